@@ -1,0 +1,49 @@
+# Targets are listed by `make` alone. Everything runs inside .venv, which `make setup` prepares.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.PHONY: help setup demo test lint format bench lock clean
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+
+setup: $(STAMP) ## prepare .venv with exactly the locked versions
+
+$(STAMP): pyproject.toml requirements-dev.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "uwbcal needs Python 3.11 or newer, and $(PYTHON) is $$($(PYTHON) --version 2>&1); try make PYTHON=python3.12"; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: setup ## simulate three flights, fit, evaluate; writes demo/report.html
+	@mkdir -p demo
+	$(BIN)/uwbsim run scenarios/icra2023/train.toml -o demo/train.uwb --force
+	$(BIN)/uwbsim run scenarios/icra2023/test1.toml -o demo/test1.uwb --force
+	$(BIN)/uwbsim run scenarios/icra2023/test2.toml -o demo/test2.uwb --force
+	$(BIN)/calib fit demo/train.uwb -o demo/calibration.json --force
+	$(BIN)/calib evaluate demo/test1.uwb demo/test2.uwb -c demo/calibration.json --report demo/report.html --force
+
+test: setup ## run the whole test suite
+	$(BIN)/python -m pytest
+
+lint: setup ## check style (ruff) and types (mypy)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup ## rewrite the code in the house style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: setup ## measure speed and memory; prints the table of the README
+	$(BIN)/python -m benchmarks
+
+lock: setup ## write the versions now in .venv to requirements-dev.lock
+	@{ echo "# Exact versions for development and CI; refresh with 'make lock'. Users install by the ranges in pyproject.toml."; \
+		$(BIN)/python -m pip freeze --disable-pip-version-check --exclude-editable; } > requirements-dev.lock
+
+clean: ## remove .venv, caches and the demo
+	rm -rf .venv demo .mypy_cache .ruff_cache .pytest_cache .hypothesis

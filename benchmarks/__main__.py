@@ -1,0 +1,128 @@
+"""Measure the figures of the README and print them as a table.
+
+Each figure is the median of several runs after one that is not counted. Whole commands run in
+processes of their own, so that their time and peak memory include start-up; the others are timed in
+this process.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.executable).parent
+TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
+RUNS = 5
+
+
+def main() -> None:
+    """Print one row a figure."""
+    print(
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
+        f"numpy {np.__version__}, {datetime.datetime.now(tz=datetime.UTC).date()}\n"
+    )
+    print("| what | goal | measured (median of 5) |\n|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / "train.uwb"
+        seconds, megabytes = command("uwbsim", "run", TRAIN, "-o", recording, "--force")
+        row("`uwbsim run` of the 240 s training scenario, whole process", "4 s", f"{seconds:.2f} s")
+        row("its peak memory", "500 MB", f"{megabytes:.0f} MB")
+        row(
+            "fit of its exchanges, in process, after loading",
+            "100 ms",
+            f"{fitting(recording) * 1e3:.0f} ms",
+        )
+        calibration = Path(folder) / "calibration.json"
+        seconds, _ = command("calib", "fit", recording, "-o", calibration, "--force")
+        row("`calib fit` of it, whole process", "", f"{seconds:.2f} s")
+        row("loading a million exchanges", "0.3 s", f"{loading(Path(folder)):.2f} s")
+    seconds, _ = command("calib", "--help")
+    row("`calib --help`, whole process", "0.5 s", f"{seconds:.2f} s")
+
+
+def row(what: str, goal: str, figure: str) -> None:
+    """Print a row of the table."""
+    print(f"| {what} | {f'under {goal}' if goal else ''} | {figure} |", flush=True)
+
+
+def command(name: str, *arguments: object) -> tuple[float, float]:
+    """Return the median wall time in seconds and the peak memory in MB of a command on one core."""
+    times, peaks = zip(
+        *(one_run([str(BIN / name), *map(str, arguments)]) for _ in range(RUNS + 1)), strict=True
+    )
+    return statistics.median(times[1:]), max(peaks)
+
+
+def one_run(arguments: list[str]) -> tuple[float, float]:
+    """Run once; the operating system's own accounting of the finished process."""
+    start = time.perf_counter()
+    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, preexec_fn=one_core)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        sys.exit(f"{' '.join(arguments)}: exit status {process.returncode}")
+    return time.perf_counter() - start, usage.ru_maxrss / 1024
+
+
+def one_core() -> None:
+    """Keep the process that starts here on one core."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def timed(work: Callable[[], object]) -> float:
+    """Return the median time of `work` in seconds."""
+    times = []
+    for _ in range(RUNS + 1):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[1:])
+
+
+def fitting(recording: Path) -> float:
+    """Return the time to fit what is already in memory, in seconds."""
+    from calib.dataset import load
+    from calib.fit import fit
+
+    ranges = load(recording)
+    return timed(lambda: fit(ranges))
+
+
+def loading(folder: Path) -> float:
+    """Return the time to read a million random exchanges into columns, in seconds."""
+    from uwblink.recording import Recording
+    from uwblink.twr import COLUMNS, Exchanges
+
+    rng = np.random.default_rng(1)
+    n = 1_000_000
+    columns = {name: rng.integers(0, 2**32, n) for name in COLUMNS}
+    for name in columns:
+        if name.endswith(("_m", "_dbm", "_ppm")):
+            columns[name] = rng.normal(size=n)
+    columns |= {name: rng.integers(1, 7, n) for name in ("initiator", "target", "reporter")}
+    columns |= {"time_ns": np.arange(n, dtype=np.int64), "protocol": np.full(n, "ds")}
+    path = folder / "million.uwb"
+    with Recording.create(path) as recording:
+        recording.append_exchanges(Exchanges(**columns))
+
+    def read() -> None:
+        with Recording.open(path) as recording:
+            if len(recording.exchanges()) != n:
+                sys.exit("not all exchanges came back")
+
+    return timed(read)
+
+
+if __name__ == "__main__":
+    main()

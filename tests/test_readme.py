@@ -1,0 +1,53 @@
+"""The README's commands run as they stand there; its make targets exist."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BIN = Path(sys.executable).parent
+
+
+def shell_commands():
+    blocks = re.findall(r"^```sh\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line.strip()]
+
+
+def test_every_shell_command_of_the_readme_works_in_order(tmp_path):
+    for name in ("scenarios", "docs"):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    commands = shell_commands()
+    assert {c.split()[0] for c in commands} == {"uwbsim", "uwblink", "calib"}
+    environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+    for command in commands:
+        done = subprocess.run(
+            command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+        assert done.stderr == "", command
+    for written in (
+        "flight.uwb",
+        "calibration.json",
+        "corrected.uwb",
+        "report.html",
+        "measured.uwb",
+    ):
+        assert (tmp_path / written).stat().st_size > 0
+
+
+def test_make_knows_the_targets_that_the_readme_names():
+    named = set(re.findall(r"\bmake ([a-z]+)\b", README)) - {"alone"}
+    assert {"demo", "test", "setup"} <= named
+    for target in sorted(named):
+        done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, f"make {target}: {done.stderr}"
+
+
+def test_links_of_the_readme_lead_somewhere():
+    links = re.findall(r"\]\((?!http)([^)#]+)\)", README)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []

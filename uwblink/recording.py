@@ -1,0 +1,360 @@
+"""The recording: one DuckDB file (`.uwb`) that simulator, recorder and importers write alike.
+
+Column meanings are those of `uwblink.twr.Exchanges`; the tables are listed in
+docs/architecture.md. Files from strangers are data: they are opened read-only and with every
+access to other files switched off.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink import __version__
+from uwblink.errors import RecordingError, RecordingExistsError, RecordingMissingError
+from uwblink.ticks import ANTENNA_DELAY_TICKS, REPORT_BITS, SPEED_OF_LIGHT, TICKS_PER_SECOND
+from uwblink.twr import COLUMNS, PROTOCOLS, Exchanges
+
+if TYPE_CHECKING:
+    import duckdb
+
+FORMAT_VERSION: Final = 1
+SUFFIX: Final = ".uwb"
+
+_EXCHANGE_TYPES: Final = {
+    **dict.fromkeys(COLUMNS, "BIGINT"),
+    **dict.fromkeys(("initiator", "target", "reporter"), "USMALLINT"),
+    **dict.fromkeys([c for c in COLUMNS if c.endswith(("_m", "_dbm", "_ppm"))], "DOUBLE"),
+    "protocol": "VARCHAR",
+}
+_LISTENER_STAMPS: Final = ("rx1", "rx2", "rx3")
+_NEIGHBOUR_STAMPS: Final = ("tx1_n", "rx1_n", "tx2_n", "rx2_n", "tx3_n", "rx3_n")
+_LISTENER_LEVELS: Final = ("fpp1_dbm", "fpp2_dbm", "fpp3_dbm", "skew1_ppm", "skew2_ppm", "skew3_ppm")
+_NEIGHBOUR_LEVELS: Final = ("fpp1_n_dbm", "fpp2_n_dbm", "skew1_n_ppm", "skew2_n_ppm")
+
+TABLES: Final[dict[str, dict[str, str]]] = {
+    "meta": {"key": "VARCHAR", "value": "VARCHAR"},
+    "tags": {"tag": "USMALLINT", "body": "VARCHAR", "x": "DOUBLE", "y": "DOUBLE", "z": "DOUBLE"},
+    "poses": {
+        "time_ns": "BIGINT",
+        "body": "VARCHAR",
+        **dict.fromkeys(("x", "y", "z", "qx", "qy", "qz", "qw"), "DOUBLE"),
+    },
+    "exchanges": _EXCHANGE_TYPES,
+    "overheard": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("listener", "initiator", "target"), "USMALLINT"),
+        **dict.fromkeys(_LISTENER_STAMPS + _NEIGHBOUR_STAMPS, "BIGINT"),
+        **dict.fromkeys(_LISTENER_LEVELS + _NEIGHBOUR_LEVELS, "DOUBLE"),
+    },
+    "cirs": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("board", "initiator", "target"), "USMALLINT"),
+        "first_path_index": "DOUBLE",
+        "magnitudes": "USMALLINT[]",
+    },
+    "frames": {"time_ns": "BIGINT", "board": "VARCHAR", "direction": "VARCHAR", "bytes": "BLOB"},
+    "faults": {"time_ns": "BIGINT", "board": "VARCHAR", "kind": "VARCHAR", "detail": "VARCHAR"},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """Where a tag sits: its body, and its lever arm in that body's frame in metres."""
+
+    tag: int
+    body: str
+    lever_arm_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses of bodies as columns of length n, in order of time.
+
+    `position_m` (n, 3) is r_iw_a, the body's position resolved in the world frame (ENU);
+    `quaternion` (n, 4), order x y z w, rotates body vectors into the world frame.
+    """
+
+    time_ns: NDArray[np.int64]
+    body: NDArray[np.str_]
+    position_m: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that went wrong while recording: a time-out, garbage, a failed exchange."""
+
+    time_ns: int
+    board: str
+    kind: str
+    detail: str
+
+
+class Recording:
+    """An open recording. Use `create` to write and `open` to read; both are context managers."""
+
+    def __init__(self, connection: duckdb.DuckDBPyConnection, path: Path, final: Path | None) -> None:
+        """Wrap an open connection; `final` is where `path` moves when writing went well."""
+        self._db = connection
+        self.path = path if final is None else final
+        self._partial = None if final is None else path
+
+    @classmethod
+    def create(
+        cls, path: str | os.PathLike[str], *, meta: Mapping[str, Any] | None = None, force: bool = False
+    ) -> Self:
+        """Start a recording beside `path`; it takes that name when the `with` block ends well.
+
+        Raises `RecordingExistsError` if `path` is there and not `force`, `RecordingError` where it
+        cannot be written. When the block raises, nothing is left behind.
+        """
+        import duckdb
+
+        final = Path(path)
+        check_output(final, force=force)
+        partial = final.with_name(f".{final.name}.{os.getpid()}.partial")
+        _remove(partial)
+        try:
+            db = duckdb.connect(str(partial))
+        except duckdb.Error as error:
+            raise RecordingError(f"{final}: cannot be written ({_first_line(error)})") from error
+        recording = cls(db, partial, final)
+        for table, columns in TABLES.items():
+            spec = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            db.execute(f"CREATE TABLE {table} ({spec})")
+        recording.append_meta(standard_meta() | dict(meta or {}))
+        return recording
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> Self:
+        """Open a recording for reading.
+
+        Raises `RecordingMissingError` or `RecordingError` (a directory, not a recording, truncated,
+        tables or columns missing, a newer format).
+        """
+        import duckdb
+
+        source = Path(path)
+        if not source.exists():
+            raise RecordingMissingError(f"{source}: no such recording")
+        if source.is_dir():
+            raise RecordingError(f"{source}: is a directory, expected a {SUFFIX} recording")
+        try:
+            db = duckdb.connect(
+                str(source),
+                read_only=True,
+                config={"enable_external_access": "false", "lock_configuration": "true"},
+            )
+        except duckdb.Error as error:
+            raise RecordingError(
+                f"{source}: not a {SUFFIX} recording, or a truncated one ({_first_line(error)})"
+            ) from error
+        recording = cls(db, source, None)
+        try:
+            recording._check_shape()
+        except RecordingError:
+            db.close()
+            raise
+        return recording
+
+    def __enter__(self) -> Self:
+        """Return the recording itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close; a written file takes its name, or vanishes if the block raised."""
+        self._db.close()
+        if self._partial is None:
+            return
+        if kind is None:
+            self._partial.replace(self.path)
+        _remove(self._partial)
+
+    def append_meta(self, meta: Mapping[str, Any]) -> None:
+        """Add entries to `meta`, replacing those with the same key; values are stored as JSON."""
+        for key, value in meta.items():
+            self._db.execute("DELETE FROM meta WHERE key = ?", [key])
+            text = json.dumps(value, sort_keys=True, allow_nan=False)
+            self._db.execute("INSERT INTO meta VALUES (?, ?)", [key, text])
+
+    def append_tags(self, tags: Iterable[Tag]) -> None:
+        """Add tags with their bodies and lever arms."""
+        for t in tags:
+            self._db.execute("INSERT INTO tags VALUES (?, ?, ?, ?, ?)", [t.tag, t.body, *t.lever_arm_m])
+
+    def append_exchanges(self, exchanges: Exchanges) -> None:
+        """Add exchanges, in one transaction."""
+        self._insert("exchanges", {name: getattr(exchanges, name) for name in COLUMNS})
+
+    def append_poses(self, poses: Poses) -> None:
+        """Add poses, in one transaction."""
+        position, quaternion = poses.position_m.T, poses.quaternion.T
+        columns = {"time_ns": poses.time_ns, "body": poses.body}
+        columns |= dict(zip("xyz", position, strict=True))
+        columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
+        self._insert("poses", columns)
+
+    def append_faults(self, faults: Iterable[Fault]) -> None:
+        """Add faults, in one transaction."""
+        rows = list(faults)
+        columns = {f.name: np.array([getattr(r, f.name) for r in rows]) for f in fields(Fault)}
+        self._insert("faults", columns)
+
+    def append_frames(self, rows: Iterable[tuple[int, str, str, bytes]]) -> None:
+        """Add raw bytes: (time_ns, board, "in" or "out", bytes)."""
+        listed = list(rows)
+        if listed:
+            self._db.executemany("INSERT INTO frames VALUES (?, ?, ?, ?)", listed)
+
+    def meta(self) -> dict[str, Any]:
+        """Return all entries of `meta`, decoded."""
+        rows = self._read("SELECT key, value FROM meta ORDER BY key")
+        try:
+            return {key: json.loads(value) for key, value in zip(rows["key"], rows["value"], strict=True)}
+        except ValueError as error:
+            raise RecordingError(f"{self.path}: table meta holds a value that is not JSON") from error
+
+    def tags(self) -> list[Tag]:
+        """Return the tags in order of id."""
+        r = self._read("SELECT * FROM tags ORDER BY tag")
+        rows = zip(r["tag"], r["body"], r["x"], r["y"], r["z"], strict=True)
+        return [Tag(int(t), str(b), (float(x), float(y), float(z))) for t, b, x, y, z in rows]
+
+    def count(self, table: str) -> int:
+        """Return the number of rows of one of `TABLES`."""
+        if table not in TABLES:
+            raise RecordingError(f"no table {table!r} in a recording; there are {', '.join(TABLES)}")
+        return int(self._read(f"SELECT count(*) AS n FROM {table}")["n"][0])  # noqa: S608 - a key of TABLES
+
+    def exchanges(self) -> Exchanges:
+        """Return all exchanges in the order in which they were written."""
+        names = sorted(PROTOCOLS)
+        listed = ", ".join(f"'{name}'" for name in names)
+        plain = ", ".join(name for name in COLUMNS if name != "protocol")
+        query = (
+            f"SELECT {plain}, list_position([{listed}], protocol)::TINYINT AS protocol FROM exchanges"  # noqa: S608 - names are constants
+        )
+        rows = self._read(query)
+        code = rows.pop("protocol")
+        if np.ma.is_masked(code):
+            raise RecordingError(f"{self.path}: exchanges of an unknown protocol; known are {', '.join(names)}")
+        columns = {name: _filled(rows[name]) for name in rows}
+        protocol = np.array(names)[np.asarray(code, dtype=np.int64) - 1]
+        bits = self.meta().get("timestamp_bits", REPORT_BITS)
+        return Exchanges(protocol=protocol, bits=int(bits), **columns)
+
+    def poses(self) -> Poses:
+        """Return all poses in order of time."""
+        r = self._read("SELECT * FROM poses ORDER BY time_ns, body")
+        return Poses(
+            time_ns=_filled(r["time_ns"]),
+            body=np.asarray(r["body"], dtype=np.str_),
+            position_m=np.column_stack([_filled(r[c]) for c in ("x", "y", "z")]),
+            quaternion=np.column_stack([_filled(r[c]) for c in ("qx", "qy", "qz", "qw")]),
+        )
+
+    def faults(self) -> list[Fault]:
+        """Return all faults in order of time."""
+        r = self._read("SELECT * FROM faults ORDER BY time_ns")
+        rows = zip(r["time_ns"], r["board"], r["kind"], r["detail"], strict=True)
+        return [Fault(int(t), str(b), str(k), str(d)) for t, b, k, d in rows]
+
+    def _insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
+        if not len(columns["time_ns"]):
+            return
+        batch = {name: np.ascontiguousarray(column) for name, column in columns.items()}
+        names = ", ".join(f'"{name}"' for name in TABLES[table])
+        self._db.register("batch", batch)
+        self._db.execute(f"INSERT INTO {table} SELECT {names} FROM batch")  # noqa: S608 - keys of TABLES
+        self._db.unregister("batch")
+
+    def _read(self, query: str) -> dict[str, NDArray[Any]]:
+        import duckdb
+
+        try:
+            return dict(self._db.execute(query).fetchnumpy())
+        except duckdb.Error as error:
+            raise RecordingError(f"{self.path}: cannot be read ({_first_line(error)})") from error
+
+    def _check_shape(self) -> None:
+        found: dict[str, set[str]] = {}
+        rows = self._read(
+            "SELECT table_name AS t, column_name AS c FROM information_schema.columns "
+            "WHERE table_schema = 'main'"
+        )
+        for table, column in zip(rows["t"], rows["c"], strict=True):
+            found.setdefault(str(table), set()).add(str(column))
+        if "meta" not in found:
+            raise RecordingError(f"{self.path}: a DuckDB file, but not a {SUFFIX} recording (no table meta)")
+        version = self.meta().get("format_version")
+        if not isinstance(version, int):
+            raise RecordingError(f"{self.path}: not a {SUFFIX} recording (no format_version in meta)")
+        if version > FORMAT_VERSION:
+            raise RecordingError(
+                f"{self.path}: format version {version} is newer than this uwbcal reads "
+                f"({FORMAT_VERSION}); update uwbcal"
+            )
+        for table, columns in TABLES.items():
+            missing = sorted(set(columns) - found.get(table, set()))
+            if missing:
+                raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
+
+
+def standard_meta() -> dict[str, Any]:
+    """Return the entries that every recording carries."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "writer": "uwbcal",
+        "writer_version": __version__,
+        "speed_of_light": SPEED_OF_LIGHT,
+        "ticks_per_second": TICKS_PER_SECOND,
+        "timestamp_bits": REPORT_BITS,
+        "configured_antenna_delay_ticks": {"tx": ANTENNA_DELAY_TICKS, "rx": ANTENNA_DELAY_TICKS},
+    }
+
+
+def check_output(path: Path, *, force: bool) -> None:
+    """Raise the one clear error if `path` cannot be written to; writes nothing."""
+    if path.is_dir():
+        raise RecordingError(f"{path}: is a directory, expected the name of an output file")
+    if path.exists() and not force:
+        raise RecordingExistsError(f"{path}: exists already; give another name, or --force to replace it")
+    if not path.parent.is_dir():
+        raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise RecordingError(f"{path}: no permission to write in {path.parent}")
+
+
+def _filled(column: NDArray[Any]) -> NDArray[Any]:
+    """Nulls become NaN in floats and zero in integers."""
+    kind = np.float64 if column.dtype.kind == "f" else np.int64
+    if isinstance(column, np.ma.MaskedArray):
+        column = column.filled(np.nan if column.dtype.kind == "f" else 0)
+    return np.asarray(column, dtype=kind)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]
+
+
+def _remove(path: Path) -> None:
+    for name in (path, path.with_name(path.name + ".wal")):
+        name.unlink(missing_ok=True)
