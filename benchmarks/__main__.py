@@ -58,9 +58,7 @@ def row(what: str, goal: str, figure: str) -> None:
 
 def command(name: str, *arguments: object) -> tuple[float, float]:
     """Return the median wall time in seconds and the peak memory in MB of a command on one core."""
-    times, peaks = zip(
-        *(one_run([str(BIN / name), *map(str, arguments)]) for _ in range(RUNS + 1)), strict=True
-    )
+    times, peaks = zip(*(one_run([str(BIN / name), *map(str, arguments)]) for _ in range(RUNS + 1)), strict=True)
     return statistics.median(times[1:]), max(peaks)
 
 

@@ -48,9 +48,7 @@ def test_package_keeps_the_import_rule(package):
     files = sorted((ROOT / package).rglob("*.py"))
     assert files, f"no modules found in {package}"
     found = [
-        line
-        for file in files
-        for line in violations(package, file.relative_to(ROOT).as_posix(), file.read_text())
+        line for file in files for line in violations(package, file.relative_to(ROOT).as_posix(), file.read_text())
     ]
     assert found == []
 

@@ -24,9 +24,7 @@ def test_every_shell_command_of_the_readme_works_in_order(tmp_path):
     assert {c.split()[0] for c in commands} == {"uwbsim", "uwblink", "calib"}
     environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
     for command in commands:
-        done = subprocess.run(
-            command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True
-        )
+        done = subprocess.run(command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         assert done.stderr == "", command
     for written in (

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 FORMAT_VERSION: Final = 1
 SUFFIX: Final = ".uwb"
 
+HEADER_BYTES: Final = 3 * 4096
+BLOCK_BYTES: Final = 16_384
+"""Smallest block of a DuckDB file; every larger one is a multiple of it."""
+
 _EXCHANGE_TYPES: Final = {
     **dict.fromkeys(COLUMNS, "BIGINT"),
     **dict.fromkeys(("initiator", "target", "reporter"), "USMALLINT"),
@@ -37,7 +41,14 @@ _EXCHANGE_TYPES: Final = {
 }
 _LISTENER_STAMPS: Final = ("rx1", "rx2", "rx3")
 _NEIGHBOUR_STAMPS: Final = ("tx1_n", "rx1_n", "tx2_n", "rx2_n", "tx3_n", "rx3_n")
-_LISTENER_LEVELS: Final = ("fpp1_dbm", "fpp2_dbm", "fpp3_dbm", "skew1_ppm", "skew2_ppm", "skew3_ppm")
+_LISTENER_LEVELS: Final = (
+    "fpp1_dbm",
+    "fpp2_dbm",
+    "fpp3_dbm",
+    "skew1_ppm",
+    "skew2_ppm",
+    "skew3_ppm",
+)
 _NEIGHBOUR_LEVELS: Final = ("fpp1_n_dbm", "fpp2_n_dbm", "skew1_n_ppm", "skew2_n_ppm")
 
 TABLES: Final[dict[str, dict[str, str]]] = {
@@ -114,7 +125,11 @@ class Recording:
 
     @classmethod
     def create(
-        cls, path: str | os.PathLike[str], *, meta: Mapping[str, Any] | None = None, force: bool = False
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        meta: Mapping[str, Any] | None = None,
+        force: bool = False,
     ) -> Self:
         """Start a recording beside `path`; it takes that name when the `with` block ends well.
 
@@ -152,6 +167,7 @@ class Recording:
             raise RecordingMissingError(f"{source}: no such recording")
         if source.is_dir():
             raise RecordingError(f"{source}: is a directory, expected a {SUFFIX} recording")
+        _check_length(source)
         try:
             db = duckdb.connect(
                 str(source),
@@ -249,9 +265,7 @@ class Recording:
         names = sorted(PROTOCOLS)
         listed = ", ".join(f"'{name}'" for name in names)
         plain = ", ".join(name for name in COLUMNS if name != "protocol")
-        query = (
-            f"SELECT {plain}, list_position([{listed}], protocol)::TINYINT AS protocol FROM exchanges"  # noqa: S608 - names are constants
-        )
+        query = f"SELECT {plain}, list_position([{listed}], protocol)::TINYINT AS protocol FROM exchanges"  # noqa: S608 - names are constants
         rows = self._read(query)
         code = rows.pop("protocol")
         if np.ma.is_masked(code):
@@ -292,13 +306,12 @@ class Recording:
         try:
             return dict(self._db.execute(query).fetchnumpy())
         except duckdb.Error as error:
-            raise RecordingError(f"{self.path}: cannot be read ({_first_line(error)})") from error
+            raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({_first_line(error)})") from error
 
     def _check_shape(self) -> None:
         found: dict[str, set[str]] = {}
         rows = self._read(
-            "SELECT table_name AS t, column_name AS c FROM information_schema.columns "
-            "WHERE table_schema = 'main'"
+            "SELECT table_name AS t, column_name AS c FROM information_schema.columns WHERE table_schema = 'main'"
         )
         for table, column in zip(rows["t"], rows["c"], strict=True):
             found.setdefault(str(table), set()).add(str(column))
@@ -341,6 +354,12 @@ def check_output(path: Path, *, force: bool) -> None:
         raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
     if not os.access(path.parent, os.W_OK):
         raise RecordingError(f"{path}: no permission to write in {path.parent}")
+
+
+def _check_length(path: Path) -> None:
+    """A DuckDB file is headers and whole blocks; one that was cut is not, and may still open."""
+    if path.stat().st_size % BLOCK_BYTES != HEADER_BYTES % BLOCK_BYTES:
+        raise RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one (its length is odd)")
 
 
 def _filled(column: NDArray[Any]) -> NDArray[Any]:

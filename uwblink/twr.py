@@ -197,9 +197,7 @@ PROTOCOLS: Final[dict[str, Protocol]] = {
 }
 
 THIRD_FROM_TARGET: Final = tuple(
-    name
-    for name, row in PROTOCOLS.items()
-    if len(row.messages) == 3 and row.messages[2].sender == "target"
+    name for name, row in PROTOCOLS.items() if len(row.messages) == 3 and row.messages[2].sender == "target"
 )
 
 

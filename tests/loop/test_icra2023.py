@@ -116,6 +116,4 @@ def test_fit_does_not_read_what_was_planted(flights, tmp_path):
         target.append_poses(source.poses())
         target.append_exchanges(source.exchanges())
     run("calib", "fit", copy, "-o", tmp_path / "calibration.json")
-    assert (tmp_path / "calibration.json").read_bytes() == (
-        flights / "calibration.json"
-    ).read_bytes()
+    assert (tmp_path / "calibration.json").read_bytes() == (flights / "calibration.json").read_bytes()

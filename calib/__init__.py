@@ -1,0 +1,1 @@
+"""Fits, applies and evaluates calibrations of ultra-wideband ranges."""

@@ -1,0 +1,125 @@
+"""The `calib` command."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import uwblink
+from calib.errors import CalibError, UnanswerableError
+from uwblink.errors import UwblinkError
+
+app = typer.Typer(
+    help="Fit, apply and evaluate calibrations of ultra-wideband ranges.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.uwb).")]
+CalibrationFile = Annotated[Path, typer.Option("-c", "--calibration", help="Calibration (.json).")]
+Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+
+
+@app.callback(invoke_without_command=True)
+def _top(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(uwblink.__version__)
+        raise typer.Exit
+
+
+@app.command()
+def fit(
+    recordings: Recordings,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],
+    loss: Annotated[str, typer.Option(help="cauchy, huber, soft_l1 or l2.")] = "cauchy",
+    scale: Annotated[str, typer.Option(help="Scale of the loss in ns, or auto.")] = "auto",
+    lift: Annotated[str, typer.Option(help="mean-of-lifted or lift-of-mean.")] = "mean-of-lifted",
+    force: Force = False,
+) -> None:
+    """Fit antenna delays and power curves."""
+    from calib.calibration import save
+    from calib.dataset import concatenate, load
+    from calib.fit import fit as run
+    from calib.options import lift_name, loss_name, scale_ns
+    from uwblink.recording import check_output
+
+    loss, lift, width = loss_name(loss), lift_name(lift), scale_ns(scale)
+    check_output(output, force=force)
+    ranges = concatenate([load(path) for path in recordings])
+    result = run(ranges, scale_ns=width, loss=loss, lift=lift)
+    save(result.calibration, output, force=force)
+    found = result.calibration
+    typer.echo(f"{output}: {len(ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
+    for tag, delay in found.delays_ns.items():
+        typer.echo(f"  tag {tag:3d}  delay {delay:+.4f} ns  ± {found.delays_std_ns[tag]:.4f}")
+    for reason, count in ranges.excluded.items():
+        typer.echo(f"  left out: {count} exchanges, {reason}")
+
+
+@app.command()
+def apply(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    calibration: CalibrationFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
+    force: Force = False,
+) -> None:
+    """Write a recording whose ranges are corrected."""
+    from calib.calibration import load
+    from calib.correction import correct
+
+    count, clamped = correct(recording, load(calibration), output, force=force)
+    typer.echo(f"{output}: {count} ranges corrected, {clamped} beyond the fitted power")
+
+
+@app.command()
+def evaluate(
+    recordings: Recordings,
+    calibration: CalibrationFile,
+    report: Annotated[Path | None, typer.Option(help="Report to write (.html).")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    force: Force = False,
+) -> None:
+    """Compare raw, delay-corrected and fully corrected ranges with the truth."""
+    from calib.calibration import load as load_calibration
+    from calib.dataset import concatenate, load
+    from calib.evaluation import evaluate as run
+    from uwblink.recording import check_output
+
+    if report:
+        check_output(report, force=force)
+    known = load_calibration(calibration)
+    parts = [load(path) for path in recordings]
+    evaluation = run(concatenate(parts), known)
+    if report:
+        from calib.report import write_report
+
+        write_report(report, parts, known, force=force)
+    if as_json:
+        typer.echo(json.dumps(evaluation.to_dict(), indent=1))
+        return
+    from rich.console import Console
+
+    from calib.table import print_table
+
+    print_table(evaluation, Console())
+    if report:
+        typer.echo(f"report: {report}")
+
+
+def main() -> None:
+    """Run the command; a mistake is one line on standard error, status 2, or 1 (see docs)."""
+    try:
+        app()
+    except UnanswerableError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    except (CalibError, UwblinkError) as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(2)

@@ -1,0 +1,132 @@
+"""From recordings to the columns a calibration works with; the only reader of recordings in here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import UnanswerableError
+from calib.truth import distances_m
+from uwblink.recording import Recording
+from uwblink.ticks import TICK_S
+from uwblink.twr import Exchanges, delay_weights, intervals, raw_range
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """Ranges with their truth as columns of length n.
+
+    `raw_m` is the range recomputed from the stamps, `truth_m` the distance between the antennas;
+    `weight_initiator` and `weight_target` are the derivatives of the calibrated time of flight with
+    respect to the two tags' antenna delays. `excluded` counts by reason what was left out; `planted`
+    is what a simulation put in, for display only.
+    """
+
+    source: str
+    time_ns: Ints
+    initiator: Ints
+    target: Ints
+    protocol: NDArray[np.str_]
+    raw_m: Floats
+    truth_m: Floats
+    weight_initiator: Floats
+    weight_target: Floats
+    fpp1_dbm: Floats
+    fpp2_dbm: Floats
+    excluded: dict[str, int]
+    planted: dict[str, Any] | None
+
+    def __len__(self) -> int:
+        """Return the number of ranges."""
+        return len(self.time_ns)
+
+    def __getitem__(self, rows: NDArray[np.bool_] | Ints | slice) -> Ranges:
+        """Return the chosen rows, in their order."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+
+    def tags(self) -> list[int]:
+        """Return the ids of the tags that range, in order."""
+        return sorted({*np.unique(self.initiator).tolist(), *np.unique(self.target).tolist()})
+
+
+COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted"})
+
+
+def load(path: str | os.PathLike[str]) -> Ranges:
+    """Read a recording and work out true distances, leaving out what cannot be used.
+
+    Raises the errors of `Recording.open`, and `UnanswerableError` when no exchange can be used.
+    """
+    with Recording.open(path) as recording:
+        exchanges = recording.exchanges()
+        truth = _truth(recording, exchanges)
+        planted = recording.meta().get("planted")
+    if not len(exchanges):
+        raise UnanswerableError(f"{path}: holds no exchanges")
+    raw = raw_range(exchanges)
+    initiator, target = delay_weights(exchanges)
+    ranges = Ranges(
+        source=os.path.basename(path),
+        time_ns=exchanges.time_ns,
+        initiator=exchanges.initiator,
+        target=exchanges.target,
+        protocol=exchanges.protocol,
+        raw_m=raw,
+        truth_m=truth,
+        weight_initiator=initiator,
+        weight_target=target,
+        fpp1_dbm=exchanges.fpp1_dbm,
+        fpp2_dbm=exchanges.fpp2_dbm,
+        excluded={},
+        planted=planted if isinstance(planted, dict) else None,
+    )
+    return _usable(ranges, path)
+
+
+def concatenate(parts: Sequence[Ranges]) -> Ranges:
+    """Join the ranges of several recordings, in their order."""
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS}
+    reasons = sorted({reason for p in parts for reason in p.excluded})
+    return Ranges(
+        source=", ".join(p.source for p in parts),
+        excluded={r: sum(p.excluded.get(r, 0) for p in parts) for r in reasons},
+        planted=parts[0].planted,
+        **columns,
+    )
+
+
+def _truth(recording: Recording, exchanges: Exchanges) -> Floats:
+    if np.isfinite(exchanges.truth_m).all() or not recording.count("poses"):
+        return exchanges.truth_m
+    # A range belongs to the middle of its first two messages.
+    middle = exchanges.time_ns + np.rint(intervals(exchanges).dt41 * (TICK_S * 5e8)).astype(np.int64)
+    computed = distances_m(recording.poses(), recording.tags(), exchanges.initiator, exchanges.target, middle)
+    return np.where(np.isfinite(exchanges.truth_m), exchanges.truth_m, computed)
+
+
+def _usable(ranges: Ranges, path: str | os.PathLike[str]) -> Ranges:
+    reasons = {
+        "no true distance": np.isfinite(ranges.truth_m),
+        "no power": np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm),
+        "impossible stamps": np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < 1e4),
+    }
+    keep = np.ones(len(ranges), dtype=bool)
+    excluded = {}
+    for reason, good in reasons.items():
+        excluded[reason] = int(np.count_nonzero(keep & ~good))
+        keep &= good
+    if not keep.any():
+        most = max(excluded, key=lambda reason: excluded[reason])
+        raise UnanswerableError(
+            f"{path}: none of its {len(ranges)} exchanges can be used: {most}"
+            + ("; it needs poses and lever arms, or measured distances" if "true" in most else "")
+        )
+    return replace(ranges[keep], excluded={r: n for r, n in excluded.items() if n})

@@ -1,0 +1,180 @@
+"""Robust least squares for antenna delays, and whether the pairs of tags determine them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.dataset import Ranges
+from calib.errors import UnanswerableError
+from uwblink.ticks import SPEED_OF_LIGHT
+
+Floats = NDArray[np.float64]
+
+Loss = Callable[[Floats], tuple[Floats, Floats]]
+"""Maps residuals over scale (n,) to IRLS weights rho' and to the slope of the score, both (n,)."""
+
+
+def _cauchy(u: Floats) -> tuple[Floats, Floats]:
+    weight = 1 / (1 + u**2)
+    return weight, (1 - u**2) * weight**2
+
+
+def _soft_l1(u: Floats) -> tuple[Floats, Floats]:
+    weight = 1 / np.sqrt(1 + u**2)
+    return weight, weight**3
+
+
+def _huber(u: Floats) -> tuple[Floats, Floats]:
+    size = np.maximum(np.abs(u), 1.0)
+    return 1 / size, (size == 1.0).astype(np.float64)
+
+
+def _l2(u: Floats) -> tuple[Floats, Floats]:
+    return np.ones_like(u), np.ones_like(u)
+
+
+LOSSES: Final[dict[str, Loss]] = {
+    "cauchy": _cauchy,
+    "huber": _huber,
+    "soft_l1": _soft_l1,
+    "l2": _l2,
+}
+
+SCALE_OF_SPREAD: Final = 0.5
+"""The loss's scale over the robust spread of the residuals.
+
+Half the spread keeps the optimum with the core when a tenth of the data has a positive tail, and
+still leaves a Cauchy loss two thirds of least squares' efficiency on clean data.
+"""
+
+SCALE_FLOOR_NS: Final = 0.002
+UNDETERMINED: Final = 1e-8
+"""Smallest share of the largest eigenvalue at which a direction counts as determined.
+
+Clock ratios differ from 1 by parts per million, which lifts a free direction to 1e-12 at most.
+"""
+
+MAX_STEPS: Final = 100
+STILL_M: Final = 1e-8
+"""A step that moves no range by more than this ends the iteration (0.03 fs of flight)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The optimum of a robust fit: parameters (m,), covariance (m, m), residuals (n,)."""
+
+    parameters: Floats
+    covariance: Floats
+    residuals: Floats
+    scale: float
+    steps: int
+    success: bool
+
+
+def design(ranges: Ranges, tags: list[int]) -> Floats:
+    """Return the derivative of calibrated ranges by delays, in metres a nanosecond, (n, tags)."""
+    matrix = np.zeros((len(ranges), len(tags)))
+    rows = np.arange(len(ranges))
+    place = np.array(tags)
+    for ids, weight in (
+        (ranges.initiator, ranges.weight_initiator),
+        (ranges.target, ranges.weight_target),
+    ):
+        matrix[rows, np.searchsorted(place, ids)] += weight * SPEED_OF_LIGHT * 1e-9
+    return matrix
+
+
+def check_determined(matrix: Floats, tags: list[int]) -> None:
+    """Raise `UnanswerableError` naming the tags whose delays the pairs leave free.
+
+    Tags that range only with tags of another group (anchors against robots, a single pair) can shift
+    by +a and -a without a trace in any range.
+    """
+    values, vectors = np.linalg.eigh(matrix.T @ matrix)
+    free = vectors[:, values < UNDETERMINED * values[-1]]
+    if not free.size:
+        return
+    loose = [str(tag) for tag, row in zip(tags, free, strict=True) if np.abs(row).max() > 1e-3]
+    raise UnanswerableError(
+        f"the pairs do not determine the antenna delays of tags {', '.join(loose)}: some can grow as "
+        "others shrink without changing any range; record three tags that all range with each other"
+    )
+
+
+def robust_fit(
+    matrix: Floats,
+    aim: Floats,
+    loss: str,
+    scale: float | None = None,
+    penalty: Floats | None = None,
+    start: Floats | None = None,
+) -> Solution:
+    """Minimise the robust loss of `aim - matrix @ x` plus x' penalty x.
+
+    `matrix` (n, m) and `aim` (n,) share a unit, which is that of `scale` (estimated from the
+    residuals where not given). The covariance is the sandwich H^-1 S H^-1, which holds under a heavy
+    tail where the usual one does not.
+    """
+    ridge = np.zeros((matrix.shape[1],) * 2) if penalty is None else penalty
+    x = start if start is not None else _absolute_start(matrix, aim, ridge)
+    residual = aim - matrix @ x
+    width = scale or _scale(residual)
+    steps, moved = 0, np.inf
+    function = LOSSES[loss]
+    while moved > STILL_M and steps < MAX_STEPS:
+        weight, slope = function(residual / width)
+        gradient = matrix.T @ (weight * residual) - ridge @ x
+        # Newton where the loss is convex enough, iterated reweighting where it is not.
+        curvature = slope if steps > 3 else weight
+        step = _solve(matrix, curvature, ridge, gradient)
+        trial = x + step
+        if steps > 3 and not np.all(np.isfinite(trial)):
+            break
+        x, residual = trial, aim - matrix @ trial
+        moved = float(np.max(np.abs(matrix.max(axis=0) * step)))
+        if scale is None and steps <= 3:
+            width = _scale(residual)
+        steps += 1
+    return Solution(
+        x,
+        _sandwich(matrix, residual, function, width, ridge),
+        residual,
+        width,
+        steps,
+        moved <= STILL_M,
+    )
+
+
+def _scale(residual: Floats) -> float:
+    """The loss's scale from the median absolute deviation of residuals in metres."""
+    spread = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
+    return max(SCALE_OF_SPREAD * spread, SCALE_FLOOR_NS * 1e-9 * SPEED_OF_LIGHT)
+
+
+def _absolute_start(matrix: Floats, aim: Floats, ridge: Floats) -> Floats:
+    """A few rounds towards least absolute deviations: a start that outliers do not own."""
+    weight = np.ones(len(aim))
+    x = np.zeros(matrix.shape[1])
+    for _ in range(5):
+        x = x + _solve(matrix, weight, ridge, matrix.T @ (weight * (aim - matrix @ x)) - ridge @ x)
+        residual = np.abs(aim - matrix @ x)
+        weight = 1 / np.maximum(residual, 0.1 * np.median(residual) + 1e-9)
+        weight /= weight.max()
+    return x
+
+
+def _solve(matrix: Floats, weight: Floats, ridge: Floats, gradient: Floats) -> Floats:
+    normal = (matrix * weight[:, None]).T @ matrix + ridge
+    return np.asarray(np.linalg.lstsq(normal, gradient, rcond=1e-13)[0])
+
+
+def _sandwich(matrix: Floats, residual: Floats, function: Loss, width: float, ridge: Floats) -> Floats:
+    weight, slope = function(residual / width)
+    bread = np.linalg.pinv((matrix * slope[:, None]).T @ matrix + ridge, rcond=1e-12)
+    score = matrix * (weight * residual)[:, None]
+    return np.asarray(bread @ (score.T @ score) @ bread)

@@ -1,0 +1,13 @@
+"""Everything `calib` raises, in the two kinds that differ in exit status."""
+
+
+class CalibError(Exception):
+    """Base of the errors of this package; the text says what, where and what to do."""
+
+
+class BadInputError(CalibError, ValueError):
+    """A file or an option that cannot be used: exit status 2."""
+
+
+class UnanswerableError(CalibError, ValueError):
+    """Good input that does not determine what was asked: exit status 1."""

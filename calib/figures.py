@@ -1,0 +1,155 @@
+"""The figures of a calibration: histogram, curves over power, errors over time, delays."""
+
+from __future__ import annotations
+
+import io
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from calib.calibration import Applied, Calibration
+from calib.dataset import Ranges
+from calib.evaluation import STAGES, pair_rows
+from uwblink.ticks import SPEED_OF_LIGHT
+
+Floats = NDArray[np.float64]
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart.
+COLOURS: Final = {"raw": "#D55E00", "delays": "#E69F00", "full": "#0072B2", "planted": "#009E73"}
+LABELS: Final = {"raw": "raw", "delays": "delays corrected", "full": "fully corrected"}
+HISTOGRAM_CM: Final = (-40.0, 80.0)
+BINS: Final = 20
+WIDE: Final = (8.0, 3.6)
+
+
+def histogram(ranges: Ranges, applied: Applied) -> Figure:
+    """Range errors in the three stages; the outermost bins hold everything beyond them."""
+    figure = Figure(figsize=WIDE, layout="constrained")
+    axes = figure.subplots()
+    edges = np.arange(HISTOGRAM_CM[0], HISTOGRAM_CM[1] + 1, 4.0)
+    for stage, field in STAGES.items():
+        error = 100 * (getattr(applied, field) - ranges.truth_m)
+        inside = np.clip(error, edges[0] + 0.1, edges[-1] - 0.1)
+        axes.hist(inside, edges.tolist(), histtype="step", lw=1.8, color=COLOURS[stage], label=LABELS[stage])
+    ticks = np.arange(HISTOGRAM_CM[0], HISTOGRAM_CM[1] + 1, 20)
+    names = [f"{t:.0f}" for t in ticks]
+    names[0], names[-1] = f"≤ {names[0]}", f"≥ {names[-1]}"
+    axes.set_xticks(ticks, names)
+    _label(axes, "range error (cm)", "exchanges")
+    axes.legend(frameon=False)
+    return figure
+
+
+def bias_over_power(ranges: Ranges, applied: Applied, calibration: Calibration) -> Figure:
+    """Median error after delay correction over lifted power: every pair, all, fitted, planted."""
+    error = 100 * (applied.delays_m - ranges.truth_m)
+    figure = _over_power(ranges, applied, error, np.median)
+    axes = figure.axes[0]
+    grid = np.linspace(*calibration.bias_curve.range, 300)
+    axes.plot(grid, 100 * calibration.bias_curve(grid), color=COLOURS["full"], lw=2.2, label="fitted")
+    planted = planted_curve(ranges, "bias_curve", grid)
+    if planted is not None:
+        shift = common_shift_ns(ranges, calibration) * 1e-9 * SPEED_OF_LIGHT
+        axes.plot(grid, 100 * (planted + shift), "--", color=COLOURS["planted"], lw=2.2, label="planted")
+    _label(axes, "lifted first-path power", "bias (cm)")
+    axes.legend(frameon=False)
+    return figure
+
+
+def sigma_over_power(ranges: Ranges, applied: Applied, calibration: Calibration) -> Figure:
+    """Robust standard deviation of calibrated errors over lifted power, likewise."""
+    error = 100 * (applied.full_m - ranges.truth_m)
+    figure = _over_power(ranges, applied, error, _robust_std)
+    axes = figure.axes[0]
+    grid = np.linspace(*calibration.sigma_curve.range, 300)
+    axes.plot(grid, 100 * calibration.sigma_curve(grid), color=COLOURS["full"], lw=2.2, label="fitted")
+    planted = planted_curve(ranges, "sigma_curve", grid)
+    if planted is not None:
+        axes.plot(grid, 100 * planted, "--", color=COLOURS["planted"], lw=2.2, label="planted")
+    axes.set_ylim(bottom=0)
+    _label(axes, "lifted first-path power", "standard deviation (cm)")
+    axes.legend(frameon=False)
+    return figure
+
+
+def over_time(ranges: Ranges, applied: Applied) -> Figure:
+    """Calibrated error of each pair over time, with the band in which 95 % should lie."""
+    pairs = pair_rows(ranges)
+    rows_of_panels = int(np.ceil(len(pairs) / 3))
+    figure = Figure(figsize=(10, 1.9 * rows_of_panels + 0.4), layout="constrained")
+    panels = figure.subplots(rows_of_panels, 3, sharex=True, sharey=True, squeeze=False).flat
+    start = ranges.time_ns.min()
+    for panel, (name, rows) in zip(panels, pairs.items(), strict=False):
+        time = (ranges.time_ns[rows] - start) * 1e-9
+        order = np.argsort(time)
+        error = 100 * (applied.full_m - ranges.truth_m)[rows]
+        panel.plot(time, error, ".", ms=1.5, color=COLOURS["full"], alpha=0.5, rasterized=True)
+        band = 196 * applied.sigma_m[rows][order]
+        panel.fill_between(time[order], -band, band, color="0.6", alpha=0.45, lw=0, rasterized=True)
+        panel.set_title(f"tags {name}", fontsize="small", loc="left")
+        panel.set_ylim(-60, 60)
+        panel.grid(alpha=0.25)
+    for panel in list(panels)[len(pairs) :]:
+        panel.set_visible(False)
+    figure.supxlabel("time (s)")
+    figure.supylabel("calibrated error (cm)")
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG picture."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=130)
+    return data.getvalue()
+
+
+def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
+    """Return a curve that the simulation planted, at lifted powers, or None."""
+    from scipy.interpolate import BSpline
+
+    curve: dict[str, Any] | None = (ranges.planted or {}).get(which)
+    if not curve:
+        return None
+    knots, degree = np.array(curve["knots"], dtype=float), int(curve["degree"])
+    spline = BSpline(knots, np.array(curve["coefficients"], dtype=float), degree)
+    return np.asarray(spline(np.clip(lifted, knots[degree], knots[-1 - degree])))
+
+
+def common_shift_ns(ranges: Ranges, calibration: Calibration) -> float:
+    """Mean of fitted minus planted delays: the part that a constant in the curve makes up for."""
+    planted = (ranges.planted or {}).get("delays_ns", {})
+    known = [calibration.delays_ns[int(t)] - d for t, d in planted.items() if int(t) in calibration.delays_ns]
+    return float(np.mean(known)) if known else 0.0
+
+
+def _over_power(ranges: Ranges, applied: Applied, values: Floats, summary: Any) -> Figure:
+    figure = Figure(figsize=WIDE, layout="constrained")
+    axes = figure.subplots()
+    for rows in pair_rows(ranges).values():
+        axes.plot(*_binned(applied.lifted[rows], values[rows], summary), color="0.75", lw=0.9)
+    axes.plot([], [], color="0.75", lw=0.9, label="each pair")
+    everything = _binned(applied.lifted, values, summary)
+    axes.plot(*everything, "o", color="0.2", ms=4, label="all pairs")
+    return figure
+
+
+def _binned(x: Floats, y: Floats, summary: Any) -> tuple[Floats, Floats]:
+    groups = np.array_split(np.argsort(x), max(1, min(BINS, len(x) // 20)))
+    return (
+        np.array([np.median(x[rows]) for rows in groups]),
+        np.array([summary(y[rows]) for rows in groups]),
+    )
+
+
+def _robust_std(values: Floats) -> float:
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)

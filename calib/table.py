@@ -1,0 +1,36 @@
+"""The evaluation as a table on the terminal."""
+
+from __future__ import annotations
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from calib.evaluation import STAGES, Evaluation, Group
+
+
+def print_table(evaluation: Evaluation, console: Console) -> None:
+    """Print errors in centimetres, a row a pair and one for all."""
+    table = Table(
+        title="Range error in cm", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
+    table.add_column("pair", no_wrap=True)
+    table.add_column("n", justify="right", no_wrap=True)
+    for stage in STAGES:
+        for what in ("mean", "std", "rob."):
+            table.add_column(f"{stage}\n{what}", justify="right", no_wrap=True)
+    table.add_column("chi2\n>95%", justify="right", no_wrap=True)
+    for name, group in evaluation.pairs.items():
+        table.add_row(name, *_cells(group))
+    table.add_section()
+    table.add_row("all", *_cells(evaluation.overall), style="bold")
+    console.print(table)
+
+
+def _cells(group: Group) -> list[str]:
+    cells = [str(group.raw.n)]
+    for stage in STAGES:
+        stats = getattr(group, stage)
+        figures = (stats.mean_m, stats.std_m, stats.robust_std_m)
+        cells += [f"{100 * figure:.1f}" for figure in figures]
+    return [*cells, f"{100 * group.rejected:.1f}%"]

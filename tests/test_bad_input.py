@@ -1,0 +1,160 @@
+"""Every mistake a user can make at the three commands: one line, the right status, nothing written."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import pytest
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.executable).parent
+NOISELESS = ROOT / "scenarios" / "noiseless.toml"
+HEADER = "time_s,from_id,to_id,tx1,rx1,tx2,rx2"
+GOOD = "0.0,1,2,100,200,300,500"
+
+
+def run(*arguments):
+    words = [str(a) for a in arguments]
+    return subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True)
+
+
+def refused(done, status, *fragments):
+    assert done.returncode == status, done.stdout + done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1, done.stderr
+    for fragment in fragments:
+        assert fragment in done.stderr
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("flight")
+    done = run("uwbsim", "run", NOISELESS, "-o", folder / "f.uwb", "--set", "scenario.duration_s=5")
+    assert done.returncode == 0, done.stderr
+    done = run("calib", "fit", folder / "f.uwb", "-o", folder / "c.json")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fragments"),
+    [
+        ("rate_hz = 160.0", "rate_hz = -1.0", ["ranging.rate_hz", "-1.0", "greater than 0"]),
+        ("rate_hz = 160.0", "rate_hz = 9000.0", ["ranging.rate_hz", "at most"]),
+        ("rate_hz = 160.0", "rate_hertz = 1.0", ["ranging.rate_hertz", "unknown key", "rate_hz"]),
+        ("rate_hz = 160.0", "rate_hz = inf", ["ranging.rate_hz", "inf"]),
+        ("duration_s = 60.0", "duration_s = 0", ["scenario.duration_s", "greater than 0"]),
+        ("id = 2\n", "id = 1\n", ["tags[1].id", "second 1"]),
+        ('id = 2\nbody = "ifo001"', 'id = 2\nbody = "ifo9"', ["tags[1].body", "ifo9", "ifo001"]),
+        ('protocol = "ds"', 'protocol = "tdoa"', ["ranging.protocol", "tdoa", "ds-alt"]),
+        ('antenna = "dipole"', 'antenna = "yagi"', ["radio.antenna", "yagi", "isotropic"]),
+        ("[scenario]", "[scenario", ["not valid TOML", "line"]),
+    ],
+)
+def test_scenarios_that_cannot_be(tmp_path, old, new, fragments):
+    text = NOISELESS.read_text()
+    assert old in text
+    bad = tmp_path / "bad.toml"
+    bad.write_text(text.replace(old, new, 1))
+    refused(run("uwbsim", "run", bad, "-o", tmp_path / "out.uwb"), 2, "bad.toml", *fragments)
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.toml"]
+
+
+def test_scenario_files_that_are_not(tmp_path):
+    out = tmp_path / "out.uwb"
+    refused(run("uwbsim", "run", tmp_path / "no.toml", "-o", out), 2, "no.toml", "no such")
+    refused(run("uwbsim", "run", tmp_path, "-o", out), 2, "directory")
+    refused(run("uwbsim", "run", NOISELESS, "-o", out, "--set", "ranging.rate"), 2, "ranging.rate")
+    refused(run("uwbsim", "run", NOISELESS, "-o", tmp_path / "no" / "x.uwb"), 2, "does not exist")
+    out.write_text("mine")
+    refused(run("uwbsim", "run", NOISELESS, "-o", out), 2, "out.uwb", "--force")
+    assert out.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("content", "fragments"),
+    [
+        ("", ["empty"]),
+        (HEADER + "\n", ["no rows"]),
+        (HEADER.replace(",tx2", "") + "\n0,1,2,1,2,3\n", ["'tx2'", "missing", "--map"]),
+        (HEADER + "\n" + GOOD + "\n0.1,1,2,100,abc,300,500\n", ["row 3", "'rx1'", "'abc'"]),
+        (HEADER + "\n0.1,1,2,100,nan,300,500\n", ["row 2", "'rx1'", "'nan'"]),
+        (HEADER + "\n0.1,1,2,100,,300,500\n", ["row 2", "'rx1'"]),
+        (HEADER + "\n0.1,1,2,100,4294967296,300,500\n", ["row 2", "'rx1'", "4294967295"]),
+        (HEADER + "\n0.1,1,2,100,1.5,300,500\n", ["row 2", "'rx1'", "whole number"]),
+        (HEADER + "\n0.1,1,1,100,200,300,500\n", ["row 2", "'to_id'", "from_id"]),
+        (HEADER + "\n0.1,1,2,100,200,300\n", ["row 2", "6 cells"]),
+        (HEADER + ",tx1\n" + GOOD + ",1\n", ["two columns", "tx1"]),
+    ],
+)
+def test_tables_that_cannot_be(tmp_path, content, fragments):
+    table = tmp_path / "t.csv"
+    table.write_text(content)
+    refused(run("uwblink", "import", "csv", table, "-o", tmp_path / "o.uwb"), 2, "t.csv", *fragments)
+    assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
+
+
+def test_recordings_that_are_not(tmp_path, flight):
+    whole = (flight / "f.uwb").read_bytes()
+    (tmp_path / "cut.uwb").write_bytes(whole[: len(whole) // 2])
+    with duckdb.connect(str(tmp_path / "other.uwb")) as db:
+        db.execute("CREATE TABLE planets (name VARCHAR)")
+    before = sorted(p.name for p in tmp_path.iterdir())
+    for name, fragment in (("no.uwb", "no such"), ("cut.uwb", "truncated"), ("other.uwb", "not a"), ("", "directory")):
+        bad = tmp_path / name
+        refused(run("uwblink", "show", bad), 2, name, fragment)
+        refused(run("calib", "fit", bad, "-o", tmp_path / "c.json"), 2, name, fragment)
+        apply = run("calib", "apply", bad, "-c", flight / "c.json", "-o", tmp_path / "o.uwb")
+        refused(apply, 2, name, fragment)
+        refused(run("calib", "evaluate", bad, "-c", flight / "c.json"), 2, name, fragment)
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_outputs_that_exist_are_kept(tmp_path, flight):
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+    refused(run("calib", "fit", flight / "f.uwb", "-o", mine), 2, "--force")
+    apply = run("calib", "apply", flight / "f.uwb", "-c", flight / "c.json", "-o", mine)
+    refused(apply, 2, "--force")
+    report = run("calib", "evaluate", flight / "f.uwb", "-c", flight / "c.json", "--report", mine)
+    refused(report, 2, "--force")
+    assert mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("content", "fragment"),
+    [
+        ("{", "not JSON"),
+        ("[]", "not a calibration"),
+        ('{"schema_version": 99}', "99"),
+        ('{"schema_version": 1}', "missing"),
+        ('{"schema_version": 1, "lift": "up"}', "mean-of-lifted"),
+    ],
+)
+def test_calibrations_that_are_not(tmp_path, flight, content, fragment):
+    (tmp_path / "c.json").write_text(content)
+    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "c.json", fragment)
+
+
+def test_options_that_are_not(tmp_path, flight):
+    for option, value in (("--loss", "tukey"), ("--scale", "-1"), ("--lift", "up")):
+        done = run("calib", "fit", flight / "f.uwb", "-o", tmp_path / "c.json", option, value)
+        refused(done, 2, option, value)
+
+
+def test_pairs_that_cannot_determine_delays_are_status_1(tmp_path):
+    done = run(
+        "uwbsim", "run", NOISELESS, "-o", tmp_path / "f.uwb", "--set", "scenario.duration_s=5",
+        "--set", "ranging.pairs=[[1, 3], [1, 5]]",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    refused(run("calib", "fit", tmp_path / "f.uwb", "-o", tmp_path / "c.json"), 1, "1, 3, 5")
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_a_table_without_truth_is_status_1(tmp_path):
+    (tmp_path / "t.csv").write_text(HEADER + "\n" + GOOD + "\n")
+    assert run("uwblink", "import", "csv", tmp_path / "t.csv", "-o", tmp_path / "o.uwb").returncode == 0
+    refused(run("calib", "fit", tmp_path / "o.uwb", "-o", tmp_path / "c.json"), 1, "no true distance")

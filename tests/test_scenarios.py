@@ -1,0 +1,34 @@
+"""Every scenario in the tree runs, at a few seconds' length, and its recording opens."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from uwblink.recording import Recording
+
+ROOT = Path(__file__).parents[1]
+SCENARIOS = sorted((ROOT / "scenarios").rglob("*.toml"))
+
+
+def test_the_scenarios_that_the_readme_promises_are_there():
+    names = {p.relative_to(ROOT / "scenarios").as_posix() for p in SCENARIOS}
+    expected = {"noiseless.toml", *(f"icra2023/{n}.toml" for n in ("train", "test1", "test2"))}
+    assert expected <= names
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_scenario_runs(scenario, tmp_path):
+    output = tmp_path / "out.uwb"
+    uwbsim = Path(sys.executable).parent / "uwbsim"
+    done = subprocess.run(
+        [uwbsim, "run", scenario, "-o", output, "--set", "scenario.duration_s=3"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    with Recording.open(output) as recording:
+        assert len(recording.exchanges()) > 0
+        assert len(recording.poses()) > 0
+        assert recording.tags()

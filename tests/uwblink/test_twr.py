@@ -1,0 +1,103 @@
+"""Formulas of the protocols against exact arithmetic and finite differences."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwblink.ticks import METRES_PER_TICK, TICK_S, elapsed
+from uwblink.twr import PROTOCOLS, Exchanges, delay_weights, time_of_flight, truncate4
+
+INITIATOR_STAMPS = {"ds-alt": ("tx1", "rx2", "tx3"), "ds": ("tx1", "rx2", "rx3"), "ss": ("tx1", "rx2")}
+
+
+def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32):
+    """An exchange in exact rationals, rounded to whole ticks only at the end."""
+    sender = PROTOCOLS[protocol].messages[-1].sender
+    true = {"tx1": 0, "rx1": flight, "tx2": flight + reply, "rx2": 2 * flight + reply}
+    if protocol != "ss":
+        left = true["tx2" if sender == "target" else "rx2"] + third
+        true |= {"tx3": left, "rx3": left + flight}
+    own = INITIATOR_STAMPS[protocol]
+    stamps = {}
+    for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3"):
+        if name not in true:
+            stamps[name] = np.array([0])
+            continue
+        rate = 1 + Fraction(gamma_i if name in own else gamma_j) / 10**6
+        offset = start if name in own else 7 * start + 12345
+        stamps[name] = np.array([int(offset + rate * Fraction(true[name])) % 2**bits])
+    one = np.array([1])
+    none = np.array([np.nan])
+    return Exchanges(
+        time_ns=np.array([0]),
+        initiator=one,
+        target=one + 1,
+        protocol=np.array([protocol]),
+        reporter=one,
+        range_m=none,
+        fpp1_dbm=none,
+        fpp2_dbm=none,
+        skew1_ppm=none,
+        skew2_ppm=none,
+        truth_m=none,
+        bits=bits,
+        **stamps,
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1), st.sampled_from([32, 40]))
+def test_elapsed_undoes_addition_whatever_the_wrap(start, duration, bits):
+    assert elapsed((start + duration) % 2**bits, start, bits) == duration
+    assert 0 <= elapsed(start, start + duration, bits) < 2**bits
+
+
+@given(
+    st.sampled_from(["ds", "ds-alt"]),
+    st.integers(100, 10_000),
+    st.integers(15_000_000, 60_000_000),
+    st.integers(20_000_000, 300_000_000),
+    st.integers(-20, 20),
+    st.integers(-20, 20),
+    st.integers(0, 2**32 - 1),
+)
+def test_double_sided_finds_the_flight_time_whatever_the_skews(protocol, flight, reply, third, gi, gj, start):
+    found = time_of_flight(exchange(protocol, flight, reply, third, gi, gj, start))[0] / TICK_S
+    # Six stamps cut to whole ticks, weighted by up to 1 + r <= 4 (docs/theory.md), halved; and the skew's share.
+    assert abs(found - flight) < 2 * (1 + reply / third) + flight * 2e-5
+
+
+def test_single_sided_carries_half_the_relative_skew_times_the_reply():
+    found = time_of_flight(exchange("ss", 1000, 98_320_384, 0, 5, -5))[0] / TICK_S
+    assert found - 1000 == pytest.approx(0.5 * 10e-6 * 98_320_384, abs=1)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("side", ["initiator", "target"])
+@pytest.mark.parametrize("kind", ["tx", "rx"])
+def test_a_delay_on_one_side_only_is_taken_out_by_its_weight(protocol, side, kind):
+    clean = exchange(protocol, 1000, 20_000_000, 98_320_384, 3, -2)
+    d = 4000
+    own = INITIATOR_STAMPS[protocol]
+    touched = {
+        name: getattr(clean, name) + d
+        for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
+        if name[:2] == kind and (name in own) == (side == "initiator")
+    }
+    delayed = replace(clean, **touched)
+    aggregate = d if kind == "tx" else -d  # d = d_t - d_r
+    weights = dict(zip(("initiator", "target"), delay_weights(delayed), strict=True))
+    corrected = time_of_flight(delayed)[0] / TICK_S + weights[side][0] * aggregate
+    assert corrected == pytest.approx(time_of_flight(clean)[0] / TICK_S, abs=1e-3)
+    assert abs(time_of_flight(delayed)[0] - time_of_flight(clean)[0]) > 0.4 * d * TICK_S
+
+
+def test_truncation_is_towards_zero_and_keeps_what_has_four_decimals():
+    assert truncate4(np.array([1.23459, -1.23459, -87.6187, 0.0001])).tolist() == [1.2345, -1.2345, -87.6187, 0.0001]
+
+
+def test_a_tick_is_4_69_mm():
+    assert pytest.approx(4.690357e-3, rel=1e-6) == METRES_PER_TICK

@@ -1,0 +1,1 @@
+"""A discrete-event simulator of tags that range with ultra-wideband radios."""

@@ -1,0 +1,91 @@
+"""The `uwbsim` command."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import uwblink
+from uwblink.errors import UwblinkError
+from uwbsim.errors import UwbsimError
+
+app = typer.Typer(
+    help="Simulate tags that range with ultra-wideband radios.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback(invoke_without_command=True)
+def _top(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(uwblink.__version__)
+        raise typer.Exit
+
+
+@app.command()
+def run(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed instead of the file's.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
+    ] = None,
+    force: Annotated[bool, typer.Option(help="Replace the output if it exists.")] = False,
+) -> None:
+    """Simulate a scenario and write what its boards and motion capture record."""
+    from uwblink.recording import check_output
+    from uwbsim.reading import load
+    from uwbsim.simulate import simulate, write
+
+    check_output(output, force=force)
+    loaded = load(scenario, settings or (), seed)
+    with _progress(loaded.scenario.name) as report:
+        simulated = simulate(loaded, report)
+    write(simulated, output, force=force)
+    typer.echo(
+        f"{output}: {len(simulated.exchanges)} exchanges of {len(loaded.tags)} tags in "
+        f"{len(loaded.pairs())} pairs, {loaded.scenario.duration_s:g} s, "
+        f"{len(simulated.faults)} failed"
+    )
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of scenario files."""
+    from uwbsim.scenario import Scenario
+
+    typer.echo(json.dumps(Scenario.model_json_schema(), indent=2))
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Callable[[float], None] | None]:
+    """Show a bar on a terminal, and nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(escape(name), total=1.0)
+        yield lambda fraction: bar.update(task, completed=fraction)
+
+
+def main() -> None:
+    """Run the command; a user's mistake is one line on standard error and exit status 2."""
+    try:
+        app()
+    except (UwbsimError, UwblinkError) as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(2)

@@ -1,0 +1,86 @@
+"""Where bodies are: smooth trajectories, evaluated at many instants at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, CubicSpline
+from scipy.spatial.transform import Rotation
+
+from uwbsim.scenario import RandomFlight, Static, Waypoints
+
+Floats = NDArray[np.float64]
+
+TILT_RAD: Final = 0.12
+"""Standard deviation of roll and pitch of a quadcopter in calm flight."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A body's path: `position` maps seconds (n,) to metres (n, 3), `angles` to yaw, pitch, roll."""
+
+    position: Callable[[Floats], Floats]
+    angles: Callable[[Floats], Floats]
+
+    def position_m(self, time_s: Floats) -> Floats:
+        """Return r_iw_a, shape (n, 3), in the world frame (ENU)."""
+        return self.position(time_s)
+
+    def quaternion(self, time_s: Floats) -> Floats:
+        """Return the attitude (body to world) as quaternions x y z w, shape (n, 4)."""
+        quaternions: Floats = Rotation.from_euler("ZYX", self.angles(time_s)).as_quat()
+        return quaternions
+
+    def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+        """Return where a point of the body is, shape (n, 3)."""
+        rotated = Rotation.from_euler("ZYX", self.angles(time_s)).apply(np.array(lever_arm_m))
+        return np.asarray(self.position(time_s) + rotated)
+
+
+def sample(motion: RandomFlight | Waypoints | Static, duration_s: float, rng: np.random.Generator) -> Trajectory:
+    """Make the trajectory of a body over [0, duration_s]; random ones draw from `rng`."""
+    return _MAKERS[type(motion)](motion, duration_s, rng)
+
+
+def _static(motion: Static, _duration_s: float, _rng: np.random.Generator) -> Trajectory:
+    point = np.array(motion.position_m)
+    yaw = np.array([np.radians(motion.yaw_deg), 0.0, 0.0])
+    return Trajectory(
+        lambda t: np.broadcast_to(point, (len(t), 3)).copy(),
+        lambda t: np.broadcast_to(yaw, (len(t), 3)).copy(),
+    )
+
+
+def _waypoints(motion: Waypoints, _duration_s: float, _rng: np.random.Generator) -> Trajectory:
+    times = np.array(motion.times_s)
+    path = CubicSpline(times, np.array(motion.points_m), bc_type="clamped")
+    return Trajectory(
+        # Before the first and after the last point the body hovers there.
+        lambda t: np.asarray(path(np.clip(t, times[0], times[-1]))),
+        lambda t: np.zeros((len(t), 3)),
+    )
+
+
+def _random_flight(motion: RandomFlight, duration_s: float, rng: np.random.Generator) -> Trajectory:
+    lo, hi = np.array(motion.box_min_m), np.array(motion.box_max_m)
+    # Two random points of a box lie about 0.38 of its diagonal apart.
+    leg_s = 0.38 * float(np.linalg.norm(hi - lo)) / motion.speed_mps
+    # One control point a leg. A B-spline stays in the convex hull of its control points, hence in
+    # the box, and a cubic one has continuous acceleration.
+    count = int(np.ceil(duration_s / leg_s)) + 8
+    knots = (np.arange(count + 4) - 5) * leg_s
+    path = BSpline(knots, rng.uniform(lo, hi, (count, 3)), 3)
+    yaw = np.cumsum(rng.normal(0, 0.8, count)) + rng.uniform(-np.pi, np.pi)
+    angles = BSpline(knots, np.column_stack([yaw, rng.normal(0, TILT_RAD, (count, 2))]), 3)
+    return Trajectory(lambda t: np.asarray(path(t)), lambda t: np.asarray(angles(t)))
+
+
+_MAKERS: Final[dict[type, Callable[[Any, float, np.random.Generator], Trajectory]]] = {
+    Static: _static,
+    Waypoints: _waypoints,
+    RandomFlight: _random_flight,
+}

@@ -1,0 +1,111 @@
+"""Received power and what depends on it: antenna gain, shadowing, bias, noise, printed values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.twr import truncate4
+from uwbsim.scenario import Radio, SigmaSpline, Spline
+from uwbsim.streams import stream
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+ALPHA_DBM: Final = -82.0
+FPP_OFFSET_DB: Final = 121.74
+"""DW1000 User Manual, section 4.7.1, for a pulse repetition frequency of 64 MHz."""
+
+SKEW_GRID_PPM: Final = 9.3132e-4
+"""One count of the carrier integrator (firmware wire format, section 4)."""
+
+NULL_DEPTH: Final = 0.1
+SHADOW_HARMONICS: Final = 3
+
+
+def dipole_gain_db(sine: Floats) -> Floats:
+    """Gain of a short dipole at the angle to its axis with this sine; nulls are 20 dB deep."""
+    return 1.76 + 20 * np.log10(np.maximum(sine, NULL_DEPTH))
+
+
+ANTENNAS: Final[dict[str, Callable[[Floats], Floats]]] = {
+    "isotropic": np.zeros_like,
+    "dipole": dipole_gain_db,
+}
+
+
+def gain_db(radio: Radio, seed: int, tag: int, direction: Floats) -> Floats:
+    """Gain of a tag towards unit vectors (n, 3) in its body's frame, in dB, shape (n,).
+
+    The antenna stands along the body's z axis. Shadowing by the body is a smooth function of
+    azimuth with standard deviation `shadowing_db`, the same in every run with this seed.
+    """
+    sine = np.hypot(direction[:, 0], direction[:, 1])
+    gain = ANTENNAS[radio.antenna](sine)
+    if radio.shadowing_db:
+        azimuth = np.arctan2(direction[:, 1], direction[:, 0])
+        phases = stream(seed, "shadowing", tag).uniform(0, 2 * np.pi, SHADOW_HARMONICS)
+        order = np.arange(1, SHADOW_HARMONICS + 1)
+        waves = np.cos(np.outer(azimuth, order) + phases).sum(axis=1)
+        gain = gain + radio.shadowing_db * waves * np.sqrt(2 / SHADOW_HARMONICS)
+    return gain
+
+
+def path_gain_db(radio: Radio, distance_m: Floats) -> Floats:
+    """First-path power over distance without antennas, in dBm, shape (n,)."""
+    nearest = np.maximum(distance_m, 0.05)
+    return radio.first_path_at_1m_dbm - 10 * radio.path_loss_exponent * np.log10(nearest)
+
+
+def lifted(power_dbm: Floats) -> Floats:
+    """Lifted power 10^((p - alpha)/10) (ICRA 2023, section V)."""
+    return np.asarray(10 ** ((power_dbm - ALPHA_DBM) / 10))
+
+
+def reception_bias_s(radio: Radio, power_dbm: Floats) -> Floats:
+    """What power adds to a receive stamp, in seconds.
+
+    Each of the two receptions of a range carries it, so a range has the mean of the curve's values.
+    """
+    return _spline(radio.bias, power_dbm) / SPEED_OF_LIGHT
+
+
+def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:
+    """Standard deviation of a receive stamp, in seconds: white noise and the sigma curve.
+
+    The curve gives the range's; a range has c sqrt(s^2/2 (1 + r + r^2)) (docs/theory.md).
+    """
+    white = radio.rx_noise_ps * 1e-12
+    ratio = radio.sigma.reply_ratio if radio.sigma else 0.0
+    factor = SPEED_OF_LIGHT * np.sqrt((1 + ratio + ratio**2) / 2)
+    return np.asarray(np.hypot(white, _spline(radio.sigma, power_dbm) / factor))
+
+
+def printed_power_dbm(radio: Radio, power_dbm: Floats) -> Floats:
+    """First-path power as the boards print it: 10 log10 of a whole number, cut to four decimals."""
+    if not radio.quantize:
+        return power_dbm
+    counts = np.maximum(np.rint(10 ** ((power_dbm + FPP_OFFSET_DB) / 10)), 1)
+    return truncate4(10 * np.log10(counts) - FPP_OFFSET_DB)
+
+
+def printed_skew_ppm(radio: Radio, skew_ppm: Floats) -> Floats:
+    """Relative skew as the boards print it: whole counts of the carrier integrator."""
+    if not radio.quantize:
+        return skew_ppm
+    return truncate4(np.rint(skew_ppm / SKEW_GRID_PPM) * SKEW_GRID_PPM)
+
+
+def _spline(curve: Spline | SigmaSpline | None, power_dbm: Floats) -> Floats:
+    if curve is None:
+        return np.zeros_like(power_dbm)
+    from scipy.interpolate import BSpline
+
+    knots = np.array(curve.knots)
+    spline = BSpline(knots, np.array(curve.coefficients), curve.degree)
+    inner = knots[curve.degree], knots[-1 - curve.degree]
+    return np.asarray(spline(np.clip(lifted(power_dbm), *inner)))

@@ -1,0 +1,191 @@
+"""Runs a scenario: plan, event loop, stamps, and the recording that a real flight would have made."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.recording import Fault, Poses, Recording, Tag
+from uwblink.ticks import REPORT_BITS, UUS_TICKS
+from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, Protocol, board_range, raw_range
+from uwbsim import air
+from uwbsim.clock import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.errors import ScenarioError
+from uwbsim.radio import printed_power_dbm, printed_skew_ppm
+from uwbsim.scenario import Scenario
+from uwbsim.stamps import Draws, Stamped, draw, stamp
+from uwbsim.streams import stream
+from uwbsim.world import World
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+NOMINAL_FLIGHT_SUBTICKS = 1 << 20
+"""Flight time in the event loop: 16 ns, 5 m. The exact one is computed with the stamps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """What a scenario gave. `truth_m` (n,) is the true distance of each exchange, not recorded."""
+
+    exchanges: Exchanges
+    poses: Poses
+    tags: list[Tag]
+    faults: list[Fault]
+    truth_m: Floats
+    meta: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Everything a run needs at hand, made once from the scenario."""
+
+    scenario: Scenario
+    protocol: Protocol
+    world: World
+    clocks: Clocks
+
+
+def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Simulated:
+    """Simulate a scenario; the same scenario gives the same result on every machine.
+
+    `progress` is called with the done fraction. Raises `ScenarioError` for a run longer than the
+    integer true time carries (36 h).
+    """
+    if scenario.scenario.duration_s > LONGEST_RUN_S:
+        raise ScenarioError(f"scenario.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
+    protocol = PROTOCOLS[scenario.ranging.protocol]
+    run = _Run(scenario, protocol, World.of(scenario), Clocks.of(scenario))
+    start, initiator, target = _plan(scenario)
+    draws = draw(scenario, len(start), len(protocol.messages))
+    slots = _slots(run, start, initiator, target, draws)
+    outcomes = air.run(protocol, slots, len(scenario.tags), progress)
+    lost = np.array([o.lost for o in outcomes])
+    begun = np.array([o.start for o in outcomes], dtype=np.int64)
+    kept = np.flatnonzero(lost < 0)
+    rows = (begun[kept], initiator[kept], target[kept])
+    stamped = stamp(scenario, protocol, run.world, run.clocks, *rows, draws[kept])
+    return Simulated(
+        exchanges=_exchanges(run, kept, len(start), rows, stamped),
+        poses=run.world.motion_capture(),
+        tags=[Tag(t.id, t.body, t.lever_arm_m) for t in scenario.tags],
+        faults=_faults(run, begun, initiator, target, lost),
+        truth_m=(stamped.distance_m[0] + stamped.distance_m[1]) / 2,
+        meta=_provenance(scenario),
+    )
+
+
+def write(simulated: Simulated, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write the recording; raises what `Recording.create` raises."""
+    with Recording.create(path, meta=simulated.meta, force=force) as recording:
+        recording.append_tags(simulated.tags)
+        recording.append_poses(simulated.poses)
+        recording.append_exchanges(simulated.exchanges)
+        recording.append_faults(simulated.faults)
+
+
+def _plan(scenario: Scenario) -> tuple[Ints, Ints, Ints]:
+    """Round robin over the pairs at the rate: start times and places of initiator and target."""
+    count = int(scenario.scenario.duration_s * scenario.ranging.rate_hz)
+    place = {tag.id: k for k, tag in enumerate(scenario.tags)}
+    pairs = np.array([[place[a], place[b]] for a, b in scenario.pairs()], dtype=np.int64)
+    turn = pairs[np.arange(count) % len(pairs)]
+    start = np.arange(count) * (SUBTICKS_PER_SECOND / scenario.ranging.rate_hz)
+    return start.astype(np.int64), turn[:, 0], turn[:, 1]
+
+
+def _slots(run: _Run, start: Ints, initiator: Ints, target: Ints, draws: Draws) -> list[air.Slot]:
+    """Give the event loop what it needs, as plain integers: it does no arithmetic of its own."""
+    scenario, messages = run.scenario, run.protocol.messages
+    _, power = run.world.link(initiator, target, start)
+    heard = _heard(scenario, power, len(messages))
+    scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
+    at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
+    delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in messages]
+    columns = zip(
+        start.tolist(),
+        initiator.tolist(),
+        target.tolist(),
+        map(tuple, heard.T.tolist()),
+        zip(*(d.tolist() for d in delay), strict=True),
+        strict=True,
+    )
+    return [air.Slot(*row, NOMINAL_FLIGHT_SUBTICKS) for row in columns]
+
+
+def _heard(scenario: Scenario, power_dbm: Floats, messages: int) -> NDArray[np.bool_]:
+    """Whether each message (messages, n) is received; a little fading makes the edge soft."""
+    fading = stream(scenario.scenario.seed, "fading").normal(size=(messages, len(power_dbm)))
+    level = power_dbm + fading * scenario.radio.power_noise_db
+    return level >= scenario.radio.sensitivity_dbm
+
+
+def _exchanges(run: _Run, kept: Ints, planned: int, rows: tuple[Ints, Ints, Ints], stamped: Stamped) -> Exchanges:
+    _, initiator, target = rows
+    ids = np.array([tag.id for tag in run.scenario.tags], dtype=np.int64)
+    mask = (1 << REPORT_BITS) - 1
+    none = np.zeros(len(kept), dtype=np.int64)
+    stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & mask for name in STAMPS}
+    fpp1, skew1 = _readings(run, 1, kept, planned, (initiator, target), stamped)
+    fpp2, skew2 = _readings(run, 2, kept, planned, (target, initiator), stamped)
+    nan = np.full(len(kept), np.nan)
+    exchanges = Exchanges(
+        time_ns=np.rint(stamped.departure[0] * (1e9 / SUBTICKS_PER_SECOND)).astype(np.int64),
+        initiator=ids[initiator],
+        target=ids[target],
+        protocol=np.full(len(kept), run.protocol.name),
+        reporter=ids[initiator],
+        range_m=nan,
+        fpp1_dbm=fpp1,
+        fpp2_dbm=fpp2,
+        skew1_ppm=skew1,
+        skew2_ppm=skew2,
+        truth_m=nan,
+        bits=REPORT_BITS,
+        **stamps,
+    )
+    printed = board_range if run.scenario.radio.quantize else raw_range
+    return replace(exchanges, range_m=printed(exchanges))
+
+
+def _readings(
+    run: _Run, number: int, kept: Ints, planned: int, ends: tuple[Ints, Ints], stamped: Stamped
+) -> tuple[Floats, Floats]:
+    """What the receiver of message `number` prints: first-path power and relative skew."""
+    radio, seed = run.scenario.radio, run.scenario.scenario.seed
+    sender, receiver = ends
+    time = stamped.departure[number - 1]
+    noise = stream(seed, "power reading", number).normal(size=planned)[kept]
+    power = stamped.power_dbm[number - 1] + noise * radio.power_noise_db
+    noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
+    skew = (run.clocks.rate(receiver, time) - run.clocks.rate(sender, time)) * 1e6
+    skew += radio.skew_bias_ppm + noise * radio.skew_noise_ppm
+    return printed_power_dbm(radio, power), printed_skew_ppm(radio, skew)
+
+
+def _faults(run: _Run, start: Ints, initiator: Ints, target: Ints, lost: Ints) -> list[Fault]:
+    ids = [tag.id for tag in run.scenario.tags]
+    return [
+        Fault(
+            round(int(start[k]) * (1e9 / SUBTICKS_PER_SECOND)),
+            str(ids[initiator[k]]),
+            "lost frame",
+            f"{ids[initiator[k]]} ranged with {ids[target[k]]}: message {lost[k] + 1} below sensitivity",
+        )
+        for k in np.flatnonzero(lost >= 0)
+    ]
+
+
+def _provenance(scenario: Scenario) -> dict[str, Any]:
+    return {
+        "source": "simulation",
+        "scenario": scenario.model_dump(mode="json"),
+        "scenario_name": scenario.scenario.name,
+        "seed": scenario.scenario.seed,
+        "planted": scenario.planted(),
+    }
