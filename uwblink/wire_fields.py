@@ -1,0 +1,158 @@
+"""The fields of wire messages: how each kind is written and read, in either direction.
+
+The two directions differ: the host sends a float as four raw bytes, the boards print it with four
+decimals, cut toward zero (firmware wire format, sections 0.2 and 1.2).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from uwblink.errors import FrameError
+
+BAR: Final = b"|"
+LONGEST_TEXT: Final = 199
+LONGEST_BYTES: Final = 1000
+
+
+class Malformed(Exception):  # noqa: N818 - a signal inside the codec, not an error for users
+    """These bytes are not this field."""
+
+
+class NeedMore(Exception):  # noqa: N818 - a signal inside the codec, not an error for users
+    """So far these bytes could be this field."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of field. `size` is None for text up to the next bar, else how many raw bytes.
+
+    `size(data, at)` returns the length at a place, or raises `NeedMore` or `Malformed`.
+    """
+
+    name: str
+    read: Callable[[bytes], Any]
+    write: Callable[[Any], bytes]
+    size: Callable[[bytes, int], int] | None = None
+
+
+_FLOAT: Final = re.compile(rb"-?(0|[1-9][0-9]{0,9})\.[0-9]{4}")
+_INTEGER: Final = re.compile(rb"0|-?[1-9][0-9]{0,9}")
+
+
+def _integer(low: int, high: int) -> Kind:
+    def read(text: bytes) -> int:
+        if not _INTEGER.fullmatch(text) or not low <= int(text) <= high:
+            raise Malformed
+        return int(text)
+
+    def write(value: int) -> bytes:
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise FrameError(f"found {value!r}, expected a whole number from {low} to {high}")
+        return b"%d" % value
+
+    return Kind(f"integer {low}..{high}", read, write)
+
+
+def _read_bool(text: bytes) -> bool:
+    if text not in (b"0", b"1"):
+        raise Malformed
+    return text == b"1"
+
+
+def _write_bool(value: bool) -> bytes:
+    if not isinstance(value, bool):
+        raise FrameError(f"found {value!r}, expected True or False")
+    return b"1" if value else b"0"
+
+
+def _read_text(text: bytes) -> str:
+    try:
+        found = text.decode()
+    except UnicodeDecodeError as error:
+        raise Malformed from error
+    if len(text) > LONGEST_TEXT or "\r" in found:
+        raise Malformed
+    return found
+
+
+def _write_text(value: str) -> bytes:
+    if "|" in value or "\r" in value:
+        raise FrameError(f"found {value[:40]!r}, text on the wire cannot hold '|' or a carriage return")
+    data = value.encode()
+    if len(data) > LONGEST_TEXT:
+        raise FrameError(f"found {len(data)} bytes of text, at most {LONGEST_TEXT} fit")
+    return data
+
+
+def _read_printed(text: bytes) -> float:
+    if not _FLOAT.fullmatch(text):
+        raise Malformed
+    return float(text)
+
+
+def write_printed(value: float) -> bytes:
+    """Print a number as the boards do: four decimals, cut toward zero, `-0.0000` included."""
+    if not math.isfinite(value) or abs(value) >= 1e10:
+        raise FrameError(f"found {value!r}, expected a finite number below 1e10")
+    # What already has four decimals must not lose its last one to binary rounding.
+    whole = math.floor(abs(value) * 1e4 + 1e-6)
+    sign = b"-" if math.copysign(1, value) < 0 else b""
+    return sign + b"%d.%04d" % divmod(whole, 10_000)
+
+
+def _read_printed_or_zero(text: bytes) -> float | None:
+    return None if text == b"0" else _read_printed(text)
+
+
+def _write_printed_or_zero(value: float | None) -> bytes:
+    return b"0" if value is None else write_printed(value)
+
+
+def _read_raw_float(data: bytes) -> float:
+    return float(struct.unpack("<f", data)[0])
+
+
+def _write_raw_float(value: float) -> bytes:
+    try:
+        return struct.pack("<f", value)
+    except (OverflowError, struct.error) as error:
+        raise FrameError(f"found {value!r}, expected a number that fits four bytes") from error
+
+
+def _bytes(longest: int) -> Kind:
+    def size(data: bytes, at: int) -> int:
+        if len(data) < at + 2:
+            raise NeedMore
+        length = int.from_bytes(data[at : at + 2], "little")
+        if length > longest:
+            raise Malformed
+        return 2 + length
+
+    def write(value: bytes) -> bytes:
+        if len(value) > longest:
+            raise FrameError(f"found {len(value)} bytes, at most {longest} fit")
+        return len(value).to_bytes(2, "little") + value
+
+    return Kind(f"bytes up to {longest}", lambda data: data[2:], write, size)
+
+
+def _four(_data: bytes, _at: int) -> int:
+    return 4
+
+
+ID: Final = _integer(0, 255)
+STAMP: Final = _integer(0, 2**32 - 1)
+INT: Final = _integer(-(2**31), 2**31 - 1)
+BOOL: Final = Kind("bool", _read_bool, _write_bool)
+TEXT: Final = Kind("text", _read_text, _write_text)
+PRINTED: Final = Kind("printed number", _read_printed, write_printed)
+PRINTED_OR_ZERO: Final = Kind("printed number or 0", _read_printed_or_zero, _write_printed_or_zero)
+RAW_FLOAT: Final = Kind("four-byte float", _read_raw_float, _write_raw_float, _four)
+BROADCAST: Final = _bytes(92)
+BYTES: Final = _bytes(LONGEST_BYTES)
