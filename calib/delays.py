@@ -60,6 +60,15 @@ Clock ratios differ from 1 by parts per million, which lifts a free direction to
 """
 
 MAX_STEPS: Final = 100
+SETTLING: Final = 4
+"""Steps of reweighting during which an unknown scale follows the residuals; then it stands."""
+
+NEWTON_M: Final = 0.01
+"""Newton's steps begin when reweighting moves no range by more than this, and may not move one further."""
+
+CHUNK: Final = 16_384
+"""Rows of a matrix worked on at once, so that they stay in the cache."""
+
 STILL_M: Final = 1e-8
 """A step that moves no range by more than this ends the iteration (0.03 fs of flight)."""
 
@@ -122,24 +131,24 @@ def robust_fit(
     """
     ridge = np.zeros((matrix.shape[1],) * 2) if penalty is None else penalty
     x = start if start is not None else _absolute_start(matrix, aim, ridge)
+    function = LOSSES[loss]
+    reach = np.abs(matrix).max(axis=0)
     residual = aim - matrix @ x
     width = scale or _scale(residual)
     steps, moved = 0, np.inf
-    function = LOSSES[loss]
     while moved > STILL_M and steps < MAX_STEPS:
         weight, slope = function(residual / width)
         gradient = matrix.T @ (weight * residual) - ridge @ x
-        # Newton where the loss is convex enough, iterated reweighting where it is not.
-        curvature = slope if steps > 3 else weight
-        step = _solve(matrix, curvature, ridge, gradient)
-        trial = x + step
-        if steps > 3 and not np.all(np.isfinite(trial)):
-            break
-        x, residual = trial, aim - matrix @ trial
-        moved = float(np.max(np.abs(matrix.max(axis=0) * step)))
-        if scale is None and steps <= 3:
-            width = _scale(residual)
+        # Reweighting descends from anywhere; Newton is faster, where it descends at all.
+        step = _newton(matrix, slope, ridge, gradient) if steps >= SETTLING and moved < NEWTON_M else None
+        if step is None or np.max(np.abs(reach * step)) > NEWTON_M:
+            step = np.asarray(np.linalg.lstsq(_normal(matrix, weight, ridge), gradient, rcond=1e-13)[0])
+        x = np.asarray(x + step)
+        residual = aim - matrix @ x
+        moved = float(np.max(np.abs(reach * step)))
         steps += 1
+        if scale is None and steps <= SETTLING:
+            width = _scale(residual)
     return Solution(
         x,
         _sandwich(matrix, residual, function, width, ridge),
@@ -148,6 +157,15 @@ def robust_fit(
         steps,
         moved <= STILL_M,
     )
+
+
+def _newton(matrix: Floats, slope: Floats, ridge: Floats, gradient: Floats) -> Floats | None:
+    """Return Newton's step, None where the loss is not convex."""
+    curvature = _normal(matrix, slope, ridge)
+    values = np.linalg.eigvalsh(curvature)
+    if values[0] <= 1e-10 * values[-1]:
+        return None
+    return np.asarray(np.linalg.solve(curvature, gradient))
 
 
 def _scale(residual: Floats) -> float:
@@ -161,20 +179,24 @@ def _absolute_start(matrix: Floats, aim: Floats, ridge: Floats) -> Floats:
     weight = np.ones(len(aim))
     x = np.zeros(matrix.shape[1])
     for _ in range(5):
-        x = x + _solve(matrix, weight, ridge, matrix.T @ (weight * (aim - matrix @ x)) - ridge @ x)
+        gradient = matrix.T @ (weight * (aim - matrix @ x)) - ridge @ x
+        x = x + np.linalg.lstsq(_normal(matrix, weight, ridge), gradient, rcond=1e-13)[0]
         residual = np.abs(aim - matrix @ x)
         weight = 1 / np.maximum(residual, 0.1 * np.median(residual) + 1e-9)
         weight /= weight.max()
     return x
 
 
-def _solve(matrix: Floats, weight: Floats, ridge: Floats, gradient: Floats) -> Floats:
-    normal = (matrix * weight[:, None]).T @ matrix + ridge
-    return np.asarray(np.linalg.lstsq(normal, gradient, rcond=1e-13)[0])
+def _normal(matrix: Floats, weight: Floats, ridge: Floats) -> Floats:
+    normal = ridge.copy()
+    for begin in range(0, len(matrix), CHUNK):
+        part = matrix[begin : begin + CHUNK]
+        normal += (part * weight[begin : begin + CHUNK, None]).T @ part
+    return normal
 
 
 def _sandwich(matrix: Floats, residual: Floats, function: Loss, width: float, ridge: Floats) -> Floats:
     weight, slope = function(residual / width)
-    bread = np.linalg.pinv((matrix * slope[:, None]).T @ matrix + ridge, rcond=1e-12)
+    bread = np.linalg.pinv(_normal(matrix, slope, ridge), rcond=1e-12)
     score = matrix * (weight * residual)[:, None]
     return np.asarray(bread @ (score.T @ score) @ bread)

@@ -2,8 +2,9 @@
 
 A constant in the curve and a shift common to all delays are the same thing (docs/theory.md), so the fit
 must choose: the curve's average over the populated range of lifted power is zero. Delays then do not
-depend on how often a flight happened to see each power, only on the range. Curve and delays together
-put the mean calibrated error of the inliers at zero.
+depend on how often a flight happened to see each power, only on the range. Curve and delays together put the
+centre of the core of the calibrated errors at zero: the core is told from the tail of reflections by its shape
+(`calib.mixture`), so the tail does not pull it.
 """
 
 from __future__ import annotations
@@ -19,12 +20,14 @@ from calib.calibration import Calibration
 from calib.dataset import Ranges
 from calib.delays import check_determined, design, robust_fit
 from calib.errors import UnanswerableError
+from calib.mixture import take_apart
 from calib.power import (
     ALPHA_DBM,
     BIAS_SEGMENTS,
     DEGREE,
     Curve,
     basis,
+    equal_bins,
     knots_for,
     lifted_power,
     populated,
@@ -36,7 +39,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 Floats = NDArray[np.float64]
 
 FEWEST: Final = 100
-SMOOTHNESS: Final = 1e-3
+SMOOTHNESS: Final = 1e-4
 INLIER_SIGMAS: Final = 3.0
 
 
@@ -95,9 +98,11 @@ def fit(
     delays, shape = np.split(joint.parameters, [len(tags)])
     # Errors are raw + delays - curve; the curve so far has zero mean over the data.
     core = error + matrix @ delays - (splines - centre) @ shape
-    sigma = sigma_curve(lifted, core - np.median(core))
-    inliers = np.abs(core - np.median(core)) < INLIER_SIGMAS * sigma(lifted)
-    centre_m = float(np.mean(core[inliers]))
+    bins = equal_bins(lifted)
+    makeup = take_apart(core, bins, int(bins.max()) + 1)
+    sigma = sigma_curve(lifted, bins, makeup.sigma_m)
+    centre_m = makeup.location_m
+    inliers = np.abs(core - centre_m) < INLIER_SIGMAS * sigma(lifted)
     # The integral of a B-spline is its coefficients times a quarter of each one's span.
     average = float(shape @ (knots[DEGREE + 1 :] - knots[: -DEGREE - 1])) / (DEGREE + 1) / (high - low)
     constant = -average
@@ -122,7 +127,7 @@ def fit(
     )
     return FitResult(
         calibration,
-        core - centre_m,
+        calibration.apply(ranges).full_m - ranges.truth_m,
         inliers,
         joint.success,
         f"{'converged' if joint.success else 'stopped'} after {joint.steps} steps",

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 ALPHA_DBM: Final = -82.0
 DEGREE: Final = 3
 BIAS_SEGMENTS: Final = 8
 SIGMA_SEGMENTS: Final = 4
 SIGMA_BINS: Final = 30
+SIGMA_SMOOTHNESS: Final = 0.1
 SIGMA_FLOOR_M: Final = 0.002
 """A tick is 4.7 mm long; no range is better than half of one."""
 
@@ -98,28 +100,26 @@ def roughness(count: int) -> Floats:
     return np.asarray(second.T @ second)
 
 
-def sigma_curve(lifted: Floats, residual_m: Floats) -> Curve:
-    """Fit the standard deviation of the core of residuals (n,) over lifted power.
+def equal_bins(lifted: Floats, most: int = SIGMA_BINS) -> Ints:
+    """Return the bin of each lifted power (n,): bins of equal count, at least 20 each, in order of power."""
+    count = min(most, max(1, len(lifted) // 20))
+    bins = np.empty(len(lifted), dtype=np.int64)
+    bins[np.argsort(lifted)] = np.arange(len(lifted)) * count // len(lifted)
+    return bins
 
-    Reflections only ever lengthen a range, so the core's spread is read from the side below the
-    centre: 1.4826 times the median distance of those residuals, in bins of equal count. The spline's
-    coefficients are held above a floor, and with them the whole curve.
+
+def sigma_curve(lifted: Floats, bins: Ints, sigma_m: Floats) -> Curve:
+    """Draw a curve through the standard deviations (bins,) of the bins of lifted power (n,).
+
+    The spline's coefficients are held above a floor, and with them the whole curve.
     """
     from scipy.optimize import lsq_linear
 
-    order = np.argsort(lifted)
-    bins = np.array_split(order, min(SIGMA_BINS, max(1, len(order) // 20)))
-    where = np.array([np.median(lifted[rows]) for rows in bins])
-    spread = np.array([_lower_spread(residual_m[rows]) for rows in bins])
+    where = np.array([np.median(lifted[bins == k]) for k in range(len(sigma_m))])
     knots = knots_for(lifted, SIGMA_SEGMENTS)
     design = basis(where, knots)
-    smooth = np.diff(np.eye(design.shape[1]), 2, axis=0) * 0.3
+    smooth = SIGMA_SMOOTHNESS * np.diff(np.eye(design.shape[1]), 2, axis=0)
     stacked = np.vstack([design, smooth])
-    aim = np.concatenate([spread, np.zeros(len(smooth))])
+    aim = np.concatenate([sigma_m, np.zeros(len(smooth))])
     solution = lsq_linear(stacked, aim, bounds=(SIGMA_FLOOR_M, np.inf), tol=1e-12)
     return Curve(tuple(knots.tolist()), tuple(solution.x.tolist()), DEGREE, populated(lifted))
-
-
-def _lower_spread(residual_m: Floats) -> float:
-    below = -residual_m[residual_m < 0]
-    return 1.4826 * float(np.median(below)) if len(below) else 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.recording import Poses, Tag
+from uwblink.schema import Poses, Tag
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwblink.recording import TABLES, Recording
+from uwblink.recording import Recording
+from uwblink.schema import TABLES
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.recording import Fault, Poses, Recording, Tag
+from uwblink.recording import Recording
+from uwblink.schema import Fault, Poses, Tag
 from uwblink.ticks import REPORT_BITS, UUS_TICKS
 from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, Protocol, board_range, raw_range
 from uwbsim import air

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from uwblink.recording import Poses
+from uwblink.schema import Poses
 from uwbsim.clock import SUBTICKS_PER_SECOND
 from uwbsim.motion import Trajectory, sample
 from uwbsim.radio import gain_db, path_gain_db

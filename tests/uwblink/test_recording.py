@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from uwblink.errors import RecordingError, RecordingExistsError, RecordingMissingError
-from uwblink.recording import Fault, Poses, Recording, Tag
+from uwblink.recording import Recording
+from uwblink.schema import Fault, Poses, Tag
 from uwblink.twr import COLUMNS, Exchanges
 
 

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.mapping import LEVELS, POSITIONS, STAMP_UNITS, TIME_UNITS, ColumnMap
-from uwblink.recording import Recording, Tag, check_output
+from uwblink.recording import Recording, check_output
+from uwblink.schema import Tag
 from uwblink.twr import STAMPS, Exchanges, raw_range
 
 Floats = NDArray[np.float64]

@@ -1,0 +1,40 @@
+"""Ranges with planted delays and curve, made without the simulator."""
+
+import numpy as np
+
+from calib.dataset import Ranges
+from uwblink.ticks import SPEED_OF_LIGHT
+
+DELAYS_NS = {1: -0.36, 2: 0.05, 3: 0.24, 7: -0.11}
+PAIRS = [(1, 2), (1, 3), (1, 7), (2, 3), (2, 7), (3, 7)]
+
+
+def bias_m(lifted):
+    return 0.08 * np.sin(4 * lifted) - 0.03
+
+
+def ranges(n=6000, noise_m=0.05, tail=0.1, seed=1, k=1.00001, bias=bias_m):
+    rng = np.random.default_rng(seed)
+    pair = np.array(PAIRS)[np.arange(n) % len(PAIRS)]
+    initiator, target = pair.T
+    fpp = rng.uniform(-95, -80, (2, n))
+    lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
+    truth = rng.uniform(1, 6, n)
+    delay = np.array([DELAYS_NS.get(t, np.nan) for t in range(8)])
+    raw = truth + bias(lifted) - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + k * delay[target])
+    raw = raw + rng.normal(0, 1, n) * noise_m + np.where(rng.random(n) < tail, rng.exponential(0.4, n), 0)
+    return Ranges(
+        source="synthetic",
+        time_ns=np.arange(n) * 5_000_000,
+        initiator=initiator,
+        target=target,
+        protocol=np.full(n, "ds"),
+        raw_m=raw,
+        truth_m=truth,
+        weight_initiator=np.full(n, 0.5),
+        weight_target=np.full(n, 0.5 * k),
+        fpp1_dbm=fpp[0],
+        fpp2_dbm=fpp[1],
+        excluded={},
+        planted=None,
+    )

@@ -1,0 +1,75 @@
+"""Delays and curves together: planted truth, the gauge, and what cannot be answered."""
+
+import numpy as np
+import pytest
+
+from calib.errors import UnanswerableError
+from calib.fit import fit
+from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+from uwblink.ticks import SPEED_OF_LIGHT
+
+
+def corrections(result):
+    """Fitted total correction minus the planted one, by pair of equal tags, over power."""
+    c = result.calibration
+    grid = np.linspace(*c.bias_curve.range, 200)
+    common = np.mean([c.delays_ns[t] - d for t, d in DELAYS_NS.items()]) * 1e-9 * SPEED_OF_LIGHT
+    return c.bias_curve(grid) - common - bias_m(grid)
+
+
+def test_planted_delays_and_curve_come_back():
+    result = fit(ranges(20_000))
+    c = result.calibration
+    shift = np.mean([c.delays_ns[t] - d for t, d in DELAYS_NS.items()])
+    for tag, delay in DELAYS_NS.items():
+        # 3300 ranges a pair at 5 cm leave 5 ps of standard error in a delay; four of those.
+        assert c.delays_ns[tag] - shift == pytest.approx(delay, abs=0.020)
+    assert np.sqrt(np.mean(corrections(result) ** 2)) < 0.004
+    assert c.sigma_curve(np.array([0.2, 0.5, 0.9])) == pytest.approx(0.05, rel=0.06)
+
+
+def test_curve_has_zero_average_over_its_range():
+    c = fit(ranges()).calibration
+    grid = np.linspace(*c.bias_curve.range, 20_001)
+    assert np.mean(c.bias_curve(grid)) == pytest.approx(0, abs=1e-5)
+
+
+def test_curves_are_held_constant_and_flagged_beyond_their_range():
+    c = fit(ranges()).calibration
+    low, high = c.bias_curve.range
+    outside = np.array([-5.0, low - 1e-6, high + 1e-6, 50.0])
+    np.testing.assert_allclose(c.bias_curve(outside), c.bias_curve(np.array([low, low, high, high])), atol=1e-9)
+    assert not c.bias_curve.inside(outside).any()
+    assert np.all(c.sigma_curve(np.linspace(-5, 50, 500)) > 0)
+
+
+def test_residuals_belong_to_the_calibration():
+    r = ranges()
+    result = fit(r)
+    np.testing.assert_allclose(result.residuals_m, result.calibration.apply(r).full_m - r.truth_m, atol=1e-9)
+
+
+def test_inputs_stay_as_they_are():
+    r = ranges()
+    before = r.raw_m.copy()
+    fit(r)
+    np.testing.assert_array_equal(r.raw_m, before)
+
+
+@pytest.mark.parametrize("lift", ["mean-of-lifted", "lift-of-mean"])
+@pytest.mark.parametrize("loss", ["cauchy", "huber", "soft_l1", "l2"])
+def test_every_option_fits(loss, lift):
+    c = fit(ranges(tail=0.02), loss=loss, lift=lift).calibration
+    assert (c.loss, c.lift) == (loss, lift)
+    assert np.all(np.isfinite(list(c.delays_ns.values())))
+
+
+def test_what_cannot_be_answered_says_why():
+    with pytest.raises(UnanswerableError, match="too few"):
+        fit(ranges(60))
+    r = ranges()
+    constant = r.fpp1_dbm * 0 - 82.0
+    from dataclasses import replace
+
+    with pytest.raises(UnanswerableError, match="power never changes"):
+        fit(replace(r, fpp1_dbm=constant, fpp2_dbm=constant))

@@ -1,0 +1,109 @@
+"""What a recording consists of: its tables and columns, and the rows that are not exchanges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink import __version__
+from uwblink.ticks import ANTENNA_DELAY_TICKS, REPORT_BITS, SPEED_OF_LIGHT, TICKS_PER_SECOND
+from uwblink.twr import COLUMNS
+
+FORMAT_VERSION: Final = 1
+SUFFIX: Final = ".uwb"
+
+_EXCHANGE_TYPES: Final = {
+    **dict.fromkeys(COLUMNS, "BIGINT"),
+    **dict.fromkeys(("initiator", "target", "reporter"), "USMALLINT"),
+    **dict.fromkeys([c for c in COLUMNS if c.endswith(("_m", "_dbm", "_ppm"))], "DOUBLE"),
+    "protocol": "VARCHAR",
+}
+_LISTENER_STAMPS: Final = ("rx1", "rx2", "rx3")
+_NEIGHBOUR_STAMPS: Final = ("tx1_n", "rx1_n", "tx2_n", "rx2_n", "tx3_n", "rx3_n")
+_LISTENER_LEVELS: Final = (
+    "fpp1_dbm",
+    "fpp2_dbm",
+    "fpp3_dbm",
+    "skew1_ppm",
+    "skew2_ppm",
+    "skew3_ppm",
+)
+_NEIGHBOUR_LEVELS: Final = ("fpp1_n_dbm", "fpp2_n_dbm", "skew1_n_ppm", "skew2_n_ppm")
+
+TABLES: Final[dict[str, dict[str, str]]] = {
+    "meta": {"key": "VARCHAR", "value": "VARCHAR"},
+    "tags": {"tag": "USMALLINT", "body": "VARCHAR", "x": "DOUBLE", "y": "DOUBLE", "z": "DOUBLE"},
+    "poses": {
+        "time_ns": "BIGINT",
+        "body": "VARCHAR",
+        **dict.fromkeys(("x", "y", "z", "qx", "qy", "qz", "qw"), "DOUBLE"),
+    },
+    "exchanges": _EXCHANGE_TYPES,
+    "overheard": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("listener", "initiator", "target"), "USMALLINT"),
+        **dict.fromkeys(_LISTENER_STAMPS + _NEIGHBOUR_STAMPS, "BIGINT"),
+        **dict.fromkeys(_LISTENER_LEVELS + _NEIGHBOUR_LEVELS, "DOUBLE"),
+    },
+    "cirs": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("board", "initiator", "target"), "USMALLINT"),
+        "first_path_index": "DOUBLE",
+        "magnitudes": "USMALLINT[]",
+    },
+    "frames": {"time_ns": "BIGINT", "board": "VARCHAR", "direction": "VARCHAR", "bytes": "BLOB"},
+    "faults": {"time_ns": "BIGINT", "board": "VARCHAR", "kind": "VARCHAR", "detail": "VARCHAR"},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """Where a tag sits: its body, and its lever arm in that body's frame in metres."""
+
+    tag: int
+    body: str
+    lever_arm_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses of bodies as columns of length n, in order of time.
+
+    `position_m` (n, 3) is r_iw_a, the body's position resolved in the world frame (ENU);
+    `quaternion` (n, 4), order x y z w, rotates body vectors into the world frame.
+    """
+
+    time_ns: NDArray[np.int64]
+    body: NDArray[np.str_]
+    position_m: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.time_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that went wrong while recording: a time-out, garbage, a failed exchange."""
+
+    time_ns: int
+    board: str
+    kind: str
+    detail: str
+
+
+def standard_meta() -> dict[str, Any]:
+    """Return the entries that every recording carries."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "writer": "uwbcal",
+        "writer_version": __version__,
+        "speed_of_light": SPEED_OF_LIGHT,
+        "ticks_per_second": TICKS_PER_SECOND,
+        "timestamp_bits": REPORT_BITS,
+        "configured_antenna_delay_ticks": {"tx": ANTENNA_DELAY_TICKS, "rx": ANTENNA_DELAY_TICKS},
+    }
