@@ -66,7 +66,7 @@ SETTLING: Final = 4
 NEWTON_M: Final = 0.01
 """Newton's steps begin when reweighting moves no range by more than this, and may not move one further."""
 
-CHUNK: Final = 16_384
+CHUNK: Final = 2048
 """Rows of a matrix worked on at once, so that they stay in the cache."""
 
 STILL_M: Final = 1e-8

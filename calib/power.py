@@ -91,7 +91,7 @@ def basis(lifted: Floats, knots: Floats) -> Floats:
     from scipy.interpolate import BSpline
 
     clamped = np.clip(lifted, knots[0], knots[-1])
-    return np.asarray(BSpline.design_matrix(clamped, knots, DEGREE).toarray())
+    return np.asarray(BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)(clamped))
 
 
 def roughness(count: int) -> Floats:
@@ -115,7 +115,8 @@ def sigma_curve(lifted: Floats, bins: Ints, sigma_m: Floats) -> Curve:
     """
     from scipy.optimize import lsq_linear
 
-    where = np.array([np.median(lifted[bins == k]) for k in range(len(sigma_m))])
+    middles = (np.searchsorted(np.sort(bins), np.arange(len(sigma_m))) + np.bincount(bins) // 2).astype(np.int64)
+    where = np.sort(lifted)[middles]
     knots = knots_for(lifted, SIGMA_SEGMENTS)
     design = basis(where, knots)
     smooth = SIGMA_SMOOTHNESS * np.diff(np.eye(design.shape[1]), 2, axis=0)

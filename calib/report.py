@@ -15,14 +15,15 @@ from calib.evaluation import STAGES, Evaluation, Group, evaluate
 STYLE: Final = """
 :root { color-scheme: light dark; --ink: #1a1a1a; --page: #fff; --line: #ccc; --soft: #f3f5f7; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e8e8e8; --page: #16181b; --line: #444; --soft: #22262b; } }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--page); max-width: 960px;
+body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--page); max-width: 1040px;
   margin: 0 auto; padding: 1rem; }
 h1 { line-height: 1.2; } h2 { margin-top: 2.2rem; border-bottom: 1px solid var(--line); }
 .lead { font-size: 1.15rem; background: var(--soft); padding: .8rem 1rem; border-radius: .4rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .2rem .7rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th, td { padding: .2rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; } tr.all { font-weight: bold; }
+tr.above th { text-align: center; border-left: 1px solid var(--line); }
 figure { margin: 1rem 0; } figure img { width: 100%; height: auto; background: #fff; border-radius: .4rem; }
 figcaption { font-size: .9rem; } pre { background: var(--soft); padding: .6rem; overflow-x: auto; }
 @media print { body { max-width: none; } h2 { break-after: avoid; } figure, tr { break-inside: avoid; } }
@@ -111,14 +112,15 @@ def _delays(ranges: Ranges, calibration: Calibration) -> str:
 
 
 def _before_after(evaluation: Evaluation) -> str:
-    header = ["pair", "n", *[f"{s} {w}" for s in STAGES for w in ("mean", "std", "robust")], "rejected", "clamped"]
+    header = ["pair", "n", *["mean", "std", "robust"] * len(STAGES), "rejected", "clamped"]
     rows = [[escape(name), *_cells(group)] for name, group in evaluation.pairs.items()]
     rows.append(["all", *_cells(evaluation.overall)])
     note = (
         "<p>Errors in cm. Robust is 1.4826 median absolute deviations. Rejected: share beyond the 95 % quantile of "
         "chi-square with the calibrated variance. Clamped: share at powers the curves were not fitted at.</p>"
     )
-    return _table(header, rows, last="all") + note
+    spans = "<th colspan='2'></th>" + "".join(f"<th colspan='3'>{s}</th>" for s in STAGES) + "<th colspan='2'></th>"
+    return _table(header, rows, last="all", above=f"<tr class='above'>{spans}</tr>") + note
 
 
 def _cells(group: Group) -> list[str]:
@@ -165,10 +167,10 @@ def _figure(png: bytes, caption: str) -> str:
     )
 
 
-def _table(header: list[str], rows: list[list[str]], last: str = "") -> str:
+def _table(header: list[str], rows: list[list[str]], last: str = "", above: str = "") -> str:
     head = "".join(f"<th>{name}</th>" for name in header)
     body = "".join(
         f"<tr class='{last if row is rows[-1] else ''}'>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>"
         for row in rows
     )
-    return f"<div class='wide'><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    return f"<div class='wide'><table><thead>{above}<tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
