@@ -79,10 +79,14 @@ def populated(lifted: Floats) -> tuple[float, float]:
 
 
 def knots_for(lifted: Floats, segments: int) -> Floats:
-    """Return clamped knots with `segments` intervals, each holding as many data as the others."""
+    """Return clamped knots with `segments` intervals, halfway between equal counts and equal lengths.
+
+    Equal counts alone leave the sparse high powers to one long segment, equal lengths the sparse ones without data.
+    """
     low, high = populated(lifted)
-    inner = np.quantile(np.clip(lifted, low, high), np.linspace(0, 1, segments + 1))
-    inner = np.linspace(low, high, segments + 1) if np.any(np.diff(inner) <= 0) else inner
+    shares = np.linspace(0, 1, segments + 1)
+    inner = (np.quantile(np.clip(lifted, low, high), shares) + np.linspace(low, high, segments + 1)) / 2
+    inner[[0, -1]] = low, high
     return np.concatenate([[low] * DEGREE, inner, [high] * DEGREE])
 
 
