@@ -149,5 +149,5 @@ def _provenance(ranges: Ranges, inliers: NDArray[np.bool_]) -> dict[str, Any]:
         "exchanges": len(ranges),
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,
-        "gauge": "common delay from a fit of delays alone; average of the bias curve over its range is zero",
+        "gauge": "average of the bias curve over its range is zero; the delays carry the constant",
     }

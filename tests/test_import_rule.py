@@ -15,7 +15,7 @@ FORBIDDEN = {
 }
 # A library that belongs to certain files only.
 CONFINED = {
-    "serial": lambda path: path == "uwblink/board.py",
+    "serial": lambda path: path == "uwblink/ports.py",
     "simpy": lambda path: path.startswith("uwbsim/"),
     "matplotlib": lambda path: Path(path).name == "figures.py",
     "typer": lambda path: Path(path).name == "cli.py",

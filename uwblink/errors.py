@@ -23,3 +23,47 @@ class RecordingMissingError(UwblinkError, FileNotFoundError):
 
 class ImportTableError(UwblinkError, ValueError):
     """A table whose columns or cells cannot be understood; quotes the row and the column."""
+
+
+class PlanError(UwblinkError, ValueError):
+    """A ranging plan that cannot be played."""
+
+
+class PortError(UwblinkError, OSError):
+    """A serial port that cannot be used; says which and why."""
+
+    def __str__(self) -> str:
+        """Return the message (an `OSError` would print its arguments)."""
+        return str(self.args[0]) if self.args else ""
+
+
+class PortMissingError(PortError, FileNotFoundError):
+    """No such port."""
+
+
+class PortPermissionError(PortError, PermissionError):
+    """The port belongs to somebody else; says which group to join."""
+
+
+class PortBusyError(PortError):
+    """Another process has the port open."""
+
+
+class PortLostError(PortError, ConnectionError):
+    """The port disappeared while it was in use."""
+
+
+class BoardError(UwblinkError):
+    """A board that did not do what it was asked to."""
+
+
+class NoAnswerError(BoardError, TimeoutError):
+    """A board did not answer in time; says what was sent and what was heard."""
+
+
+class RangingFailedError(BoardError):
+    """An exchange failed; quotes the board's own line."""
+
+
+class RefusedError(BoardError, ValueError):
+    """A request that would harm the board, or that it would not understand; nothing was sent."""

@@ -18,6 +18,7 @@ from uwblink.errors import FrameError
 BAR: Final = b"|"
 LONGEST_TEXT: Final = 199
 LONGEST_BYTES: Final = 1000
+LONGEST_BROADCAST: Final = 92
 
 
 class Malformed(Exception):  # noqa: N818 - a signal inside the codec, not an error for users
@@ -154,5 +155,5 @@ TEXT: Final = Kind("text", _read_text, _write_text)
 PRINTED: Final = Kind("printed number", _read_printed, write_printed)
 PRINTED_OR_ZERO: Final = Kind("printed number or 0", _read_printed_or_zero, _write_printed_or_zero)
 RAW_FLOAT: Final = Kind("four-byte float", _read_raw_float, _write_raw_float, _four)
-BROADCAST: Final = _bytes(92)
+BROADCAST: Final = _bytes(LONGEST_BROADCAST)
 BYTES: Final = _bytes(LONGEST_BYTES)

@@ -76,7 +76,11 @@ def _random_flight(motion: RandomFlight, duration_s: float, rng: np.random.Gener
     path = BSpline(knots, rng.uniform(lo, hi, (count, 3)), 3)
     yaw = np.cumsum(rng.normal(0, 0.8, count)) + rng.uniform(-np.pi, np.pi)
     angles = BSpline(knots, np.column_stack([yaw, rng.normal(0, TILT_RAD, (count, 2))]), 3)
-    return Trajectory(lambda t: np.asarray(path(t)), lambda t: np.asarray(angles(t)))
+    # A little after the end, where the last exchange may still be under way, the body holds its place.
+    last_s = duration_s + leg_s
+    return Trajectory(
+        lambda t: np.asarray(path(np.minimum(t, last_s))), lambda t: np.asarray(angles(np.minimum(t, last_s)))
+    )
 
 
 _MAKERS: Final[dict[type, Callable[[Any, float, np.random.Generator], Trajectory]]] = {

@@ -85,19 +85,24 @@ def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:
     return np.asarray(np.hypot(white, _spline(radio.sigma, power_dbm) / factor))
 
 
-def printed_power_dbm(radio: Radio, power_dbm: Floats) -> Floats:
-    """First-path power as the boards print it: 10 log10 of a whole number, cut to four decimals."""
+def printed_power_dbm(radio: Radio, power_dbm: Floats, noise: Floats) -> Floats:
+    """First-path power as the boards print it: 10 log10 of a whole number, cut to four decimals.
+
+    `noise` is standard normal, shape (n,).
+    """
+    read = power_dbm + noise * radio.power_noise_db
     if not radio.quantize:
-        return power_dbm
-    counts = np.maximum(np.rint(10 ** ((power_dbm + FPP_OFFSET_DB) / 10)), 1)
+        return read
+    counts = np.maximum(np.rint(10 ** ((read + FPP_OFFSET_DB) / 10)), 1)
     return truncate4(10 * np.log10(counts) - FPP_OFFSET_DB)
 
 
-def printed_skew_ppm(radio: Radio, skew_ppm: Floats) -> Floats:
-    """Relative skew as the boards print it: whole counts of the carrier integrator."""
+def printed_skew_ppm(radio: Radio, skew_ppm: Floats, noise: Floats) -> Floats:
+    """Relative skew as the boards print it: whole counts of the carrier integrator, with its bias and noise."""
+    read = skew_ppm + radio.skew_bias_ppm + noise * radio.skew_noise_ppm
     if not radio.quantize:
-        return skew_ppm
-    return truncate4(np.rint(skew_ppm / SKEW_GRID_PPM) * SKEW_GRID_PPM)
+        return read
+    return truncate4(np.rint(read / SKEW_GRID_PPM) * SKEW_GRID_PPM)
 
 
 def _spline(curve: Spline | SigmaSpline | None, power_dbm: Floats) -> Floats:

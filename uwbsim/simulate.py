@@ -161,12 +161,13 @@ def _readings(
     radio, seed = run.scenario.radio, run.scenario.scenario.seed
     sender, receiver = ends
     time = stamped.departure[number - 1]
-    noise = stream(seed, "power reading", number).normal(size=planned)[kept]
-    power = stamped.power_dbm[number - 1] + noise * radio.power_noise_db
-    noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
+    power_noise = stream(seed, "power reading", number).normal(size=planned)[kept]
+    skew_noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
     skew = (run.clocks.rate(receiver, time) - run.clocks.rate(sender, time)) * 1e6
-    skew += radio.skew_bias_ppm + noise * radio.skew_noise_ppm
-    return printed_power_dbm(radio, power), printed_skew_ppm(radio, skew)
+    return (
+        printed_power_dbm(radio, stamped.power_dbm[number - 1], power_noise),
+        printed_skew_ppm(radio, skew, skew_noise),
+    )
 
 
 def _faults(run: _Run, start: Ints, initiator: Ints, target: Ints, lost: Ints) -> list[Fault]:

@@ -72,17 +72,16 @@ def draw(scenario: Scenario, count: int, messages: int) -> Draws:
     return Draws(
         transmit=np.array([stream(seed, "transmit noise", k).normal(size=count) for k in numbers]),
         receive=np.array([stream(seed, "receive noise", k).normal(size=count) for k in numbers]),
-        reply_s=_reply_s(scenario, count),
+        reply_s=draw_reply_s(scenario, stream(seed, "reply latency"), count),
         excess_m=excess,
     )
 
 
-def _reply_s(scenario: Scenario, count: int) -> Floats:
-    """Reply latency, in the mixture measured on boards (firmware wire format, section 5)."""
+def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Floats:
+    """Draw reply latencies (count,) from the mixture measured on boards (firmware wire format, section 5)."""
     reply = scenario.ranging.reply
     if reply.model == "fixed":
         return np.full(count, reply.delay_us * 1e-6)
-    rng = stream(scenario.scenario.seed, "reply latency")
     kind = rng.random(count)
     microseconds = np.select(
         [kind < 0.60, kind < 0.91],
@@ -101,8 +100,13 @@ def stamp(
     initiator: Ints,
     target: Ints,
     draws: Draws,
+    response_delay_uus: int | None = None,
 ) -> Stamped:
-    """Execute exchanges that start at true times `start` (n,) between tags given by their places."""
+    """Execute exchanges that start at true times `start` (n,) between tags given by their places.
+
+    `response_delay_uus` replaces the scenario's.
+    """
+    delay_uus = scenario.ranging.response_delay_uus if response_delay_uus is None else response_delay_uus
     radio = scenario.radio
     delays = np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9 * SUBTICKS_PER_SECOND
     excess = draws.excess_m / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
@@ -112,7 +116,7 @@ def stamp(
         sender, receiver = (initiator, target) if message.sender == "initiator" else (target, initiator)
         if message.after:
             reference = result.stamps[message.after]
-            printed = _transmission(scenario, message, reference, draws.reply_s)
+            printed = _transmission(message, reference, draws.reply_s, delay_uus)
         else:
             printed = _next_grid(-(-ready // SUBTICKS)) + ANTENNA_DELAY_TICKS
         jitter = draws.transmit[k] * radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
@@ -121,20 +125,25 @@ def stamp(
         distance, power = world.link(initiator, target, departure)
         flight = np.rint(distance / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND + excess)
         late_s = reception_bias_s(radio, power) + draws.receive[k] * reception_noise_s(radio, power)
-        shift = np.rint(late_s * SUBTICKS_PER_SECOND + delays[receiver, 1]).astype(np.int64)
-        arrival = clocks.read(receiver, departure + flight.astype(np.int64)) + shift
+        arrival = departure + flight.astype(np.int64)
         result.stamps[f"tx{k + 1}"] = printed
-        result.stamps[f"rx{k + 1}"] = (arrival + SUBTICKS // 2) // SUBTICKS
+        result.stamps[f"rx{k + 1}"] = reception(clocks, receiver, arrival, late_s, delays[receiver, 1])
         result.departure.append(departure)
         result.distance_m.append(distance)
         result.power_dbm.append(power)
     return result
 
 
-def _transmission(scenario: Scenario, message: Message, reference: Ints, reply_s: Floats) -> Ints:
+def reception(clocks: Clocks, receiver: Ints, arrival: Ints, late_s: Floats, delay_subticks: Floats) -> Ints:
+    """Return the stamps in whole ticks of frames that reach antennas at true times `arrival` (n,)."""
+    shift = np.rint(late_s * SUBTICKS_PER_SECOND + delay_subticks).astype(np.int64)
+    return (clocks.read(receiver, arrival) + shift + SUBTICKS // 2) // SUBTICKS
+
+
+def _transmission(message: Message, reference: Ints, reply_s: Floats, delay_uus: int) -> Ints:
     """Return the printed transmit stamp of a message that waits for the stamp `reference`."""
     if message.timing == "scheduled":
-        due = reference + scenario.ranging.response_delay_uus * UUS_TICKS
+        due = reference + delay_uus * UUS_TICKS
         # The chip ignores the low nine bits of the time at which it is told to send.
         return due // GRID * GRID + ANTENNA_DELAY_TICKS
     latency = np.rint(reply_s / TICK_S).astype(np.int64)

@@ -1,0 +1,45 @@
+"""Channel impulse responses as the boards print them: a first path, its echoes, and noise."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Final
+
+import numpy as np
+
+from uwblink.messages import Cir
+
+FIRST_PATH: Final = 745.0
+"""Where the chip puts the first path, give or take a tap (DW1000 User Manual, 7.2.40.1)."""
+
+NOISE: Final = 45.0
+AMPLITUDE: Final = 9000.0
+DECAY_TAPS: Final = 14.0
+VALUES_A_TRANSFER: Final = 50
+HEADER_FIELDS: Final = 5
+
+
+def impulse_response(rng: np.random.Generator) -> tuple[int, tuple[int, ...]]:
+    """Draw one: index of the first path in thousandths of a tap, and 1016 magnitudes."""
+    index = round(1000 * (FIRST_PATH + rng.uniform(-1, 1)))
+    taps = np.arange(Cir.TAPS)
+    wave = AMPLITUDE * np.exp(-(((taps - index / 1000) / 1.2) ** 2)) + 0j
+    echoes = rng.poisson(12)
+    later = index / 1000 + rng.exponential(DECAY_TAPS, echoes)
+    for place, phase in zip(later, rng.uniform(0, 2 * np.pi, echoes), strict=True):
+        strength = 0.4 * AMPLITUDE * np.exp(-(place - index / 1000) / DECAY_TAPS) * rng.rayleigh()
+        wave += strength * np.exp(1j * phase - ((taps - place) / 1.2) ** 2)
+    wave += NOISE * (rng.normal(size=Cir.TAPS) + 1j * rng.normal(size=Cir.TAPS))
+    re, im = np.abs(np.trunc(wave.real)), np.abs(np.trunc(wave.imag))
+    # The firmware's estimate of a magnitude: the larger part and a quarter of the smaller.
+    return index, tuple((np.maximum(re, im) + np.minimum(re, im) // 4).astype(np.int64).tolist())
+
+
+def in_transfers(line: bytes) -> list[bytes]:
+    """Cut a printed response into its USB transfers of 50 values, and one for the line end."""
+    body, end = line[:-2], line[-2:]
+    parts = body.split(b"|")
+    cuts = [0, *range(HEADER_FIELDS + VALUES_A_TRANSFER, len(parts), VALUES_A_TRANSFER), len(parts)]
+    pieces = [b"|".join(parts[a:b]) for a, b in itertools.pairwise(cuts)]
+    # Each piece after the first begins with the bar that separates it from the one before.
+    return [pieces[0], *(b"|" + piece for piece in pieces[1:]), end]
