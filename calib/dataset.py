@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import UnanswerableError
-from calib.truth import distances_m
+from uwblink.geometry import distances_m
 from uwblink.recording import Recording
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, delay_weights, intervals, raw_range

@@ -18,8 +18,8 @@ CONFINED = {
     "serial": lambda path: path == "uwblink/ports.py",
     "simpy": lambda path: path.startswith("uwbsim/"),
     "matplotlib": lambda path: Path(path).name == "figures.py",
-    "typer": lambda path: Path(path).name == "cli.py",
-    "rich": lambda path: Path(path).name in {"cli.py", "listing.py"} or path == "calib/table.py",
+    "typer": lambda path: Path(path).name == "cli.py" or "/cli/" in path,
+    "rich": lambda path: Path(path).name in {"cli.py", "listing.py"} or "/cli/" in path or path == "calib/table.py",
     "duckdb": lambda path: path.startswith("uwblink/"),
     "pydantic": lambda path: path.startswith("uwbsim/"),
 }

@@ -76,6 +76,18 @@ class Decoder:
         self._buffer += data
         return self._drain(final=False)
 
+    def take_back(self) -> bytes:
+        """Return the bytes of a message that has only begun, and forget them; none while in the middle of damage."""
+        if not self._clean:
+            return b""
+        data, self._buffer = self._buffer, b""
+        return data
+
+    @property
+    def between_messages(self) -> bool:
+        """Whether everything so far was understood or skipped, and the next byte begins a message."""
+        return self._clean and not self._buffer
+
     def finish(self) -> list[Event]:
         """Return what is left when no more bytes will come."""
         return self._drain(final=True)

@@ -11,6 +11,11 @@ from uwblink.schema import TABLES
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
+
+    from uwblink.recorder import Progress
+
+RATE_WINDOW_S = 2.0
 
 
 def summarize(recording: Recording) -> dict[str, Any]:
@@ -59,6 +64,27 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     console.print(f"faults: {_counted(summary['faults'])}")
     for key, value in summary["provenance"].items():
         console.print(f"  {_plain(key)}: {_plain(value)}")
+
+
+def progress_table(progress: Progress) -> Table:
+    """Return a recorder's progress as a table: rate and success of each pair, last range and power, faults."""
+    from rich.table import Table
+
+    table = Table(title=f"{progress.time_s:.1f} s, {progress.exchanges} of {progress.tried} exchanges")
+    for name in ("pair", "rate (Hz)", "success", "range (m)", "FPP (dBm)"):
+        table.add_column(name, justify="right")
+    for (initiator, target), pair in progress.pairs.items():
+        recent = sum(t > progress.time_s - RATE_WINDOW_S for t in pair.recent_s)
+        table.add_row(
+            f"{initiator} -> {target}",
+            f"{recent / min(RATE_WINDOW_S, max(progress.time_s, 0.1)):.1f}",
+            f"{100 * pair.good / pair.tried:.0f} %" if pair.tried else "",
+            f"{pair.range_m:.3f}" if pair.good else "",
+            f"{pair.fpp_dbm:.1f}" if pair.good else "",
+        )
+    last = f"\n{_plain(progress.last_fault)}" if progress.last_fault else ""
+    table.caption = f"faults: {_counted(progress.faults)}{last}"
+    return table
 
 
 def _counted(counts: dict[str, int]) -> str:

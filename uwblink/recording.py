@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
@@ -47,35 +48,40 @@ class Recording:
         *,
         meta: Mapping[str, Any] | None = None,
         force: bool = False,
+        live: bool = False,
     ) -> Self:
         """Start a recording beside `path`; it takes that name when the `with` block ends well.
 
-        Raises `RecordingExistsError` if `path` is there and not `force`, `RecordingError` where it
-        cannot be written. When the block raises, nothing is left behind.
+        A `live` one has its name from the start, and what was appended stays whatever happens. Raises
+        `RecordingExistsError` if `path` is there and not `force`, `RecordingError` where it cannot be written. When
+        the block raises, nothing is left behind of one that is not live.
         """
         import duckdb
 
         final = Path(path)
         check_output(final, force=force)
-        partial = final.with_name(f".{final.name}.{os.getpid()}.partial")
-        _remove(partial)
+        place = final if live else final.with_name(f".{final.name}.{os.getpid()}.partial")
+        _remove(place)
         try:
-            db = duckdb.connect(str(partial))
+            db = duckdb.connect(str(place))
         except duckdb.Error as error:
             raise RecordingError(f"{final}: cannot be written ({_first_line(error)})") from error
-        recording = cls(db, partial, final)
+        recording = cls(db, place, None if live else final)
         for table, columns in TABLES.items():
             spec = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
             db.execute(f"CREATE TABLE {table} ({spec})")
         recording.append_meta(standard_meta() | dict(meta or {}))
+        if live:
+            # So that the tables are in the file itself, and only rows ever in the log beside it.
+            db.execute("CHECKPOINT")
         return recording
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str]) -> Self:
-        """Open a recording for reading.
+    def open(cls, path: str | os.PathLike[str], *, update: bool = False) -> Self:
+        """Open a recording for reading, or to `update` it in place.
 
         Raises `RecordingMissingError` or `RecordingError` (a directory, not a recording, truncated,
-        tables or columns missing, a newer format).
+        tables or columns missing, a newer format, still being written).
         """
         import duckdb
 
@@ -88,13 +94,15 @@ class Recording:
         try:
             db = duckdb.connect(
                 str(source),
-                read_only=True,
+                read_only=not update,
                 config={"enable_external_access": "false", "lock_configuration": "true"},
             )
+        except duckdb.IOException as error:
+            if "lock" in str(error):
+                raise RecordingError(f"{source}: another process is writing it; wait until that ends") from error
+            raise _damaged(source, error) from error
         except duckdb.Error as error:
-            raise RecordingError(
-                f"{source}: not a {SUFFIX} recording, or a truncated one ({_first_line(error)})"
-            ) from error
+            raise _damaged(source, error) from error
         recording = cls(db, source, None)
         try:
             recording._check_shape()
@@ -155,7 +163,55 @@ class Recording:
         """Add raw bytes: (time_ns, board, "in" or "out", bytes)."""
         listed = list(rows)
         if listed:
-            self._db.executemany("INSERT INTO frames VALUES (?, ?, ?, ?)", listed)
+            time_ns, board, direction, data = zip(*listed, strict=True)
+            raw = np.empty(len(listed), dtype=object)
+            raw[:] = data
+            columns = {"time_ns": np.array(time_ns), "board": np.array(board), "direction": np.array(direction)}
+            self._insert("frames", columns | {"bytes": raw})
+
+    def append_overheard(self, rows: Iterable[Mapping[str, float]]) -> None:
+        """Add passively heard exchanges, one mapping of the table's columns each; NaN where there was nothing."""
+        listed = list(rows)
+        if listed:
+            self._insert("overheard", {n: np.array([row[n] for row in listed]) for n in TABLES["overheard"]})
+
+    def append_cirs(self, rows: Iterable[tuple[int, int, int, int, float, tuple[int, ...]]]) -> None:
+        """Add impulse responses: (time_ns, board, initiator, target, first_path_index, magnitudes)."""
+        for row in rows:
+            self._db.execute("INSERT INTO cirs VALUES (?, ?, ?, ?, ?, ?)", [*row[:5], list(row[5])])
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Have everything appended in the block written at once, or not at all; raises `RecordingError`."""
+        import duckdb
+
+        try:
+            self._db.execute("BEGIN")
+            yield
+            self._db.execute("COMMIT")
+        except duckdb.Error as error:
+            with suppress(duckdb.Error):
+                self._db.execute("ROLLBACK")
+            raise RecordingError(
+                f"{self.path}: cannot be written any more ({_first_line(error)}); is the disk full? "
+                "What was written before is kept"
+            ) from error
+
+    def replace_poses(self, poses: Poses, meta: Mapping[str, Any], tags: Iterable[Tag] | None = None) -> None:
+        """Put poses, and tags where given, in place of those there are."""
+        with self.transaction():
+            self._db.execute("DELETE FROM poses")
+            self.append_poses(poses)
+            self.append_meta(meta)
+            if tags is not None:
+                self._db.execute("DELETE FROM tags")
+                self.append_tags(tags)
+
+    def frames(self) -> list[tuple[int, str, str, bytes]]:
+        """Return all raw bytes in order of time, as `append_frames` takes them."""
+        r = self._read("SELECT * FROM frames ORDER BY time_ns, rowid")
+        rows = zip(r["time_ns"].tolist(), r["board"], r["direction"], r["bytes"], strict=True)
+        return [(t, str(board), str(direction), bytes(data)) for t, board, direction, data in rows]
 
     def meta(self) -> dict[str, Any]:
         """Return all entries of `meta`, decoded."""
@@ -258,6 +314,10 @@ def check_output(path: Path, *, force: bool) -> None:
         raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
     if not os.access(path.parent, os.W_OK):
         raise RecordingError(f"{path}: no permission to write in {path.parent}")
+
+
+def _damaged(path: Path, error: Exception) -> RecordingError:
+    return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({_first_line(error)})")
 
 
 def _check_length(path: Path) -> None:

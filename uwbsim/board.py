@@ -58,6 +58,7 @@ TO_REPORT: Final = 530 * US
 
 TARGET_LATER: Final = 330 * US
 LISTENER_LATER: Final = 370 * US
+LISTENER_AT_ONCE: Final = 60 * US
 PREAMBLE_TIMEOUT: Final = 6_521 * US
 LAST_RETRY: Final = 5
 DEFAULT_DELAY_UUS: Final = 1500
@@ -284,12 +285,15 @@ class VirtualBoard:
             yield self.bench.env.timeout(MS)
             return False
         yield self.bench.env.timeout(TO_POLL)
-        for other in self._others():
-            if self.bench.radios.hears(other.id, self.id, self.bench.subticks()):
-                other._say(BroadcastReceived(data), 230 * US)
+        for other in self._in_range(self._others(), self.bench.subticks()):
+            other._say(BroadcastReceived(data), 230 * US)
         yield self.bench.env.timeout(790 * US)
         self._say(BroadcastSent())
         return True
+
+    def _in_range(self, others: list[VirtualBoard], time: int) -> list[VirtualBoard]:
+        tags = set(self.bench.radios.hearers(self.id, [other.id for other in others], time))
+        return [other for other in others if other.id in tags]
 
     def _others(self) -> list[VirtualBoard]:
         return [b for b in self.bench.boards.values() if b is not self and b.on_air]
@@ -341,21 +345,22 @@ class VirtualBoard:
         warnings = [WARNING_B, WARNING_C] if len(ends) == 2 else [WARNING_C]
         if target_reports:
             ends, warnings = [*ends, end + TARGET_LATER], [*warnings, WARNING_C]
-        for other in others:
-            if not self.bench.radios.hears(other.id, self.id, start):
-                continue
+        in_range = self._in_range(others, start)
+        for other in in_range:
             if not other.passive:
                 for delay, warning in zip(ends, warnings, strict=True):
                     other._say(warning, delay)
-                continue
-            delay = end + (LISTENER_LATER if target_reports else 60 * US)
-            heard = self.bench.radios.overhear(other.id, self.id, met, target_reports=target_reports)
+        listeners = {other.id: other for other in in_range if other.passive}
+        if not listeners:
+            return
+        heard = self.bench.radios.overhear(list(listeners), self.id, met, target_reports=target_reports)
+        for tag, other in listeners.items():
             other.busy_until = int(self.bench.env.now) + end
-            if heard is None:
-                continue
-            if get_cir:
-                delay = other._print_cir(self.id, met.report.neighbour, delay)
-            other._say(heard, delay)
+            if tag in heard:
+                delay = end + (LISTENER_LATER if target_reports else LISTENER_AT_ONCE)
+                if get_cir:
+                    delay = other._print_cir(self.id, met.report.neighbour, delay)
+                other._say(heard[tag], delay)
 
     def _print_cir(self, initiator: int, target: int, delay: int) -> int:
         """Print a channel impulse response, a piece a millisecond; returns when it is over."""

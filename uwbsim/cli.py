@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -57,6 +58,53 @@ def run(
         f"{len(loaded.pairs())} pairs, {loaded.scenario.duration_s:g} s, "
         f"{len(simulated.faults)} failed"
     )
+
+
+@app.command()
+def serve(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
+    link_dir: Annotated[Path | None, typer.Option(help="Folder for stable links, tag10 and so on.")] = None,
+    faults: Annotated[Path | None, typer.Option(help="What goes wrong (.toml).")] = None,
+    poses: Annotated[Path | None, typer.Option(help="Motion capture to write (.csv), in host time.")] = None,
+    duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
+    ] = None,
+    force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
+) -> None:
+    """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
+    from uwblink.recording import check_output
+    from uwbsim import faults as fault_files
+    from uwbsim.reading import load
+    from uwbsim.serve import Server, extended, write_poses
+
+    if poses:
+        check_output(poses, force=force)
+    loaded = load(scenario, settings or ())
+    wrong = fault_files.load(faults, [tag.id for tag in loaded.tags]) if faults else None
+    server = Server(extended(loaded, duration), link_dir, wrong)
+    try:
+        for tag, name in server.names.items():
+            typer.echo(f"tag {tag:3d}  {name}")
+        if poses:
+            write_poses(loaded, server.epoch_ns, poses)
+        with _interrupts() as stop:
+            server.run(stop, duration or float("inf"))
+    finally:
+        server.close()
+
+
+@contextmanager
+def _interrupts() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C and a polite kill into a question to ask."""
+    asked: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {n: signal.signal(n, lambda number, _frame: asked.append(number)) for n in numbers}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @app.command()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from uwblink.messages import Overheard, OverheardNothing, Ranged, TargetRanged
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT
 from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, Protocol, board_range
+from uwbsim.ahead import Ahead
 from uwbsim.clock import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
 from uwbsim.scenario import Scenario
@@ -50,7 +51,7 @@ class Radios:
     def __init__(self, scenario: Scenario, lost_share: float = 0.0) -> None:
         """Set up world and clocks; chance comes from the scenario's seed."""
         self.scenario = scenario
-        self.world = World.of(scenario)
+        self.ahead = Ahead(World.of(scenario))
         self.clocks = Clocks.of(scenario)
         self.lost_share = lost_share
         self._place = {tag.id: k for k, tag in enumerate(scenario.tags)}
@@ -65,7 +66,7 @@ class Radios:
         draws = self._draws(count)
         delay = delay_uus if double_sided else SINGLE_SIDED_DELAY_UUS
         stamped = stamp(
-            self.scenario, protocol, self.world, self.clocks, np.array([start]), i, j, draws, response_delay_uus=delay
+            self.scenario, protocol, self.ahead, self.clocks, np.array([start]), i, j, draws, response_delay_uus=delay
         )
         report = self._report(protocol.name, initiator, target, i, j, stamped)
         fading = self._chance.normal(size=count) * self.scenario.radio.power_noise_db
@@ -74,57 +75,33 @@ class Radios:
         departures = tuple(int(d[0]) for d in stamped.departure)
         return Encounter(report, departures, tuple(heard.tolist()), stamped, protocol)
 
-    def hears(self, listener: int, tag: int, time: int) -> bool:
-        """Whether a board is strong enough at another one's antenna."""
-        sender, receiver = (np.array([self._place[t]]) for t in (tag, listener))
-        _, power = self.world.link(sender, receiver, np.array([time]))
-        return bool(power[0] >= self.scenario.radio.sensitivity_dbm)
+    def hearers(self, sender: int, tags: list[int], time: int) -> list[int]:
+        """Return those of the tags whose boards a board is strong enough for."""
+        _, power = self.ahead.from_sender(self._place[sender], time)
+        return [tag for tag in tags if power[self._place[tag]] >= self.scenario.radio.sensitivity_dbm]
 
     def overhear(
-        self, listener: int, initiator: int, met: Encounter, *, target_reports: bool
-    ) -> Overheard | OverheardNothing | None:
-        """Return what a passive listener prints of an exchange, None for nothing.
+        self, listeners: list[int], initiator: int, met: Encounter, *, target_reports: bool
+    ) -> dict[int, Overheard | OverheardNothing]:
+        """Return what passive listeners print of an exchange; who prints nothing is not in it.
 
         Values that no frame carried are zero, and a missed response of a double-sided exchange leaves a line of
         zeros (firmware wire format, 1.4).
         """
-        me = np.array([self._place[listener]])
-        readings = []
-        for k, message in enumerate(met.protocol.messages):
-            sender = initiator if message.sender == "initiator" else met.report.neighbour
-            reading = self._reception(me, np.array([self._place[sender]]), met.stamped.departure[k])
-            if reading is None:
-                missed_response = k == 1 and met.protocol.name == "ds"
-                return OverheardNothing(initiator, met.report.neighbour) if missed_response else None
-            readings.append(reading)
-        rx1, rx2, rx3 = ([r[0] for r in readings] + [0])[:3]
-        power = [r[1] for r in readings]
-        skew = [r[2] for r in readings]
-        third = len(readings) == 3
-        r = met.report
-        return Overheard(
-            initiator,
-            r.neighbour,
-            rx1,
-            rx2,
-            rx3,
-            r.tx1 if target_reports else 0,
-            r.rx1,
-            r.tx2,
-            r.rx2 if target_reports else 0,
-            r.tx3,
-            r.rx3 if target_reports else 0,
-            power[0],
-            power[1],
-            power[2] if third else None,
-            skew[0],
-            skew[1],
-            skew[2] if third else None,
-            r.fpp1_dbm,
-            r.fpp2_dbm if target_reports else 0.0,
-            r.skew1_ppm,
-            r.skew2_ppm if target_reports else 0.0,
-        )
+        places = np.array([self._place[tag] for tag in listeners], dtype=np.int64)
+        target = met.report.neighbour
+        receptions = []
+        for message, departure in zip(met.protocol.messages, met.departures, strict=True):
+            sender = initiator if message.sender == "initiator" else target
+            receptions.append(self._receptions(places, self._place[sender], departure))
+        said: dict[int, Overheard | OverheardNothing] = {}
+        for k, tag in enumerate(listeners):
+            heard = [bool(r.heard[k]) for r in receptions]
+            if all(heard):
+                said[tag] = _overheard(k, initiator, met.report, receptions, target_reports=target_reports)
+            elif heard[0] and not heard[1] and met.protocol.name == "ds":
+                said[tag] = OverheardNothing(initiator, target)
+        return said
 
     def _draws(self, count: int) -> Draws:
         chance, multipath = self._chance, self.scenario.radio.multipath
@@ -162,22 +139,65 @@ class Radios:
         return Ranged(target, float(board_range(exchange)[0]), *(int(stamps[n][0]) for n in STAMPS), *numbers)
 
     def _readings(self, sender: Ints, receiver: Ints, time: Ints, power_dbm: Floats) -> tuple[Floats, Floats]:
-        noise = self._chance.normal(size=(2, 1))
+        noise = self._chance.normal(size=(2, len(time)))
         skew = (self.clocks.rate(receiver, time) - self.clocks.rate(sender, time)) * 1e6
         radio = self.scenario.radio
         return printed_power_dbm(radio, power_dbm, noise[0]), printed_skew_ppm(radio, skew, noise[1])
 
-    def _reception(self, me: Ints, sender: Ints, departure: Ints) -> tuple[int, float, float] | None:
-        radio = self.scenario.radio
-        distance, power = self.world.link(sender, me, departure)
-        if power[0] < radio.sensitivity_dbm or self._chance.random() < self.lost_share:
-            return None
-        noise = self._chance.normal(size=1)
-        late_s = reception_bias_s(radio, power) + noise * reception_noise_s(radio, power)
+    def _receptions(self, me: Ints, sender: int, departure: int) -> _Receptions:
+        """Return how listeners (n,) receive one frame."""
+        radio, count = self.scenario.radio, len(me)
+        distance, power = (values[me] for values in self.ahead.from_sender(sender, departure))
+        heard = (power >= radio.sensitivity_dbm) & (self._chance.random(count) >= self.lost_share)
+        late_s = reception_bias_s(radio, power) + self._chance.normal(size=count) * reception_noise_s(radio, power)
         flight = np.rint(distance / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND).astype(np.int64)
-        stamp_ = reception(self.clocks, me, departure + flight, late_s, self._delays[me, 1])
-        printed = self._readings(sender, me, departure, power)
-        return int(stamp_[0]) & MASK, float(printed[0][0]), float(printed[1][0])
+        stamps = reception(self.clocks, me, departure + flight, late_s, self._delays[me, 1]) & MASK
+        time = np.full(count, departure)
+        power, skew = self._readings(np.full(count, sender), me, time, power)
+        return _Receptions(heard, stamps, power, skew)
+
+
+@dataclass(frozen=True, slots=True)
+class _Receptions:
+    """One frame at several listeners, shape (n,): whether it came, its stamp, and what is printed of it."""
+
+    heard: NDArray[np.bool_]
+    stamps: Ints
+    power_dbm: Floats
+    skew_ppm: Floats
+
+
+def _overheard(
+    k: int, initiator: int, report: Ranged, receptions: list[_Receptions], *, target_reports: bool
+) -> Overheard:
+    """Return what listener number `k` prints; the initiator's own readings travel only in its final."""
+    third = len(receptions) == 3
+    rx1, rx2, rx3 = ([int(r.stamps[k]) for r in receptions] + [0])[:3]
+    power = [float(r.power_dbm[k]) for r in receptions]
+    skew = [float(r.skew_ppm[k]) for r in receptions]
+    return Overheard(
+        initiator,
+        report.neighbour,
+        rx1,
+        rx2,
+        rx3,
+        report.tx1 if target_reports else 0,
+        report.rx1,
+        report.tx2,
+        report.rx2 if target_reports else 0,
+        report.tx3,
+        report.rx3 if target_reports else 0,
+        power[0],
+        power[1],
+        power[2] if third else None,
+        skew[0],
+        skew[1],
+        skew[2] if third else None,
+        report.fpp1_dbm,
+        report.fpp2_dbm if target_reports else 0.0,
+        report.skew1_ppm,
+        report.skew2_ppm if target_reports else 0.0,
+    )
 
 
 def as_target(report: Ranged, initiator: int) -> TargetRanged:

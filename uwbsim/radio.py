@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
@@ -25,6 +27,7 @@ SKEW_GRID_PPM: Final = 9.3132e-4
 
 NULL_DEPTH: Final = 0.1
 SHADOW_HARMONICS: Final = 3
+SHADOW_ORDERS: Final = np.arange(1, SHADOW_HARMONICS + 1)
 
 
 def dipole_gain_db(sine: Floats) -> Floats:
@@ -38,19 +41,22 @@ ANTENNAS: Final[dict[str, Callable[[Floats], Floats]]] = {
 }
 
 
-def gain_db(radio: Radio, seed: int, tag: int, direction: Floats) -> Floats:
+def shadowing_phases(seed: int, tag: int) -> Floats:
+    """Return what makes the shadow of a tag's body its own, the same in every run with a seed, shape (harmonics,)."""
+    return stream(seed, "shadowing", tag).uniform(0, 2 * np.pi, SHADOW_HARMONICS)
+
+
+def gain_db(radio: Radio, phases: Floats, direction: Floats) -> Floats:
     """Gain of a tag towards unit vectors (n, 3) in its body's frame, in dB, shape (n,).
 
-    The antenna stands along the body's z axis. Shadowing by the body is a smooth function of
-    azimuth with standard deviation `shadowing_db`, the same in every run with this seed.
+    The antenna stands along the body's z axis. Shadowing by the body is a smooth function of azimuth with standard
+    deviation `shadowing_db`; `phases` are those of the tag (harmonics,), or of n tags (n, harmonics).
     """
     sine = np.hypot(direction[:, 0], direction[:, 1])
     gain = ANTENNAS[radio.antenna](sine)
     if radio.shadowing_db:
         azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-        phases = stream(seed, "shadowing", tag).uniform(0, 2 * np.pi, SHADOW_HARMONICS)
-        order = np.arange(1, SHADOW_HARMONICS + 1)
-        waves = np.cos(np.outer(azimuth, order) + phases).sum(axis=1)
+        waves = np.cos(azimuth[:, None] * SHADOW_ORDERS + phases).sum(axis=1)
         gain = gain + radio.shadowing_db * waves * np.sqrt(2 / SHADOW_HARMONICS)
     return gain
 
@@ -108,9 +114,12 @@ def printed_skew_ppm(radio: Radio, skew_ppm: Floats, noise: Floats) -> Floats:
 def _spline(curve: Spline | SigmaSpline | None, power_dbm: Floats) -> Floats:
     if curve is None:
         return np.zeros_like(power_dbm)
-    from scipy.interpolate import BSpline
-
-    knots = np.array(curve.knots)
-    spline = BSpline(knots, np.array(curve.coefficients), curve.degree)
-    inner = knots[curve.degree], knots[-1 - curve.degree]
+    spline, inner = _bspline(curve)
     return np.asarray(spline(np.clip(lifted(power_dbm), *inner)))
+
+
+@lru_cache(maxsize=16)
+def _bspline(curve: Spline) -> tuple[BSpline, tuple[float, float]]:
+    """Return a curve of a scenario as a spline, and the range in which it is not constant."""
+    knots = np.array(curve.knots)
+    return BSpline(knots, np.array(curve.coefficients), curve.degree), (knots[curve.degree], knots[-1 - curve.degree])

@@ -6,6 +6,7 @@ boards print goes out when it is due.
 
 from __future__ import annotations
 
+import csv
 import heapq
 import selectors
 import time
@@ -18,11 +19,36 @@ import numpy as np
 
 from uwblink.terminals import Terminal
 from uwbsim.board import MS, NS_PER_S, Bench
+from uwbsim.clock import LONGEST_RUN_S
 from uwbsim.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
 from uwbsim.scenario import Scenario
 from uwbsim.streams import stream
+from uwbsim.world import World
 
 LONGEST_WAIT_S: Final = 0.1
+
+
+PREPARED_S: Final = 7200.0
+"""For how long bodies go on moving when nobody says for how long to serve; then they hold their place."""
+
+
+def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
+    """Return a scenario that lasts as long as it is to be served."""
+    longer = max(scenario.scenario.duration_s, duration_s or PREPARED_S)
+    return scenario.model_copy(
+        update={"scenario": scenario.scenario.model_copy(update={"duration_s": min(longer, LONGEST_RUN_S)})}
+    )
+
+
+def write_poses(scenario: Scenario, epoch_ns: int, path: Path) -> None:
+    """Write what motion capture sees over the scenario's duration, in host time, as `uwblink poses` reads it."""
+    poses = World.of(scenario).motion_capture()
+    columns = zip(poses.time_ns + epoch_ns, poses.body, poses.position_m, poses.quaternion, strict=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time_ns", "body", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        for time_ns, body, position, quaternion in columns:
+            writer.writerow([time_ns, body, *(f"{v:.6f}" for v in (*position, *quaternion))])
 
 
 class Server:

@@ -7,7 +7,7 @@ arrive, and which integers do the two boards write down.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +19,25 @@ from uwblink.ticks import (
     TICK_S,
     UUS_TICKS,
 )
-from uwblink.twr import Message, Protocol
+from uwblink.twr import Message
+from uwblink.twr import Protocol as RangingProtocol
 from uwbsim.clock import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.radio import reception_bias_s, reception_noise_s
 from uwbsim.scenario import Scenario
 from uwbsim.streams import stream
-from uwbsim.world import World
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 GRID: Final = DELAYED_TX_GRID
+
+
+class Links(Protocol):
+    """What knows how far apart tags are and how strongly they hear each other: a `World`, or `Ahead` of one."""
+
+    def link(self, initiator: Ints, target: Ints, time: Ints) -> tuple[Floats, Floats]:
+        """Return distance (m) and first-path power (dBm) between tags (n,) at true times (n,)."""
+        ...
 
 
 @dataclass(slots=True)
@@ -93,8 +101,8 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
 
 def stamp(
     scenario: Scenario,
-    protocol: Protocol,
-    world: World,
+    protocol: RangingProtocol,
+    world: Links,
     clocks: Clocks,
     start: Ints,
     initiator: Ints,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from uwblink.schema import Poses
 from uwbsim.clock import SUBTICKS_PER_SECOND
 from uwbsim.motion import Trajectory, sample
-from uwbsim.radio import gain_db, path_gain_db
+from uwbsim.radio import gain_db, path_gain_db, shadowing_phases
 from uwbsim.scenario import Scenario
 from uwbsim.streams import stream
 
@@ -26,6 +26,7 @@ class World:
 
     scenario: Scenario
     trajectories: dict[str, Trajectory]
+    phases: Floats
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
@@ -34,6 +35,7 @@ class World:
         return cls(
             scenario,
             {b.name: sample(b.motion, duration, stream(seed, "motion", b.name)) for b in scenario.bodies},
+            np.array([shadowing_phases(seed, tag.id) for tag in scenario.tags]),
         )
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> tuple[Floats, Floats]:
@@ -54,11 +56,11 @@ class World:
         apart = spots[1] - spots[0]
         distance = np.linalg.norm(apart, axis=1)
         towards = apart / np.maximum(distance, 1e-9)[:, None]
-        radio, seed = self.scenario.radio, self.scenario.scenario.seed
+        radio = self.scenario.radio
         power = path_gain_db(radio, distance)
         for k, turn, sign in ((i, turns[0], 1.0), (j, turns[1], -1.0)):
             seen = turn.inv().apply(sign * towards)
-            power = power + gain_db(radio, seed, self.scenario.tags[k].id, seen)
+            power = power + gain_db(radio, self.phases[k], seen)
         return distance, power
 
     def _tag(self, index: int, time_s: Floats) -> tuple[Floats, Rotation]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.truth import distances_m
+from uwblink.geometry import distances_m
 from uwblink.schema import Poses, Tag
 
 

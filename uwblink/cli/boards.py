@@ -1,0 +1,214 @@
+"""Commands that talk to one board."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from uwblink.messages import Ranged
+
+Port = Annotated[str, typer.Argument(help="Serial port, link to one, or pyserial URL.")]
+Target = Annotated[int, typer.Argument(min=0, max=254, help="Id of the other board.")]
+Protocol = Annotated[str, typer.Option(help="ss or ds.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command()(ports)
+    app.command()(info)
+    app.command()(twr)
+    app.command()(test)
+    app.command("set-delay")(set_delay)
+    app.command()(passive)
+    app.command()(send)
+    app.command()(cir)
+
+
+def ports(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to probe.")] = None,
+    probe: Annotated[bool, typer.Option("--probe", help="Ask the named ports, or all listed, for their id.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the serial devices with the boards' USB identity (0483:5740); nothing is written to any, unless probed."""
+    from uwblink.board import Board
+    from uwblink.errors import UwblinkError
+    from uwblink.ports import boards_ports
+
+    found = boards_ports()
+    rows = [asdict(port) for port in found]
+    if names:
+        known = {port.device: asdict(port) for port in found}
+        rows = [known.get(n, {"device": n, "description": "", "serial_number": None}) for n in names]
+    if probe:
+        for row in rows:
+            try:
+                with Board.open(str(row["device"])) as board:
+                    row["board"] = board.id
+            except UwblinkError as error:
+                row["error"] = str(error)
+    if as_json:
+        typer.echo(json.dumps(rows, indent=1))
+        return
+    if not rows:
+        typer.echo("no serial device with the boards' USB identity (0483:5740) is plugged in")
+    for row in rows:
+        said = f"board {row['board']}" if "board" in row else row.get("error", row["description"])
+        typer.echo(f"{row['device']}  {said}")
+
+
+def info(port: Port, as_json: AsJson = False) -> None:
+    """Print a board's id and longest frame."""
+    from uwblink.board import Board
+    from uwblink.messages import GetMaxFrame, MaxFrameIs
+    from uwblink.ports import serial_number
+
+    with Board.open(port) as board:
+        longest = board.request(GetMaxFrame())
+        facts = {
+            "port": port,
+            "board": board.id,
+            "longest_frame_bytes": longest.length if isinstance(longest, MaxFrameIs) else None,
+            "usb_serial_number": serial_number(port),
+        }
+    if as_json:
+        typer.echo(json.dumps(facts, indent=1))
+        return
+    number = facts["usb_serial_number"] or "none"
+    typer.echo(
+        f"{port}: board {facts['board']}, frames of up to {facts['longest_frame_bytes']} bytes, "
+        f"USB serial number {number}"
+    )
+
+
+def twr(
+    port: Port,
+    target: Target,
+    protocol: Protocol = "ds",
+    count: Annotated[int, typer.Option("-n", min=1, help="How many exchanges.")] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Range with another board."""
+    from uwblink.board import Board
+    from uwblink.errors import RangingFailedError
+
+    reports: list[Ranged] = []
+    failures: list[RangingFailedError] = []
+    with Board.open(port) as board:
+        initiator = board.id
+        for _ in range(count):
+            try:
+                report = board.range(target, protocol=protocol)
+            except RangingFailedError as error:
+                failures.append(error)
+                if not reports and len(failures) >= 3:
+                    raise
+                continue
+            reports.append(report)
+            if not as_json:
+                typer.echo(_line(initiator, report))
+    if not reports:
+        raise failures[-1]
+    if as_json:
+        rows = [{"initiator": initiator, "target": target, **_fields(r)} for r in reports]
+        typer.echo(json.dumps(rows, indent=1))
+    elif count > 1:
+        import statistics
+
+        ranges = [r.range_m for r in reports]
+        spread = f" ± {statistics.stdev(ranges):.4f}" if len(ranges) > 1 else ""
+        typer.echo(f"{len(reports)} of {count} exchanges, mean {statistics.fmean(ranges):.4f}{spread} m")
+
+
+def _line(initiator: int, report: Ranged) -> str:
+    return (
+        f"{initiator} -> {report.neighbour}  {report.range_m:8.4f} m  "
+        f"FPP {report.fpp1_dbm:.1f} / {report.fpp2_dbm:.1f} dBm  skew {report.skew1_ppm:+.2f} ppm"
+    )
+
+
+def _fields(report: Ranged) -> dict[str, float]:
+    return {name: getattr(report, name) for name in type(report).FIELDS if name != "neighbour"}
+
+
+def test(port: Port) -> None:
+    """Have a board echo one field of each kind."""
+    from uwblink.board import Board
+
+    with Board.open(port) as board:
+        board.test()
+        typer.echo(f"{port}: board {board.id} echoes every kind of field")
+
+
+def set_delay(
+    port: Port,
+    delay_uus: Annotated[int, typer.Argument(metavar="N", help="280 to 6500, in units of 512/499.2 us.")],
+) -> None:
+    """Set the response delay of double-sided exchanges for which this board is the target (C08)."""
+    from uwblink.board import Board
+
+    with Board.open(port) as board:
+        board.set_response_delay(delay_uus)
+    typer.echo(f"{port}: response delay {delay_uus} ({delay_uus * 512 / 499.2 + 0.25641:.1f} us), until power is lost")
+
+
+def passive(port: Port, state: Annotated[str, typer.Argument(metavar="on|off")]) -> None:
+    """Have a board listen to the exchanges of others, or stop to."""
+    from uwblink.board import Board
+    from uwblink.errors import RefusedError
+
+    if state not in ("on", "off"):
+        raise RefusedError(f"passive: found {state!r}, expected on or off")
+    with Board.open(port) as board:
+        board.set_passive(state == "on")
+    typer.echo(f"{port}: passive listening {state}" + (", until power is lost" if state == "on" else ""))
+
+
+def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 92 bytes in UTF-8.")]) -> None:
+    """Broadcast a text to every board in range."""
+    from uwblink.board import Board
+
+    data = text.encode()
+    with Board.open(port) as board:
+        board.send(data)
+    typer.echo(f"{port}: {len(data)} bytes sent; delivery is not confirmed")
+
+
+def cir(
+    port: Port,
+    target: Target,
+    protocol: Protocol = "ds",
+    plot: Annotated[Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")] = None,
+    force: Annotated[bool, typer.Option(help="Replace the picture if it exists.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Range with another board and print the channel impulse response."""
+    from uwblink.board import Board
+    from uwblink.errors import RecordingError
+    from uwblink.recording import check_output
+
+    if plot:
+        check_output(plot, force=force)
+        if plot.suffix.lower() not in (".png", ".svg", ".pdf"):
+            raise RecordingError(f"{plot}: found {plot.suffix or 'no suffix'}, expected .png, .svg or .pdf")
+    with Board.open(port) as board:
+        report, response = board.cir(target, protocol=protocol)
+        initiator = board.id
+    if plot:
+        from uwblink.figures import plot_cir
+
+        plot_cir(response, plot)
+    index = response.first_path_milli / 1000
+    if as_json:
+        typer.echo(json.dumps({"first_path_index": index, "magnitudes": list(response.magnitudes), **_fields(report)}))
+        return
+    peak = max(range(response.TAPS), key=response.magnitudes.__getitem__)
+    typer.echo(_line(initiator, report))
+    typer.echo(f"first path at index {index:.3f}, peak {response.magnitudes[peak]} at {peak}")
+    if plot:
+        typer.echo(f"{plot}")

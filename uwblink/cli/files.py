@@ -1,0 +1,108 @@
+"""Commands on recordings: show, import, poses, replay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+imports = typer.Typer(help="Turn other files into recordings.", no_args_is_help=True)
+
+Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command()(show)
+    app.add_typer(imports, name="import")
+    app.command()(poses)
+    app.command()(replay)
+
+
+def show(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print what a recording holds."""
+    from uwblink.listing import print_summary, summarize
+    from uwblink.recording import Recording
+
+    with Recording.open(recording) as opened:
+        summary = summarize(opened)
+    if as_json:
+        typer.echo(json.dumps(summary, indent=1))
+        return
+    from rich.console import Console
+
+    print_summary(summary, Console(highlight=False))
+
+
+@imports.command("csv")
+def import_csv(
+    table: Annotated[Path, typer.Argument(help="Table of exchanges (.csv or .csv.gz).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
+    column_map: Annotated[Path | None, typer.Option("--map", help="Names, units and constants (.toml).")] = None,
+    force: Force = False,
+) -> None:
+    """Import ranging exchanges from a table."""
+    from uwblink.importers.csv_table import import_csv as run
+    from uwblink.importers.mapping import ColumnMap, load_map
+
+    count = run(table, output, load_map(column_map) if column_map else ColumnMap(), force=force)
+    typer.echo(f"{output}: {count} exchanges")
+
+
+def poses(
+    recording: Annotated[Path, typer.Argument(help="Recording to add poses to (.uwb).")],
+    source: Annotated[Path, typer.Option("--from", help="Poses: .csv, .tum or a ROS bag.")],
+    offset: Annotated[str, typer.Option(help="Seconds to add to the poses' times, or auto.")] = "0",
+    tags: Annotated[Path | None, typer.Option(help="Plan or scenario (.toml) whose [[tags]] to use.")] = None,
+    body: Annotated[str | None, typer.Option(help="The body of a TUM file.")] = None,
+) -> None:
+    """Add motion-capture truth to a recording of boards."""
+    from uwblink.importers.truth import add_poses
+
+    found = add_poses(recording, source, offset=offset, tags_from=tags, body=body)
+    typer.echo(
+        f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
+        f"{found.covered} of {found.exchanges} exchanges have a true distance"
+    )
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(help="Recording of boards (.uwb).")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Recording to write, decoded again.")] = None,
+    speed: Annotated[float, typer.Option(min=0.001, help="How much faster than it was.")] = 1.0,
+    serve: Annotated[bool, typer.Option("--serve", help="Play back on pseudo-terminals.")] = False,
+    link_dir: Annotated[Path | None, typer.Option(help="Folder for stable links to them.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    force: Force = False,
+) -> None:
+    """Decode the stored bytes again, or play them back as boards would have sent them."""
+    from uwblink.recording import Recording, check_output
+    from uwblink.replay import decode_again, play, rewrite, summarize
+
+    if output:
+        check_output(output, force=force)
+    with Recording.open(recording) as opened:
+        if serve:
+            count = play(opened, _announce, speed=speed, link_dir=link_dir)
+            typer.echo(f"{count} pieces played")
+            return
+        decoded = decode_again(opened)
+        summary = summarize(opened, decoded)
+        if output:
+            rewrite(opened, decoded, output, force=force)
+    if as_json:
+        typer.echo(json.dumps(summary, indent=1))
+        return
+    typer.echo(f"{summary['messages']} messages, {summary['skipped_bytes']} bytes skipped")
+    for table in ("exchanges", "overheard", "cirs"):
+        typer.echo(f"  {table}: {summary[table]['decoded']} decoded now, {summary[table]['stored']} stored then")
+
+
+def _announce(names: dict[str, str]) -> None:
+    for was, now in names.items():
+        typer.echo(f"{was} plays at {now}")

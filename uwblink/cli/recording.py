@@ -1,0 +1,128 @@
+"""The command that records."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from uwblink.recorder import Progress
+
+LINE_EVERY_S = 2.0
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command."""
+    app.command()(record)
+
+
+def record(
+    ports: Annotated[list[str], typer.Argument(metavar="PORT...", help="Serial ports or pyserial URLs.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
+    plan: Annotated[Path | None, typer.Option(help="Who ranges with whom (.toml).")] = None,
+    pairs: Annotated[str | None, typer.Option(help="all: every two boards.")] = None,
+    rate: Annotated[float | None, typer.Option(min=0.001, help="Exchanges a second in total (Hz).")] = None,
+    duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
+    passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
+    cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
+    force: Annotated[bool, typer.Option(help="Replace the output if it exists.")] = False,
+) -> None:
+    """Play a ranging plan on boards and record everything they say."""
+    from dataclasses import replace
+
+    from uwblink.errors import PlanError
+    from uwblink.plan import Plan, load_plan
+    from uwblink.recorder import record as run
+    from uwblink.recording import check_output
+
+    check_output(output, force=force)
+    if (plan is None) == (pairs is None):
+        raise PlanError("give either --plan plan.toml or --pairs all")
+    if pairs not in (None, "all"):
+        raise PlanError(f"--pairs: found {pairs!r}, expected all; a plan file can name pairs")
+    chosen = load_plan(plan) if plan else Plan()
+    if rate:
+        chosen = replace(chosen, rate_hz=rate)
+    if cir:
+        chosen = replace(chosen, get_cir=True)
+    with _interrupts() as stop, _watcher() as watch:
+        progress = run(
+            ports,
+            output,
+            chosen,
+            duration_s=duration or float("inf"),
+            passive=passive,
+            force=force,
+            stop=stop,
+            watch=watch,
+        )
+    typer.echo(f"{output}: {_summary(progress)}")
+
+
+@contextmanager
+def _interrupts() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C and a polite kill into a question to ask; a second Ctrl-C interrupts."""
+    asked: list[int] = []
+
+    def ask(number: int, _frame: Any) -> None:
+        asked.append(number)
+        if len(asked) > 1:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _watcher() -> Iterator[Callable[[Progress], None]]:
+    """Show a live table on a terminal, and a line every two seconds elsewhere."""
+    if not sys.stderr.isatty():
+        yield _Lines().watch
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    from uwblink.listing import progress_table
+
+    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
+        yield lambda progress: live.update(progress_table(progress), refresh=True)
+
+
+class _Lines:
+    """Plain lines of progress."""
+
+    def __init__(self) -> None:
+        self._next_s = LINE_EVERY_S
+        self._fault = ""
+
+    def watch(self, progress: Progress) -> None:
+        if progress.last_fault != self._fault:
+            self._fault = progress.last_fault
+            typer.echo(f"{progress.time_s:7.1f} s  {_printable(self._fault)}", err=True)
+        if progress.time_s >= self._next_s:
+            self._next_s = progress.time_s + LINE_EVERY_S
+            typer.echo(f"{progress.time_s:7.1f} s  {_summary(progress)}", err=True)
+
+
+def _summary(progress: Progress) -> str:
+    text = f"{progress.exchanges} of {progress.tried} exchanges in {progress.time_s:.1f} s"
+    if progress.overheard:
+        text += f", {progress.overheard} overheard"
+    if progress.cirs:
+        text += f", {progress.cirs} impulse responses"
+    faults = ", ".join(f"{kind} {count}" for kind, count in sorted(progress.faults.items()))
+    return text + f"; faults: {faults or 'none'}"
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)

@@ -1,0 +1,151 @@
+"""Motion-capture poses from files: CSV with a body a row, TUM trajectories, ROS bags.
+
+CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres, ENU) and `qx, qy, qz, qw` (body to world). TUM
+has `time x y z qx qy qz qw` separated by blanks, one body a file. Bags (ROS 1, ROS 2, MCAP) need the extra
+`uwbcal[bags]`; every topic of geometry_msgs/PoseStamped is a body, named after the topic.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from uwblink.errors import ImportTableError
+from uwblink.schema import Poses
+
+NUMBERS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
+LATEST_NS: Final = 2**62
+Row = tuple[int, str, list[float]]
+
+
+def read_poses(path: Path, body: str | None = None) -> Poses:
+    """Read poses by the file's kind; `body` names the body of a TUM file. Raises `ImportTableError`."""
+    if not path.exists():
+        raise ImportTableError(f"{path}: no such file of poses")
+    kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
+    reader = _READERS.get(kind)
+    if reader is None:
+        raise ImportTableError(f"{path}: found .{kind}, expected one of .{', .'.join(sorted(_READERS))}")
+    poses = _as_poses(path, reader(path, body))
+    if not len(poses):
+        raise ImportTableError(f"{path}: holds no poses")
+    return poses
+
+
+def _csv(path: Path, body: str | None) -> Iterable[Row]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file)
+            names = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = names
+            time = next((name for name in ("time_ns", "time_s") if name in names), None)
+            missing = [name for name in (*NUMBERS, *(() if body else ("body",))) if name not in names]
+            if time is None or missing:
+                raise ImportTableError(f"{path}: column {(missing or ['time_s'])[0]!r} is missing; found {names}")
+            for row in reader:
+                line = reader.line_num
+                name = body or str(row["body"]).strip()
+                if not name:
+                    raise ImportTableError(f"{path}: row {line}: column 'body' is empty")
+                yield _time_ns(path, line, time, row[time]), name, [_number(path, line, n, row[n]) for n in NUMBERS]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportTableError(f"{path}: cannot be read as a table ({error})") from error
+
+
+def _tum(path: Path, body: str | None) -> Iterable[Row]:
+    if body is None:
+        raise ImportTableError(f"{path}: a TUM file does not say whose poses it holds; name the body with --body")
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImportTableError(f"{path}: cannot be read as text ({error})") from error
+    for number, line in enumerate(lines, start=1):
+        cells = line.split()
+        if not cells or cells[0].startswith("#"):
+            continue
+        if len(cells) != 8:
+            raise ImportTableError(f"{path}: row {number}: found {len(cells)} cells, TUM has 8: time x y z qx qy qz qw")
+        values = [_number(path, number, n, c) for n, c in zip(NUMBERS, cells[1:], strict=True)]
+        yield _time_ns(path, number, "time_s", cells[0]), body, values
+
+
+def _bag(path: Path, _body: str | None) -> Iterable[Row]:
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportTableError(f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'") from error
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            topics = [c for c in reader.connections if c.msgtype == "geometry_msgs/msg/PoseStamped"]
+            if not topics:
+                found = ", ".join(sorted({c.msgtype for c in reader.connections})) or "nothing"
+                raise ImportTableError(f"{path}: no topic of geometry_msgs/PoseStamped; found {found}")
+            for connection, _, raw in reader.messages(connections=topics):
+                message: Any = reader.deserialize(raw, connection.msgtype)
+                stamp, pose = message.header.stamp, message.pose
+                p, q = pose.position, pose.orientation
+                yield (
+                    stamp.sec * 1_000_000_000 + stamp.nanosec,
+                    _body_of(connection.topic),
+                    [p.x, p.y, p.z, q.x, q.y, q.z, q.w],
+                )
+    except (AnyReaderError, OSError, ValueError) as error:
+        if isinstance(error, ImportTableError):
+            raise
+        raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
+
+
+def _body_of(topic: str) -> str:
+    """The body of a topic: its first part that is not what motion-capture nodes call all of theirs."""
+    parts = [p for p in topic.split("/") if p not in ("", "vrpn_client_node", "mocap", "pose", "optitrack", "vicon")]
+    return parts[0] if parts else topic
+
+
+_READERS: Final[dict[str, Callable[[Path, str | None], Iterable[Row]]]] = {
+    "csv": _csv,
+    "tum": _tum,
+    "txt": _tum,
+    "bag": _bag,
+    "mcap": _bag,
+    "db3": _bag,
+}
+
+
+def _as_poses(path: Path, rows: Iterable[Row]) -> Poses:
+    listed = list(rows)
+    time = np.array([row[0] for row in listed], dtype=np.int64)
+    body = np.array([row[1] for row in listed], dtype=np.str_)
+    values = np.array([row[2] for row in listed], dtype=np.float64).reshape(-1, len(NUMBERS))
+    norm = np.linalg.norm(values[:, 3:], axis=1)
+    bad = np.flatnonzero((norm < 0.9) | (norm > 1.1))
+    if len(bad):
+        raise ImportTableError(f"{path}: pose {bad[0] + 1}: its quaternion has length {norm[bad[0]]:.3g}, expected 1")
+    order = np.argsort(time, kind="stable")
+    return Poses(time[order], body[order], values[order, :3], values[order, 3:] / norm[order, None])
+
+
+def _number(path: Path, line: int, name: str, cell: str | None) -> float:
+    try:
+        value = float(cell or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ImportTableError(f"{path}: row {line}: column {name!r}: found {cell!r}, expected a number")
+    return value
+
+
+def _time_ns(path: Path, line: int, name: str, cell: str | None) -> int:
+    if name == "time_ns" and cell and cell.strip().lstrip("-").isdecimal():
+        value = int(cell)
+    else:
+        # Seconds since 1970 have ten digits; a float of them is good to 0.2 us.
+        value = round(_number(path, line, name, cell) * (1 if name == "time_ns" else 1e9))
+    if abs(value) > LATEST_NS:
+        raise ImportTableError(f"{path}: row {line}: column {name!r}: found {cell!r}, expected a time")
+    return value
