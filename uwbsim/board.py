@@ -74,6 +74,9 @@ FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 WARNING_B: Final = b"WARNING 0xB: TWR message is firing an interrupt when it shouldn't be.\r\n"
 WARNING_C: Final = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
 
+WARNINGS: Final = {2: (WARNING_C,), 3: (WARNING_B, WARNING_C)}
+"""What a bystander prints of the frames after the poll, by the number of messages."""
+
 Steps = Generator[simpy.Event, Any, None]
 Attempt = Generator[simpy.Event, Any, bool]
 Listener = Callable[[int, int, bytes], None]
@@ -93,7 +96,10 @@ class Bench:
     def advance(self, time_ns: int) -> None:
         """Let time pass until `time_ns`."""
         if time_ns > self.env.now:
-            self.env.run(until=time_ns)
+            # Stepping, because `run(until=...)` leaves its own event in the queue, where `next_ns` would find it.
+            reached = self.env.timeout(time_ns - int(self.env.now))
+            while not reached.processed:
+                self.env.step()
 
     def next_ns(self) -> float:
         """Return when something happens next, infinity when nothing is due."""
@@ -316,9 +322,14 @@ class VirtualBoard:
         in_time = not double_sided or SHORTEST_DELAY_UUS <= target.delay_uus <= LONGEST_DELAY_UUS
         fits = max(b - a for a, b in itertools.pairwise(lasts)) < PREAMBLE_TIMEOUT
         if not all(met.heard) or not in_time or not fits:
-            first_missing = met.heard.index(False) if False in met.heard else len(lasts) - 1
-            target.busy_until = int(env.now) + lasts[first_missing - 1]
-            yield env.timeout(lasts[first_missing - 1])
+            sent = met.heard.index(False) + 1 if False in met.heard else len(lasts)
+            sent = min(sent, len(lasts) if in_time else 2)
+            target.busy_until = int(env.now) + lasts[sent - 1]
+            for other in self._in_range(others, start):
+                for delay, warning in list(zip(lasts[1:], WARNINGS[len(lasts)], strict=True))[: sent - 1]:
+                    if not other.passive:
+                        other._say(warning, delay + TO_POLL)
+            yield env.timeout(lasts[min(sent, 2) - 1])
             return (yield from self._give_up())
         end = lasts[-1] + TO_REPORT
         target.busy_until = int(env.now) + end + (TARGET_LATER if target_reports else 0)
@@ -342,7 +353,7 @@ class VirtualBoard:
     ) -> None:
         """Have every other board in range print what it makes of the exchange; `end` is when R05 comes."""
         ends = [(d - start) * NS_PER_S // SUBTICKS_PER_SECOND + TO_POLL for d in met.departures[1:]]
-        warnings = [WARNING_B, WARNING_C] if len(ends) == 2 else [WARNING_C]
+        warnings = list(WARNINGS[len(met.departures)])
         if target_reports:
             ends, warnings = [*ends, end + TARGET_LATER], [*warnings, WARNING_C]
         in_range = self._in_range(others, start)

@@ -15,6 +15,8 @@ FIRST_PATH: Final = 745.0
 NOISE: Final = 45.0
 AMPLITUDE: Final = 9000.0
 DECAY_TAPS: Final = 14.0
+PULSE_TAPS: Final = 1.2
+EDGE_TO_PEAK: Final = 1.5
 VALUES_A_TRANSFER: Final = 50
 HEADER_FIELDS: Final = 5
 
@@ -23,12 +25,14 @@ def impulse_response(rng: np.random.Generator) -> tuple[int, tuple[int, ...]]:
     """Draw one: index of the first path in thousandths of a tap, and 1016 magnitudes."""
     index = round(1000 * (FIRST_PATH + rng.uniform(-1, 1)))
     taps = np.arange(Cir.TAPS)
-    wave = AMPLITUDE * np.exp(-(((taps - index / 1000) / 1.2) ** 2)) + 0j
+    # The chip reports the leading edge; the peak of the pulse follows it.
+    peak = index / 1000 + EDGE_TO_PEAK
+    wave = AMPLITUDE * np.exp(-(((taps - peak) / PULSE_TAPS) ** 2)) + 0j
     echoes = rng.poisson(12)
-    later = index / 1000 + rng.exponential(DECAY_TAPS, echoes)
+    later = peak + rng.exponential(DECAY_TAPS, echoes)
     for place, phase in zip(later, rng.uniform(0, 2 * np.pi, echoes), strict=True):
-        strength = 0.4 * AMPLITUDE * np.exp(-(place - index / 1000) / DECAY_TAPS) * rng.rayleigh()
-        wave += strength * np.exp(1j * phase - ((taps - place) / 1.2) ** 2)
+        strength = 0.4 * AMPLITUDE * np.exp(-(place - peak) / DECAY_TAPS) * rng.rayleigh()
+        wave += strength * np.exp(1j * phase - ((taps - place) / PULSE_TAPS) ** 2)
     wave += NOISE * (rng.normal(size=Cir.TAPS) + 1j * rng.normal(size=Cir.TAPS))
     re, im = np.abs(np.trunc(wave.real)), np.abs(np.trunc(wave.imag))
     # The firmware's estimate of a magnitude: the larger part and a quarter of the smaller.

@@ -1,0 +1,38 @@
+"""Boards to test with: a scenario of three on a bench, served in a thread, and real ones where there are any."""
+
+import threading
+from contextlib import contextmanager
+
+from uwbsim.faults import Faults
+from uwbsim.scenario import Scenario
+from uwbsim.serve import Server
+
+
+def bench_scenario(seed=1, **radio):
+    """The layout of the captured transcripts: boards 1, 2, 3, skews +1.5, -2.0, +0.5 ppm."""
+    places = {1: (0.0, 0.0, 0.0), 2: (3.0, 0.0, 0.0), 3: (1.0, 2.0, 0.0)}
+    skews = {1: 1.5, 2: -2.0, 3: 0.5}
+    return Scenario.model_validate(
+        {
+            "scenario": {"seed": seed, "duration_s": 60.0},
+            "ranging": {"rate_hz": 100.0},
+            "radio": {"first_path_at_1m_dbm": -78.0, **radio},
+            "bodies": [{"name": f"b{k}", "motion": {"model": "static", "position_m": p}} for k, p in places.items()],
+            "tags": [{"id": k, "body": f"b{k}", "skew_ppm": skews[k], "delay_ns": 0.0} for k in places],
+        }
+    )
+
+
+@contextmanager
+def served(scenario=None, faults=None, link_dir=None):
+    """Serve a scenario in a thread; gives the server."""
+    server = Server(scenario or bench_scenario(), link_dir, Faults.model_validate({"faults": faults or []}))
+    stop = threading.Event()
+    thread = threading.Thread(target=server.run, args=(stop.is_set,), daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        stop.set()
+        thread.join(5)
+        server.close()
