@@ -21,8 +21,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 STEP_S: Final = 0.1
-FINE_S: Final = 0.002
-MOST_EXCHANGES: Final = 1500
+PARABOLA_S: Final = 0.02
+MOST_EXCHANGES: Final = 4000
 LEAST_OVERLAP: Final = 0.5
 CLEARLY: Final = 0.7
 """The best spread must be below this share of the typical one, or motion does not tell the time."""
@@ -52,10 +52,7 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag]) -> Alignmen
         raise ImportTableError("no offset puts the poses over the exchanges; are the bodies of the tags in the file?")
     typical = float(np.nanmedian(spreads))
     best = int(offsets[np.nanargmin(spreads)])
-    for width in (step, step // 10, step // 50):
-        near = np.arange(best - width, best + width + 1, max(width // 10, int(FINE_S * 1e9 / 10)), dtype=np.int64)
-        values = np.array([_spread(some, ranges, poses, tags, int(o)) for o in near])
-        best = int(near[np.nanargmin(values)])
+    best = _refined(some, ranges, poses, tags, best, float(np.nanmin(spreads)))
     spread = _spread(some, ranges, poses, tags, best)
     if spread > CLEARLY * typical:
         raise ImportTableError(
@@ -65,13 +62,39 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag]) -> Alignmen
     return Alignment(best, spread, typical)
 
 
+def _refined(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], start: int, scale_m: float) -> int:
+    """Move to the least Cauchy loss, which uses more of the data than their median: grids, then a parabola."""
+    best, step = start, int(STEP_S * 1e9)
+    for _ in range(3):
+        step //= 5
+        near = best + step * np.arange(-6, 7, dtype=np.int64)
+        losses = np.array([_loss(exchanges, ranges, poses, tags, int(o), scale_m) for o in near])
+        best = int(near[np.nanargmin(losses)])
+    # The last grid is finer than what noise lets through, so the parabola runs over a wider one.
+    near = best + int(PARABOLA_S * 1e9) * np.arange(-5, 6, dtype=np.int64)
+    losses = np.array([_loss(exchanges, ranges, poses, tags, int(o), scale_m) for o in near])
+    curve, slope, _ = np.polyfit((near - best) * 1e-9, losses, 2)
+    move_s = -slope / (2 * curve) if curve > 0 else 0.0
+    return best + round(float(np.clip(move_s, -5 * PARABOLA_S, 5 * PARABOLA_S)) * 1e9)
+
+
+def _loss(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], offset_ns: int, scale_m: float) -> float:
+    centred = _centred(exchanges, ranges, poses, tags, offset_ns)
+    return float(np.mean(np.log1p((centred / scale_m) ** 2))) if len(centred) else float("nan")
+
+
 def _spread(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], offset_ns: int) -> float:
     """Median absolute difference of range and distance, after each pair's own median; NaN where too few overlap."""
+    centred = _centred(exchanges, ranges, poses, tags, offset_ns)
+    return float(np.median(np.abs(centred))) if len(centred) else float("nan")
+
+
+def _centred(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], offset_ns: int) -> Floats:
+    """Differences of range and distance, less each pair's median; empty where too few exchanges overlap."""
     e = exchanges
     error = ranges - distances_m(poses, tags, e.initiator, e.target, e.time_ns - offset_ns)
     good = np.isfinite(error)
     if np.count_nonzero(good) < LEAST_OVERLAP * 0.8 * len(error):
-        return float("nan")
+        return np.empty(0)
     pair = e.initiator * 65_536 + e.target
-    centred = [np.abs(v - np.median(v)) for p in np.unique(pair) if len(v := error[good & (pair == p)])]
-    return float(np.median(np.concatenate(centred)))
+    return np.concatenate([v - np.median(v) for p in np.unique(pair) if len(v := error[good & (pair == p)])])

@@ -41,18 +41,25 @@ def run(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
     ] = None,
+    wire: Annotated[
+        bool, typer.Option("--through-wire", help="Encode and decode every report, and record the bytes.")
+    ] = False,
     force: Annotated[bool, typer.Option(help="Replace the output if it exists.")] = False,
 ) -> None:
     """Simulate a scenario and write what its boards and motion capture record."""
     from uwblink.recording import check_output
     from uwbsim.reading import load
     from uwbsim.simulate import simulate, write
+    from uwbsim.wire import through_wire
 
     check_output(output, force=force)
     loaded = load(scenario, settings or (), seed)
     with _progress(loaded.scenario.name) as report:
         simulated = simulate(loaded, report)
-    write(simulated, output, force=force)
+    frames: list[tuple[int, str, str, bytes]] = []
+    if wire:
+        simulated, frames = through_wire(simulated)
+    write(simulated, output, frames=frames, force=force)
     typer.echo(
         f"{output}: {len(simulated.exchanges)} exchanges of {len(loaded.tags)} tags in "
         f"{len(loaded.pairs())} pairs, {loaded.scenario.duration_s:g} s, "

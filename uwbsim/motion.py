@@ -15,6 +15,9 @@ from uwbsim.scenario import RandomFlight, Static, Waypoints
 
 Floats = NDArray[np.float64]
 
+Draw = Callable[[str], np.random.Generator]
+"""Returns the random stream of a body for a purpose."""
+
 TILT_RAD: Final = 0.12
 """Standard deviation of roll and pitch of a quadcopter in calm flight."""
 
@@ -41,12 +44,15 @@ class Trajectory:
         return np.asarray(self.position(time_s) + rotated)
 
 
-def sample(motion: RandomFlight | Waypoints | Static, duration_s: float, rng: np.random.Generator) -> Trajectory:
-    """Make the trajectory of a body over [0, duration_s]; random ones draw from `rng`."""
-    return _MAKERS[type(motion)](motion, duration_s, rng)
+def sample(motion: RandomFlight | Waypoints | Static, duration_s: float, draw: Draw) -> Trajectory:
+    """Make the trajectory of a body over [0, duration_s]; random ones draw from the streams that `draw` names.
+
+    A longer duration continues the same flight.
+    """
+    return _MAKERS[type(motion)](motion, duration_s, draw)
 
 
-def _static(motion: Static, _duration_s: float, _rng: np.random.Generator) -> Trajectory:
+def _static(motion: Static, _duration_s: float, _draw: Draw) -> Trajectory:
     point = np.array(motion.position_m)
     yaw = np.array([np.radians(motion.yaw_deg), 0.0, 0.0])
     return Trajectory(
@@ -55,7 +61,7 @@ def _static(motion: Static, _duration_s: float, _rng: np.random.Generator) -> Tr
     )
 
 
-def _waypoints(motion: Waypoints, _duration_s: float, _rng: np.random.Generator) -> Trajectory:
+def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory:
     times = np.array(motion.times_s)
     path = CubicSpline(times, np.array(motion.points_m), bc_type="clamped")
     return Trajectory(
@@ -65,7 +71,7 @@ def _waypoints(motion: Waypoints, _duration_s: float, _rng: np.random.Generator)
     )
 
 
-def _random_flight(motion: RandomFlight, duration_s: float, rng: np.random.Generator) -> Trajectory:
+def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Trajectory:
     lo, hi = np.array(motion.box_min_m), np.array(motion.box_max_m)
     # Two random points of a box lie about 0.38 of its diagonal apart.
     leg_s = 0.38 * float(np.linalg.norm(hi - lo)) / motion.speed_mps
@@ -73,9 +79,10 @@ def _random_flight(motion: RandomFlight, duration_s: float, rng: np.random.Gener
     # the box, and a cubic one has continuous acceleration.
     count = int(np.ceil(duration_s / leg_s)) + 8
     knots = (np.arange(count + 4) - 5) * leg_s
-    path = BSpline(knots, rng.uniform(lo, hi, (count, 3)), 3)
-    yaw = np.cumsum(rng.normal(0, 0.8, count)) + rng.uniform(-np.pi, np.pi)
-    angles = BSpline(knots, np.column_stack([yaw, rng.normal(0, TILT_RAD, (count, 2))]), 3)
+    path = BSpline(knots, draw("position").uniform(lo, hi, (count, 3)), 3)
+    turns = draw("yaw")
+    yaw = turns.uniform(-np.pi, np.pi) + np.cumsum(turns.normal(0, 0.8, count))
+    angles = BSpline(knots, np.column_stack([yaw, draw("tilt").normal(0, TILT_RAD, (count, 2))]), 3)
     # A little after the end, where the last exchange may still be under way, the body holds its place.
     last_s = duration_s + leg_s
     return Trajectory(
@@ -83,7 +90,7 @@ def _random_flight(motion: RandomFlight, duration_s: float, rng: np.random.Gener
     )
 
 
-_MAKERS: Final[dict[type, Callable[[Any, float, np.random.Generator], Trajectory]]] = {
+_MAKERS: Final[dict[type, Callable[[Any, float, Draw], Trajectory]]] = {
     Static: _static,
     Waypoints: _waypoints,
     RandomFlight: _random_flight,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -81,13 +81,20 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     )
 
 
-def write(simulated: Simulated, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write the recording; raises what `Recording.create` raises."""
+def write(
+    simulated: Simulated,
+    path: str | os.PathLike[str],
+    *,
+    frames: Sequence[tuple[int, str, str, bytes]] = (),
+    force: bool = False,
+) -> None:
+    """Write the recording, with the bytes of boards where there are any; raises what `Recording.create` raises."""
     with Recording.create(path, meta=simulated.meta, force=force) as recording:
         recording.append_tags(simulated.tags)
         recording.append_poses(simulated.poses)
         recording.append_exchanges(simulated.exchanges)
         recording.append_faults(simulated.faults)
+        recording.append_frames(frames)
 
 
 def _plan(scenario: Scenario) -> tuple[Ints, Ints, Ints]:

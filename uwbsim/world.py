@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -34,7 +35,7 @@ class World:
         duration, seed = scenario.scenario.duration_s, scenario.scenario.seed
         return cls(
             scenario,
-            {b.name: sample(b.motion, duration, stream(seed, "motion", b.name)) for b in scenario.bodies},
+            {b.name: sample(b.motion, duration, partial(stream, seed, "motion", b.name)) for b in scenario.bodies},
             np.array([shadowing_phases(seed, tag.id) for tag in scenario.tags]),
         )
 

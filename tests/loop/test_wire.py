@@ -1,0 +1,58 @@
+"""The loop through the wire: bytes change nothing, and served boards calibrate like simulated ones."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.boards import served
+from uwblink.importers.truth import add_poses
+from uwblink.plan import Plan, load_tags
+from uwblink.recorder import record
+from uwbsim.reading import load
+from uwbsim.serve import extended, write_poses
+
+ROOT = Path(__file__).parents[2]
+BIN = Path(sys.executable).parent
+TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
+
+
+def run(*arguments):
+    words = [str(a) for a in arguments]
+    done = subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_path):
+    for name, more in (("direct", []), ("wire", ["--through-wire"])):
+        (tmp_path / name).mkdir()
+        flight = tmp_path / name / "flight.uwb"
+        run("uwbsim", "run", TRAIN, "-o", flight, "--set", "scenario.duration_s=60", *more)
+        run("calib", "fit", flight, "-o", tmp_path / name / "c.json")
+    assert (tmp_path / "direct" / "c.json").read_bytes() == (tmp_path / "wire" / "c.json").read_bytes()
+    run("uwblink", "replay", tmp_path / "wire" / "flight.uwb", "-o", tmp_path / "wire" / "again.uwb")
+
+
+def test_served_boards_calibrate_like_simulated_ones(tmp_path):
+    from calib.dataset import load as load_ranges
+    from calib.fit import fit
+
+    scenario = load(TRAIN, ["scenario.duration_s=25"])
+    tags = load_tags(TRAIN)
+    with served(extended(scenario, 60.0)) as server:
+        write_poses(scenario, server.epoch_ns, tmp_path / "poses.csv")
+        record(list(server.names.values()), tmp_path / "boards.uwb", Plan(tags=tags, rate_hz=160.0), duration_s=22)
+    added = add_poses(tmp_path / "boards.uwb", tmp_path / "poses.csv")
+    assert added.covered > 0.98 * added.exchanges > 2000
+    run("uwbsim", "run", TRAIN, "-o", tmp_path / "simulated.uwb", "--set", "scenario.duration_s=22")
+    fits = [fit(load_ranges(tmp_path / f"{name}.uwb")).calibration for name in ("boards", "simulated")]
+    delays = [np.array([c.delays_ns[t.tag] for t in tags]) for c in fits]
+    stds = [np.array([c.delays_std_ns[t.tag] for t in tags]) for c in fits]
+    # A shift common to all is the constant of the curve, over powers that differ between two short flights.
+    apart = [d - d.mean() for d in delays]
+    score = (apart[0] - apart[1]) / np.hypot(*stds)
+    # Six scores within three and a half sigma: one run in 400 would fail by chance, and the seeds are fixed.
+    assert np.abs(score).max() < 3.5
+    assert np.abs(apart[0] - apart[1]).max() == pytest.approx(0, abs=0.12)
