@@ -3,10 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup demo test lint format bench lock clean
+.PHONY: help setup demo test lint format bench bench-boards endurance lock clean
 
 help: ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 setup: $(STAMP) ## prepare .venv with exactly the locked versions
 
@@ -40,6 +40,12 @@ format: setup ## rewrite the code in the house style
 
 bench: setup ## measure speed and memory; prints the table of the README
 	$(BIN)/python -m benchmarks
+
+bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
+	$(BIN)/python -m benchmarks.boards
+
+endurance: setup ## kill the recorder 50 times, and serve boards for 10 minutes
+	$(BIN)/python -m benchmarks.endurance
 
 lock: setup ## write the versions now in .venv to requirements-dev.lock
 	@{ echo "# Exact versions for development and CI; refresh with 'make lock'. Users install by the ranges in pyproject.toml."; \

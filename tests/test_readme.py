@@ -3,8 +3,10 @@
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -12,8 +14,8 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 BIN = Path(sys.executable).parent
 
 
-def shell_commands():
-    blocks = re.findall(r"^```sh\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+def shell_commands(label=""):
+    blocks = re.findall(rf"^```sh{label}\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
     return [line for block in blocks for line in block.splitlines() if line.strip()]
 
 
@@ -37,8 +39,33 @@ def test_every_shell_command_of_the_readme_works_in_order(tmp_path):
         assert (tmp_path / written).stat().st_size > 0
 
 
+def test_the_commands_for_boards_work_on_served_ones(tmp_path):
+    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
+    environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+    (serve,) = shell_commands(" serve")
+    server = subprocess.Popen(serve.split(), cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+    try:
+        while not (tmp_path / "poses.csv").exists():
+            assert server.poll() is None
+            time.sleep(0.05)
+        time.sleep(1.0)
+        commands = shell_commands(" boards")
+        assert len(commands) >= 8
+        for command in commands:
+            done = subprocess.run(command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True)
+            assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+        script = re.search(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)[1]
+        done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+        assert 2 < float(done.stdout) < 4
+    finally:
+        server.send_signal(signal.SIGINT)
+        assert server.wait(10) == 0
+    assert not (tmp_path / "ports" / "tag10").exists()
+    assert (tmp_path / "cir.png").stat().st_size > 1000
+
+
 def test_make_knows_the_targets_that_the_readme_names():
-    named = set(re.findall(r"\bmake ([a-z]+)\b", README)) - {"alone"}
+    named = set(re.findall(r"\bmake ([a-z-]+)\b", README)) - {"alone"}
     assert {"demo", "test", "setup"} <= named
     for target in sorted(named):
         done = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True)

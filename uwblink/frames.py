@@ -67,6 +67,7 @@ class Decoder:
         self._resume = re.compile(b"|".join([*ended, *plausible]), re.DOTALL)
         self._longest_start = max(map(len, self._starts)) + 3
         self._buffer = b""
+        self._tail = b""
         self._clean = True
         self.messages = 0
         self.skipped_bytes = 0
@@ -111,10 +112,12 @@ class Decoder:
             if event is None:
                 event = Skipped(buffer[at:end], "not a message")
                 self.skipped_bytes += end - at
-                self._clean = buffer[at:end].endswith(self._terminator)
+                # A line end may have come in two pieces, each of them skipped.
+                self._tail = (self._tail + buffer[at:end])[-len(self._terminator) :]
+                self._clean = self._tail == self._terminator
             else:
                 self.messages += 1
-                self._clean = True
+                self._tail, self._clean = b"", True
             events.append(event)
             at = end
         self._buffer = buffer[at:]

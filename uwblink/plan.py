@@ -44,7 +44,7 @@ class Plan:
     tags: tuple[Tag, ...] = ()
 
     def turns(self, present: Sequence[int]) -> tuple[tuple[int, int], ...]:
-        """Return the pairs among boards that are present; raises `PlanError` naming absent ones.
+        """Return the pairs among boards that are present, none to only listen; raises `PlanError` naming absent ones.
 
         "all" means every two boards once, except two on one body, whose distance says nothing.
         """
@@ -56,6 +56,8 @@ class Plan:
             if not turns:
                 raise PlanError(f"no two boards to range with each other; found {_listed(present)}")
             return turns
+        if not self.pairs:
+            return ()
         absent = sorted({tag for pair in self.pairs for tag in pair} - set(present))
         if absent:
             raise PlanError(f"the plan names {_listed(absent)}, but the boards at the ports are {_listed(present)}")

@@ -26,7 +26,7 @@ def record(
     ports: Annotated[list[str], typer.Argument(metavar="PORT...", help="Serial ports or pyserial URLs.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
     plan: Annotated[Path | None, typer.Option(help="Who ranges with whom (.toml).")] = None,
-    pairs: Annotated[str | None, typer.Option(help="all: every two boards.")] = None,
+    pairs: Annotated[str | None, typer.Option(help="all: every two boards; none: only listen.")] = None,
     rate: Annotated[float | None, typer.Option(min=0.001, help="Exchanges a second in total (Hz).")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
@@ -44,9 +44,9 @@ def record(
     check_output(output, force=force)
     if (plan is None) == (pairs is None):
         raise PlanError("give either --plan plan.toml or --pairs all")
-    if pairs not in (None, "all"):
-        raise PlanError(f"--pairs: found {pairs!r}, expected all; a plan file can name pairs")
-    chosen = load_plan(plan) if plan else Plan()
+    if pairs not in (None, "all", "none"):
+        raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
+    chosen = load_plan(plan) if plan else Plan("all" if pairs == "all" else ())
     if rate:
         chosen = replace(chosen, rate_hz=rate)
     if cir:

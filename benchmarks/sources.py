@@ -1,0 +1,57 @@
+"""Plain byte sources behind pseudo-terminals, to measure driver and recorder without a simulator.
+
+Run as a script: `python -m benchmarks.sources PORTS RATE SECONDS BURST` prints the names of its ports, waits until
+each was asked for its id, then sends numbered reports and prints how many.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from uwblink.frames import encode
+from uwblink.messages import IdIs, Ranged
+from uwblink.terminals import Terminal
+
+PIECE = 64
+
+
+def report(number: int) -> bytes:
+    return encode(Ranged(99, 3.055, number, 1, 2, 3, 4, 5, -87.4977, -87.5239, -3.4971, 3.5222))
+
+
+def answer(terminals: list[Terminal], seconds: float) -> set[int]:
+    """Answer requests for ids; returns who asked."""
+    asked, until = set(), time.monotonic() + seconds
+    while time.monotonic() < until:
+        for k, terminal in enumerate(terminals):
+            if b"C01\r" in terminal.read():
+                terminal.write(encode(IdIs(k)))
+                asked.add(k)
+        time.sleep(0.001)
+    return asked
+
+
+def main() -> None:
+    ports, rate, seconds, burst = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
+    terminals = [Terminal() for _ in range(ports)]
+    print(" ".join(t.name for t in terminals), flush=True)
+    asked: set[int] = set()
+    while len(asked) < ports:
+        asked |= answer(terminals, 0.05)
+    time.sleep(1.0)
+    start, sent = time.monotonic(), 0
+    while sent < rate * seconds:
+        data = b"".join(report(sent + k) for k in range(burst))
+        for terminal in terminals:
+            # In bursts the bytes come as USB brings them, in pieces of 64.
+            for at in range(0, len(data), PIECE if burst > 1 else len(data)):
+                terminal.write(data[at : at + (PIECE if burst > 1 else len(data))])
+        sent += burst
+        time.sleep(max(start + sent / rate - time.monotonic(), 0))
+    time.sleep(1.0)
+    print(sent * ports, sum(t.lost_bytes for t in terminals), flush=True)
+
+
+if __name__ == "__main__":
+    main()

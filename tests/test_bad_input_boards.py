@@ -1,0 +1,131 @@
+"""Mistakes at the commands for boards: one line, status 2, nothing written."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.boards import served
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.executable).parent
+BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
+
+
+def run(*arguments):
+    words = [str(a) for a in arguments]
+    return subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True, timeout=30)
+
+
+def refused(done, *fragments):
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1, done.stderr
+    for fragment in fragments:
+        assert fragment in done.stderr
+
+
+@pytest.fixture(scope="module")
+def ports():
+    with served() as server:
+        yield server.names
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["info"],
+        ["twr", 2],
+        ["test"],
+        ["set-delay", 1500],
+        ["passive", "on"],
+        ["send", "x"],
+        ["cir", 2],
+        ["record", "-o", "x.uwb", "--pairs", "all"],
+    ],
+)
+def test_no_such_port(tmp_path, words):
+    command, *rest = (str(tmp_path / w) if w == "x.uwb" else w for w in words)
+    refused(run("uwblink", command, "/dev/nothing", *rest), "/dev/nothing", "no such port")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_board_cannot_do(ports, tmp_path):
+    port = ports[1]
+    refused(run("uwblink", "twr", port, 1), "own id")
+    refused(run("uwblink", "twr", port, 9), "COMMANDED TASK FAILED AFTER 5 ATTEMPTS")
+    refused(run("uwblink", "twr", port, 2, "--protocol", "tdoa"), "tdoa", "ss and ds")
+    for delay in ("279", "6501", "100000"):
+        refused(run("uwblink", "set-delay", port, delay), delay, "280 to 6500")
+    refused(run("uwblink", "passive", port, "maybe"), "maybe", "on or off")
+    refused(run("uwblink", "send", port, "x" * 93), "93 bytes", "at most 92")
+    refused(run("uwblink", "cir", port, 2, "--plot", tmp_path / "c.xyz"), ".xyz", ".png")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_port_that_is_not_a_board(ports, tmp_path):
+    from uwblink.terminals import Terminal
+
+    silent = Terminal()
+    refused(run("uwblink", "info", silent.name), "b'C07\\r'", "heard nothing", "is this a ranging board")
+    done = run("uwblink", "ports", "--probe", ports[1], silent.name)
+    assert done.returncode == 0
+    assert "board 1" in done.stdout
+    assert "no answer" in done.stdout
+    silent.unplug()
+
+
+def test_recordings_that_cannot_begin(ports, tmp_path):
+    out = tmp_path / "f.uwb"
+    both = [ports[1], ports[2]]
+    plan = tmp_path / "plan.toml"
+    plan.write_text("pairs = [[1, 9]]")
+    refused(run("uwblink", "record", *both, "-o", out, "--plan", plan), "names 9", "1, 2")
+    refused(run("uwblink", "record", *both, "-o", out), "--plan", "--pairs")
+    refused(run("uwblink", "record", *both, "-o", out, "--pairs", "some"), "some")
+    refused(run("uwblink", "record", *both, "-o", out, "--plan", tmp_path / "no.toml"), "no.toml")
+    refused(run("uwblink", "record", ports[1], "-o", out, "--pairs", "all"), "no two boards")
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
+
+
+def test_replays_of_what_has_no_bytes(tmp_path):
+    flight = tmp_path / "f.uwb"
+    assert run("uwbsim", "run", BENCH, "-o", flight, "--set", "scenario.duration_s=1").returncode == 0
+    refused(run("uwblink", "replay", flight), "no bytes from boards")
+    refused(run("uwblink", "replay", flight, "--serve"), "no bytes from boards")
+    refused(run("uwblink", "replay", tmp_path / "no.uwb"), "no such")
+
+
+@pytest.mark.parametrize(
+    ("text", "fragments"),
+    [
+        ("[[faults]]\nkind = 'flood'", ["faults", "flood"]),
+        ("[[faults]]\nkind = 'hang'\ntag = 99\nat_s = 1", ["faults[0].tag", "99", "10, 20"]),
+        ("[[faults]]\nkind = 'lose-frames'\nshare = 2", ["share"]),
+        ("faults = [", ["cannot be read"]),
+    ],
+)
+def test_faults_that_cannot_be(tmp_path, text, fragments):
+    (tmp_path / "f.toml").write_text(text)
+    refused(run("uwbsim", "serve", BENCH, "--faults", tmp_path / "f.toml", "--duration", 1), "f.toml", *fragments)
+
+
+def test_links_that_cannot_be(tmp_path):
+    (tmp_path / "file").write_text("")
+    refused(run("uwbsim", "serve", BENCH, "--link-dir", tmp_path / "file", "--duration", 1), "tag10")
+    (tmp_path / "p.csv").write_text("mine")
+    refused(run("uwbsim", "serve", BENCH, "--poses", tmp_path / "p.csv", "--duration", 1), "--force")
+    assert (tmp_path / "p.csv").read_text() == "mine"
+
+
+def test_a_replay_is_served_as_it_was(tmp_path, ports):
+    flight = tmp_path / "f.uwb"
+    done = run("uwblink", "record", ports[1], ports[2], "-o", flight, "--pairs", "all", "--duration", 0.5)
+    assert done.returncode == 0, done.stderr
+    done = run("uwblink", "replay", flight, "--serve", "--speed", 10, "--link-dir", tmp_path / "again")
+    assert done.returncode == 0, done.stderr
+    assert "pieces played" in done.stdout
+    done = run("uwblink", "replay", flight, "-o", tmp_path / "again.uwb", "--json")
+    assert '"skipped_bytes": 0' in done.stdout
+    assert (tmp_path / "again.uwb").exists()
