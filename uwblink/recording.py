@@ -175,6 +175,11 @@ class Recording:
         if listed:
             self._insert("overheard", {n: np.array([row[n] for row in listed]) for n in TABLES["overheard"]})
 
+    def append_columns(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Add rows to one of `TABLES` from columns with its names, in one transaction; none where there are none."""
+        if columns:
+            self._insert(table, columns)
+
     def append_cirs(self, rows: Iterable[tuple[int, int, int, int, float, tuple[int, ...]]]) -> None:
         """Add impulse responses: (time_ns, board, initiator, target, first_path_index, magnitudes)."""
         for row in rows:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from uwbsim.clock import SUBTICKS_PER_SECOND
-from uwbsim.radio import gain_db, path_gain_db
+from uwbsim.propagation import Link
+from uwbsim.radio import gain_db
 from uwbsim.world import World
 
 Ints = NDArray[np.int64]
@@ -34,13 +35,12 @@ class Ahead:
         self._turns: Floats = np.empty(0)
         self._prepare(0)
 
-    def link(self, initiator: Ints, target: Ints, time: Ints) -> tuple[Floats, Floats]:
-        """Return distance and power as `World.link` does, for one exchange: arrays of shape (1,)."""
-        distance, power = self.from_sender(int(initiator[0]), int(time[0]))
-        return distance[target], power[target]
+    def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
+        """Return what `World.link` does, for one exchange: arrays of shape (1,)."""
+        return self.from_sender(int(initiator[0]), int(time[0]))[target]
 
-    def from_sender(self, sender: int, time: int) -> tuple[Floats, Floats]:
-        """Return distance (m) and first-path power (dBm) from a tag's place to every tag, shape (tags,)."""
+    def from_sender(self, sender: int, time: int) -> Link:
+        """Return what reaches every tag from a tag's place, shape (tags,); shadows of bodies are left out."""
         spots, turns = self._at(time)
         apart = spots - spots[sender]
         distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
@@ -49,7 +49,8 @@ class Ahead:
         leaving = towards @ turns[sender]
         arriving = -np.einsum("ij,ijk->ik", towards, turns)
         gain = gain_db(radio, phases[sender], leaving) + gain_db(radio, phases, arriving)
-        return distance, path_gain_db(radio, distance) + gain
+        starts = np.broadcast_to(spots[sender], spots.shape)
+        return self._world.surroundings(distance, gain, (starts, spots))
 
     def _at(self, time: int) -> tuple[Floats, Floats]:
         step, into = divmod(time / SUBTICKS_PER_SECOND / STEP_S, 1)

@@ -1,145 +1,208 @@
-"""The discrete-event loop: tags that send, wait and answer, and the air between them.
+"""The discrete-event loop: who sends when, what collides, and which exchanges fail.
 
-The loop decides what happens and in which order: which frames arrive, which exchanges fail, when the
-next one can start. It runs on nominal delays, within a few tens of nanoseconds of the exact instants,
-on which nothing in it depends; those are computed afterwards in batches (`uwbsim.stamps`).
+The loop decides what happens and in which order. It runs on nominal delays, within a few tens of nanoseconds of the
+exact instants, on which nothing in it depends; those are computed afterwards in batches (`uwbsim.stamps`).
+
+A frame is noted when it is decided to send it and judged when it has ended, so that every frame which overlaps it is
+known by then: one event a message.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 import simpy
+from numpy.typing import NDArray
 
-from uwblink.twr import Protocol, Role
+from uwblink.twr import Protocol
 from uwbsim.clock import SUBTICKS_PER_SECOND
+from uwbsim.frame_times import after_marker_s, before_marker_s, message_bytes
 
-PATIENCE_S: Final = 6.73e-3
-"""Longest wait from one frame's timestamp to the next one's.
+PREAMBLE_TIMEOUT_S: Final = 6.521e-3
+"""How long a board waits for a preamble (firmware wire format, 3.1)."""
 
-The preamble timeout of 6.521 ms (firmware wire format, 3.1) starts when the receiver is on again,
-some 70 us after the stamp, and the next preamble starts 138 us before its own stamp.
-"""
+RECEIVER_ON_S: Final = 70e-6
+"""From a stamp until the receiver is on again."""
 
 TURNAROUND_S: Final = 0.5e-3
 """From the end of an exchange until the initiator's host can command the next."""
 
-Waiting = Generator[simpy.Event, Any, None]
+WEAK, COLLIDED, BUSY, FOREIGN, LATE = "below sensitivity", "collision", "receiver busy", "another's frame", "too late"
+
+Steps = Generator[simpy.Event, Any, None]
+Powers = Callable[[int, int], NDArray[np.float64]]
+"""Returns the power (dBm) at every tag from a sender, at a true time in sub-ticks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
     """One planned exchange: when, who, and what the radios will make of each message.
 
-    `heard[k]` says whether message k is above the receiver's sensitivity, `delay[k]` is the
-    sub-ticks from the stamp it waits for until message k leaves, `flight` its sub-ticks in the air.
+    `heard[k]` says whether message k is above the receiver's sensitivity, `delay[k]` is the sub-ticks from the stamp
+    it waits for until message k leaves, `number` its place in the plan, `pause` what the initiator waits first.
     """
 
+    number: int
     start: int
     initiator: int
     target: int
     heard: tuple[bool, ...]
     delay: tuple[int, ...]
-    flight: int
+    pause: int = 0
+
+
+@dataclass(slots=True)
+class Outcomes:
+    """What became of each slot: when its poll left (-1: never), the message that was lost (-1: none), and why."""
+
+    start: list[int]
+    lost: list[int]
+    reason: list[str]
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of a slot: when its poll left, and the message that was lost, or -1."""
-
+class _Frame:
     start: int
-    lost: int
+    end: int
+    sender: int
+    exchange: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What decides a reception besides its own power."""
+
+    sensitivity_dbm: float
+    capture_db: float
+    preamble_symbols: int
 
 
 class Air:
-    """Carries each frame to its receiver after its flight time, unless it is too weak to hear.
+    """The medium and the radios on it, while the slots of a plan are played."""
 
-    A board takes polls from its interrupt handler and everything else from the busy wait of the
-    exchange it is in: hence two inboxes a tag.
-    """
+    def __init__(self, protocol: Protocol, slots: int, tags: int, powers: Powers, rules: Rules) -> None:
+        """Be silent."""
+        self.env = simpy.Environment()
+        self._messages = protocol.messages
+        self._powers, self._rules = powers, rules
+        self._before = _subticks(before_marker_s(rules.preamble_symbols))
+        self._after = [_subticks(after_marker_s(n)) for n in message_bytes(protocol)]
+        self._patience = _subticks(PREAMBLE_TIMEOUT_S + RECEIVER_ON_S + before_marker_s(rules.preamble_symbols))
+        self._turnaround = _subticks(TURNAROUND_S)
+        self._frames: list[_Frame] = []
+        self._busy_until = [0] * tags
+        self.outcomes = Outcomes([-1] * slots, [-1] * slots, [""] * slots)
 
-    def __init__(self, env: simpy.Environment, tags: int) -> None:
-        """Open the inboxes of `tags` tags."""
-        self.env = env
-        self.polls = [simpy.Store(env) for _ in range(tags)]
-        self.answers = [simpy.Store(env) for _ in range(tags)]
+    def play(self, slots: Sequence[Slot], report: Callable[[int], None] | None = None) -> Steps:
+        """Play the slots of one host, one after the other."""
+        env = self.env
+        for count, slot in enumerate(slots):
+            if slot.start > env.now:
+                yield env.timeout(slot.start - int(env.now))
+            if slot.pause:
+                yield env.timeout(slot.pause)
+            yield from self._exchange(slot)
+            yield env.timeout(self._turnaround)
+            if report and not count % 500:
+                report(count)
 
-    def send(self, slot: Slot, number: int, receiver: int) -> None:
-        """Put message `number` of a slot on the air, now."""
-        if slot.heard[number]:
-            inbox = (self.answers if number else self.polls)[receiver]
-            arrival = self.env.timeout(slot.flight, slot)
-            arrival.callbacks.append(lambda event: _deliver(inbox, event))
+    def _exchange(self, slot: Slot) -> Steps:
+        """Send the messages of an exchange in turn; stop, after the wait for it, at one that is not received."""
+        env, outcomes, number = self.env, self.outcomes, slot.number
+        busy, me, other = self._busy_until, slot.initiator, slot.target
+        if busy[me] > env.now:  # a board that answers somebody takes its own command when it is done
+            yield env.timeout(busy[me] - int(env.now))
+        marker = int(env.now) + self._before
+        outcomes.start[number] = marker
+        listening_since = marker
+        for k, message in enumerate(self._messages):
+            if k:
+                marker += slot.delay[k]
+            sender, receiver = (me, other) if message.sender == "initiator" else (other, me)
+            frame = _Frame(marker - self._before, marker + self._after[k], sender, number)
+            self._frames.append(frame)
+            yield env.timeout(frame.end - int(env.now))
+            reason = self._fate(slot, k, frame, receiver, listening_since, marker)
+            if reason:
+                outcomes.lost[number], outcomes.reason[number] = k, reason
+                # Whoever waits for the missing message gives up when its preamble does not come.
+                until = marker + self._patience
+                busy[me] = max(busy[me], until)
+                if k:
+                    busy[other] = max(busy[other], marker)
+                yield env.timeout(max(until - int(env.now), 0))
+                return
+            listening_since = marker
+            busy[me] = busy[other] = max(frame.end, busy[me])
 
+    def _fate(self, slot: Slot, k: int, frame: _Frame, receiver: int, since: int, marker: int) -> str:
+        """Why a frame that has just ended was not received, empty if it was."""
+        if not slot.heard[k]:
+            return WEAK
+        if k and marker - since > self._patience:
+            return LATE
+        if not k and self._busy_until[receiver] > frame.start:
+            return BUSY
+        if len(self._frames) > 1:
+            return self._interference(slot, k, frame, receiver, since)
+        self._frames.clear()
+        return ""
 
-def _deliver(inbox: simpy.Store, arrival: simpy.Event) -> None:
-    inbox.put(arrival.value)
+    def _interference(self, slot: Slot, k: int, frame: _Frame, receiver: int, since: int) -> str:
+        """What the other frames on the air do to one: collide with it, or come in the place of it."""
+        now = int(self.env.now)
+        oldest = now - 2 * self._patience
+        self._frames = [f for f in self._frames if f.end > oldest]
+        others = [f for f in self._frames if f.exchange != slot.number and f.end > since and f.start < frame.end]
+        if not others:
+            return ""
+        signal = float(self._powers(frame.sender, frame.start)[receiver])
+        for f in others:
+            if f.sender == receiver:
+                return BUSY
+            power = float(self._powers(f.sender, f.start)[receiver])
+            if power < self._rules.sensitivity_dbm:
+                continue
+            if f.end <= frame.start:
+                if k:
+                    return FOREIGN  # a board that waits for an answer takes the first frame that comes for it
+                continue
+            captured = signal >= power + self._rules.capture_db and frame.start <= f.start
+            if not captured:
+                return COLLIDED
+        return ""
 
 
 def run(
     protocol: Protocol,
-    slots: list[Slot],
+    hosts: Sequence[Sequence[Slot]],
     tags: int,
+    powers: Powers,
+    rules: Rules,
     progress: Callable[[float], None] | None = None,
-) -> list[Outcome]:
-    """Play the slots one after the other; returns what became of each, in order."""
-    env = simpy.Environment()
-    air = Air(env, tags)
-    outcomes: list[Outcome] = []
-    for tag in range(tags):
-        env.process(_answer(env, air, protocol, tag))
-    done = env.process(_plan(env, air, protocol, slots, outcomes, progress))
-    env.run(until=done)
-    return outcomes
+) -> Outcomes:
+    """Play the slots of all hosts, each host's in order; returns what became of every slot."""
+    total = sum(map(len, hosts))
+    air = Air(protocol, total, tags, powers, rules)
+    counts = [0] * len(hosts)
+
+    def reporter(host: int) -> Callable[[int], None] | None:
+        if progress is None:
+            return None
+
+        def report(count: int) -> None:
+            counts[host] = count
+            progress(sum(counts) / max(total, 1))
+
+        return report
+
+    processes = [air.env.process(air.play(slots, reporter(h))) for h, slots in enumerate(hosts)]
+    air.env.run(until=air.env.all_of(processes))
+    return air.outcomes
 
 
-def _plan(
-    env: simpy.Environment,
-    air: Air,
-    protocol: Protocol,
-    slots: list[Slot],
-    outcomes: list[Outcome],
-    progress: Callable[[float], None] | None,
-) -> Waiting:
-    turnaround = int(TURNAROUND_S * SUBTICKS_PER_SECOND)
-    for count, slot in enumerate(slots):
-        if slot.start > env.now:
-            yield env.timeout(slot.start - int(env.now))
-        start = int(env.now)
-        yield env.process(_exchange(env, air, protocol, slot))
-        outcomes.append(Outcome(start, slot.heard.index(False) if False in slot.heard else -1))
-        yield env.timeout(turnaround)
-        if progress and not count % 500:
-            progress(count / len(slots))
-
-
-def _exchange(env: simpy.Environment, air: Air, protocol: Protocol, slot: Slot) -> Waiting:
-    """Initiate an exchange; ends when the initiator is done or has given up."""
-    air.send(slot, 0, slot.target)
-    yield from _play(env, air, protocol, slot, "initiator")
-
-
-def _answer(env: simpy.Environment, air: Air, protocol: Protocol, tag: int) -> Waiting:
-    """Wait for polls, for ever, and take the target's part in each exchange."""
-    while True:
-        slot = yield air.polls[tag].get()
-        yield from _play(env, air, protocol, slot, "target")
-
-
-def _play(env: simpy.Environment, air: Air, protocol: Protocol, slot: Slot, role: Role) -> Waiting:
-    """Send and receive what follows the poll, as the protocol's rows say; stop at a missing frame."""
-    me, other = slot.initiator, slot.target
-    if role == "target":
-        me, other = other, me
-    for number, message in enumerate(protocol.messages[1:], start=1):
-        if message.sender == role:
-            yield env.timeout(slot.delay[number])
-            air.send(slot, number, other)
-            continue
-        frame = air.answers[me].get()
-        yield frame | env.timeout(int(PATIENCE_S * SUBTICKS_PER_SECOND))
-        if not frame.triggered:
-            frame.cancel()
-            return
+def _subticks(seconds: float) -> int:
+    return round(seconds * SUBTICKS_PER_SECOND)

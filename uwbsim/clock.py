@@ -30,8 +30,8 @@ WALK_STEP_S: Final = 0.1
 class Clocks:
     """The clocks of all tags, indexed by the tag's place in the scenario.
 
-    A clock reads t + offset + deviation(t); the deviation is skew times t plus the integral of a
-    random walk of the rate, constant over steps of `WALK_STEP_S`.
+    A clock reads t + offset + deviation(t); the deviation is skew times t plus the integral of the rate's random
+    walk, white noise and temperature ramp, constant over steps of `WALK_STEP_S`.
     """
 
     offset: Ints
@@ -44,7 +44,7 @@ class Clocks:
         """Build the clocks of a scenario; offsets not given and random walks come from its seed."""
         seed, duration = scenario.scenario.seed, scenario.scenario.duration_s
         steps = int(duration / WALK_STEP_S) + 20
-        offsets, rates = [], []
+        offsets, rates, phases = [], [], []
         for tag in scenario.tags:
             rng = stream(seed, "clock", tag.id)
             drawn = rng.integers(0, 1 << COUNTER_BITS)
@@ -52,8 +52,14 @@ class Clocks:
                 drawn = np.int64(round(tag.clock_offset_s * TICKS_PER_SECOND))
             offsets.append(drawn * SUBTICKS + rng.integers(0, SUBTICKS))
             sigma = tag.drift_ppm_per_sqrt_s * 1e-6 * np.sqrt(WALK_STEP_S)
-            rates.append(np.concatenate([[0.0], np.cumsum(rng.normal(0, 1, steps) * sigma)]))
+            walk = np.concatenate([[0.0], np.cumsum(rng.normal(0, 1, steps) * sigma)])
+            ramp = tag.ramp_ppm_per_s * 1e-6 * WALK_STEP_S * np.arange(steps + 1)
+            rates.append(walk + ramp)
+            # White noise of the rate is a random walk of the phase.
+            white = tag.white_ppm_sqrt_s * 1e-6 / np.sqrt(WALK_STEP_S)
+            phases.append(stream(seed, "clock white", tag.id).normal(0, 1, steps) * white)
         rate = np.array(rates)
+        rate[:, :-1] += np.array(phases)
         step = WALK_STEP_S * SUBTICKS_PER_SECOND
         phase = np.cumsum(rate[:, :-1] * step, axis=1)
         walk = np.concatenate([np.zeros((len(rate), 1)), phase], axis=1)

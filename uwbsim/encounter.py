@@ -77,7 +77,7 @@ class Radios:
 
     def hearers(self, sender: int, tags: list[int], time: int) -> list[int]:
         """Return those of the tags whose boards a board is strong enough for."""
-        _, power = self.ahead.from_sender(self._place[sender], time)
+        power = self.ahead.from_sender(self._place[sender], time).power_dbm
         return [tag for tag in tags if power[self._place[tag]] >= self.scenario.radio.sensitivity_dbm]
 
     def overhear(
@@ -147,10 +147,12 @@ class Radios:
     def _receptions(self, me: Ints, sender: int, departure: int) -> _Receptions:
         """Return how listeners (n,) receive one frame."""
         radio, count = self.scenario.radio, len(me)
-        distance, power = (values[me] for values in self.ahead.from_sender(sender, departure))
+        link = self.ahead.from_sender(sender, departure)[me]
+        power = link.power_dbm
         heard = (power >= radio.sensitivity_dbm) & (self._chance.random(count) >= self.lost_share)
-        late_s = reception_bias_s(radio, power) + self._chance.normal(size=count) * reception_noise_s(radio, power)
-        flight = np.rint(distance / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND).astype(np.int64)
+        late_s = reception_bias_s(radio, power, link.total_dbm)
+        late_s = late_s + self._chance.normal(size=count) * reception_noise_s(radio, power)
+        flight = np.rint((link.distance_m + link.excess_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND).astype(np.int64)
         stamps = reception(self.clocks, me, departure + flight, late_s, self._delays[me, 1]) & MASK
         time = np.full(count, departure)
         power, skew = self._readings(np.full(count, sender), me, time, power)

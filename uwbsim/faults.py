@@ -10,9 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError
 
 from uwbsim.errors import ScenarioError
-from uwbsim.scenario import NotNegative, Positive, Section, TagId
-
-Share = Annotated[float, Field(ge=0, le=1)]
+from uwbsim.section import NotNegative, Positive, Section, Share, TagId
 
 
 class Bytes(Section):

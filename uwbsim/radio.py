@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, RegularGridInterpolator
 
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
-from uwbsim.scenario import Radio, SigmaSpline, Spline
+from uwbsim.radio_model import AntennaTable, BiasTable, Radio, SigmaSpline, Spline
 from uwbsim.streams import stream
 
 Floats = NDArray[np.float64]
@@ -52,13 +52,26 @@ def gain_db(radio: Radio, phases: Floats, direction: Floats) -> Floats:
     The antenna stands along the body's z axis. Shadowing by the body is a smooth function of azimuth with standard
     deviation `shadowing_db`; `phases` are those of the tag (harmonics,), or of n tags (n, harmonics).
     """
-    sine = np.hypot(direction[:, 0], direction[:, 1])
-    gain = ANTENNAS[radio.antenna](sine)
+    if isinstance(radio.antenna, AntennaTable):
+        gain = _table_gain_db(radio.antenna, direction)
+    else:
+        gain = ANTENNAS[radio.antenna](np.hypot(direction[:, 0], direction[:, 1]))
     if radio.shadowing_db:
         azimuth = np.arctan2(direction[:, 1], direction[:, 0])
         waves = np.cos(azimuth[:, None] * SHADOW_ORDERS + phases).sum(axis=1)
         gain = gain + radio.shadowing_db * waves * np.sqrt(2 / SHADOW_HARMONICS)
     return gain
+
+
+def _table_gain_db(table: AntennaTable, direction: Floats) -> Floats:
+    azimuth = np.degrees(np.arctan2(direction[:, 1], direction[:, 0]))
+    elevation = np.degrees(np.arcsin(np.clip(direction[:, 2], -1, 1)))
+    return np.asarray(_interpolator(table)(np.column_stack([azimuth, elevation])))
+
+
+@lru_cache(maxsize=16)
+def _interpolator(table: AntennaTable) -> RegularGridInterpolator:
+    return RegularGridInterpolator((table.azimuth_deg, table.elevation_deg), np.array(table.gain_db))
 
 
 def path_gain_db(radio: Radio, distance_m: Floats) -> Floats:
@@ -72,12 +85,19 @@ def lifted(power_dbm: Floats) -> Floats:
     return np.asarray(10 ** ((power_dbm - ALPHA_DBM) / 10))
 
 
-def reception_bias_s(radio: Radio, power_dbm: Floats) -> Floats:
-    """What power adds to a receive stamp, in seconds.
+def reception_bias_s(radio: Radio, power_dbm: Floats, total_dbm: Floats | None = None) -> Floats:
+    """What power adds to a receive stamp, in seconds: a spline goes by first-path power, a table by total power.
 
     Each of the two receptions of a range carries it, so a range has the mean of the curve's values.
     """
+    if isinstance(radio.bias, BiasTable):
+        return _table_bias_m(radio.bias, power_dbm if total_dbm is None else total_dbm) / SPEED_OF_LIGHT
     return _spline(radio.bias, power_dbm) / SPEED_OF_LIGHT
+
+
+def _table_bias_m(table: BiasTable, total_dbm: Floats) -> Floats:
+    order = np.argsort(table.power_dbm)
+    return np.asarray(np.interp(total_dbm, np.array(table.power_dbm)[order], np.array(table.bias_m)[order]))
 
 
 def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:

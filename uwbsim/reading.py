@@ -13,6 +13,7 @@ from typing import Any, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from uwbsim.errors import ScenarioError
+from uwbsim.files import fill_in
 from uwbsim.scenario import Scenario
 
 
@@ -26,6 +27,7 @@ def load(path: str | os.PathLike[str], overrides: Sequence[str] = (), seed: int 
         _override(table, text)
     if seed is not None:
         table.setdefault("scenario", {})["seed"] = seed
+    fill_in(table, Path(path))
     try:
         return Scenario.model_validate(table)
     except ValidationError as error:

@@ -1,33 +1,32 @@
 """The scenario: what a TOML file may say, validated. Units are in the key names and leave here.
 
-`load` turns every mistake into one `ScenarioError` line; the models below are the whole schema.
+`uwbsim.reading.load` turns every mistake into one `ScenarioError` line; the models here and in `radio_model` and
+`motion_model` are the whole schema.
 """
 
 from __future__ import annotations
 
 from itertools import combinations
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import PROTOCOLS
+from uwbsim.frame_times import exchange_air_s
+from uwbsim.motion_model import Motion, RandomFlight, Static, Waypoints
+from uwbsim.radio_model import Obstacle, Radio, Room, Shadow, Spline
+from uwbsim.section import NotNegative, Positive, Section, TagId, Vector
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Vector = tuple[float, float, float]
-TagId = Annotated[int, Field(ge=0, le=254)]
 ProtocolName = Annotated[str, Field(json_schema_extra={"enum": sorted(PROTOCOLS)})]
+PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
 
-# From the last stamp of an exchange until the board answers the next command: start-up of the
-# poll, three frames, and the transfer over USB (firmware wire format, 1.5).
-OVERHEAD_S = 0.0015
-UUS_S = 512 / 499.2e6
+OVERHEAD_S: Final = 0.0015
+"""From the last stamp of an exchange until the board answers the next command: start-up of the poll, three frames, and
+the transfer over USB (firmware wire format, 1.5)."""
 
-
-class Section(BaseModel):
-    """A table of the file: immutable, with no unknown keys, and finite numbers only."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+UUS_S: Final = 512 / 499.2e6
+WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
 
 
 class Heading(Section):
@@ -51,18 +50,29 @@ class FixedReply(Section):
     delay_us: Annotated[float, Field(ge=180, le=6000)]
 
 
+class PlanFile(Section):
+    """A plan from a CSV file with the columns time_s, initiator, target; `slots` is filled in on reading."""
+
+    file: str
+    slots: tuple[tuple[float, int, int], ...] = ()
+
+
 class Ranging(Section):
     """Who ranges with whom, how, and how often.
 
     `response_delay_uus` is the boards' C08 setting, in UWB microseconds (1.0256 us): the delay of
-    the scheduled message. `pairs` are (initiator, target).
+    the scheduled message. `pairs` are (initiator, target). `rate_hz` counts all exchanges together.
     """
 
     protocol: ProtocolName = "ds"
     rate_hz: Positive
     pairs: Literal["between-bodies"] | tuple[tuple[TagId, TagId], ...] = "between-bodies"
+    plan: PlanName | PlanFile = "round-robin"
+    sync_error_ms: NotNegative = 0.1
+    list_timeout_ms: NotNegative = 10.0
     response_delay_uus: Annotated[int, Field(ge=280, le=6500)] = 1500
     reply: Annotated[BoardReply | FixedReply, Field(discriminator="model")] = BoardReply()
+    get_cir: bool = False
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -73,128 +83,51 @@ class Ranging(Section):
         for pair in self.pairs if self.pairs != "between-bodies" else ():
             if pair[0] == pair[1]:
                 raise ValueError(f"pairs: tag {pair[0]} cannot range with itself")
-        fastest = 1 / (OVERHEAD_S + self.response_delay_uus * UUS_S)
-        if self.rate_hz > fastest:
-            raise ValueError(f"rate_hz: found {self.rate_hz:g}, at this response_delay_uus at most {fastest:.0f}")
-        return self
-
-
-class Spline(Section):
-    """A B-spline over lifted first-path power 10^((fpp_dbm + 82)/10), held constant beyond its ends."""
-
-    knots: tuple[float, ...]
-    coefficients: tuple[float, ...]
-    degree: Annotated[int, Field(ge=0, le=5)] = 3
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if len(self.knots) != len(self.coefficients) + self.degree + 1:
+        if self.plan != "aloha" and self.rate_hz > self.fastest_hz():
             raise ValueError(
-                f"knots: found {len(self.knots)}, a spline of degree {self.degree} with "
-                f"{len(self.coefficients)} coefficients has {len(self.coefficients) + self.degree + 1}"
+                f"rate_hz: found {self.rate_hz:g}, at this response_delay_uus the air allows "
+                f"at most {self.fastest_hz():.0f}"
             )
-        if list(self.knots) != sorted(self.knots) or self.knots[0] == self.knots[-1]:
-            raise ValueError("knots: must not decrease, and must span a range")
         return self
 
+    def fastest_hz(self) -> float:
+        """Return how many exchanges a second one after the other allow."""
+        return 1 / (OVERHEAD_S + self.response_delay_uus * UUS_S)
 
-class SigmaSpline(Spline):
-    """Standard deviation of the range in metres, where dt32/dt53 is `reply_ratio`."""
-
-    reply_ratio: NotNegative = 0.0
-
-
-class Multipath(Section):
-    """The positive tail: with `probability` an exchange travels an exponential excess distance."""
-
-    probability: Annotated[float, Field(ge=0, le=1)]
-    mean_excess_m: Positive
-
-
-class Radio(Section):
-    """Power, noise and bias of every radio; the defaults are those of measured boards."""
-
-    first_path_at_1m_dbm: float = -80.0
-    path_loss_exponent: NotNegative = 2.0
-    antenna: Literal["isotropic", "dipole"] = "isotropic"
-    shadowing_db: NotNegative = 0.0
-    power_noise_db: NotNegative = 0.0
-    sensitivity_dbm: float = -105.0
-    tx_noise_ps: NotNegative = 0.0
-    rx_noise_ps: NotNegative = 116.0
-    skew_noise_ppm: NotNegative = 0.20
-    skew_bias_ppm: float = -0.13
-    quantize: bool = True
-    bias: Spline | None = None
-    sigma: SigmaSpline | None = None
-    multipath: Multipath | None = None
+    def air_share(self, preamble_symbols: int) -> float:
+        """Return the share of time for which the plan keeps the air busy."""
+        return self.rate_hz * exchange_air_s(PROTOCOLS[self.protocol], preamble_symbols)
 
 
 class Mocap(Section):
-    """The motion capture that writes the poses of the recording."""
+    """The motion capture that writes the poses of the recording.
+
+    Its times are late by `latency_ms`; `gaps_per_min` times a minute it loses sight of each body for `gap_s`.
+    """
 
     rate_hz: Positive = 100.0
     position_noise_m: NotNegative = 0.0
     attitude_noise_rad: NotNegative = 0.0
-
-
-class RandomFlight(Section):
-    """Smooth flight through random points of a box."""
-
-    model: Literal["random-flight"]
-    box_min_m: Vector
-    box_max_m: Vector
-    speed_mps: Positive = 1.0
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(lo >= hi for lo, hi in zip(self.box_min_m, self.box_max_m, strict=True)):
-            raise ValueError("box_min_m: must be below box_max_m in every direction")
-        return self
-
-
-class Waypoints(Section):
-    """A spline through points at times."""
-
-    model: Literal["waypoints"]
-    times_s: tuple[float, ...]
-    points_m: tuple[Vector, ...]
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if len(self.times_s) != len(self.points_m) or len(self.times_s) < 2:
-            raise ValueError(
-                f"points_m: found {len(self.points_m)} points at {len(self.times_s)} times, "
-                "give two or more, and one time each"
-            )
-        if any(b <= a for a, b in zip(self.times_s, self.times_s[1:], strict=False)):
-            raise ValueError("times_s: must increase")
-        return self
-
-
-class Static(Section):
-    """A body that does not move, such as an anchor."""
-
-    model: Literal["static"]
-    position_m: Vector
-    yaw_deg: float = 0.0
-
-
-Motion = Annotated[RandomFlight | Waypoints | Static, Field(discriminator="model")]
+    latency_ms: float = 0.0
+    gaps_per_min: NotNegative = 0.0
+    gap_s: Positive = 0.5
 
 
 class Body(Section):
-    """Something that carries tags."""
+    """Something that carries tags, and may stand in the way of waves."""
 
     name: Annotated[str, Field(min_length=1)]
     motion: Motion
+    shadow: Shadow | None = None
 
 
 class Tag(Section):
     """A board: where it sits, its antenna delay and its clock.
 
     Give the aggregate `delay_ns` = transmit - receive, split 0.44 / 0.56, or both parts.
-    `drift_ppm_per_sqrt_s` is the random walk of the clock's rate.
+    The clock: `drift_ppm_per_sqrt_s` is the random walk of its rate (Allan deviation q sqrt(tau/3)),
+    `white_ppm_sqrt_s` white noise of its rate (Allan deviation h/sqrt(tau)), `ramp_ppm_per_s` what a change of
+    temperature adds. A `passive` tag records the exchanges that it overhears.
     """
 
     id: TagId
@@ -205,6 +138,9 @@ class Tag(Section):
     rx_delay_ns: float | None = None
     skew_ppm: Annotated[float, Field(ge=-100, le=100)] = 0.0
     drift_ppm_per_sqrt_s: NotNegative = 0.0
+    white_ppm_sqrt_s: NotNegative = 0.0
+    ramp_ppm_per_s: float = 0.0
+    passive: bool = False
     clock_offset_s: NotNegative | None = None
 
     @model_validator(mode="after")
@@ -229,6 +165,9 @@ class Scenario(Section):
     ranging: Ranging
     radio: Radio = Radio()
     mocap: Mocap = Mocap()
+    room: Room | None = None
+    obstacles: tuple[Obstacle, ...] = ()
+    min_separation_m: NotNegative = 0.0
     bodies: Annotated[tuple[Body, ...], Field(min_length=1)]
     tags: Annotated[tuple[Tag, ...], Field(min_length=2)]
 
@@ -249,9 +188,42 @@ class Scenario(Section):
                 if tag_id not in ids:
                     known = ", ".join(map(str, ids))
                     raise ValueError(f"ranging.pairs: found tag {tag_id}, the tags are {known}")
+        self._check_places()
+        self._check_plan(ids)
         if not self.pairs():
             raise ValueError("ranging.pairs: no two tags sit on different bodies, so nobody ranges")
         return self
+
+    def _check_places(self) -> None:
+        """Bodies must be inside the room, and tags of one body further apart than a wavelength."""
+        for k, body in enumerate(self.bodies):
+            for key, point in _named_points(body):
+                if self.room and any(
+                    not lo <= v <= hi for lo, v, hi in zip(self.room.min_m, point, self.room.max_m, strict=True)
+                ):
+                    raise ValueError(
+                        f"bodies[{k}].motion.{key}: found {list(point)}, outside the room "
+                        f"{list(self.room.min_m)} to {list(self.room.max_m)}"
+                    )
+        for a, b in combinations(range(len(self.tags)), 2):
+            one, two = self.tags[a], self.tags[b]
+            apart = sum((x - y) ** 2 for x, y in zip(one.lever_arm_m, two.lever_arm_m, strict=True)) ** 0.5
+            if one.body == two.body and apart < WAVELENGTH_M:
+                raise ValueError(
+                    f"tags[{b}].lever_arm_m: tags {one.id} and {two.id} of body {one.body!r} are {100 * apart:.1f} cm "
+                    f"apart, closer than a wavelength ({100 * WAVELENGTH_M:.1f} cm)"
+                )
+
+    def _check_plan(self, ids: list[int]) -> None:
+        if isinstance(self.ranging.plan, str):
+            return
+        for k, (time_s, initiator, target) in enumerate(self.ranging.plan.slots):
+            for tag_id in (initiator, target):
+                if tag_id not in ids:
+                    known = ", ".join(map(str, ids))
+                    raise ValueError(f"ranging.plan: slot {k + 1} names tag {tag_id}, the tags are {known}")
+            if initiator == target or not 0 <= time_s <= self.scenario.duration_s:
+                raise ValueError(f"ranging.plan: slot {k + 1} is tag {initiator} to {target} at {time_s:g} s")
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return the (initiator, target) pairs in the order in which they range."""
@@ -262,7 +234,8 @@ class Scenario(Section):
     def planted(self) -> dict[str, Any]:
         """Return what a calibration of this scenario should find, JSON-ready."""
         delays = {str(t.id): t.delays_ns()[0] - t.delays_ns()[1] for t in self.tags}
-        bias, sigma = self.radio.bias, self.radio.sigma
+        bias = self.radio.bias if isinstance(self.radio.bias, Spline) else None
+        sigma = self.radio.sigma
         fields = {"knots", "coefficients", "degree"}
         return {
             "delays_ns": delays,
@@ -270,3 +243,15 @@ class Scenario(Section):
             "sigma_curve": sigma.model_dump(mode="json", include=fields) if sigma else None,
             "alpha_dbm": -82.0,
         }
+
+
+def _named_points(body: Body) -> list[tuple[str, Vector]]:
+    """The points that a body's motion is known to reach, with their keys."""
+    motion = body.motion
+    if isinstance(motion, Static):
+        return [("position_m", motion.position_m)]
+    if isinstance(motion, RandomFlight):
+        return [("box_min_m", motion.box_min_m), ("box_max_m", motion.box_max_m)]
+    if isinstance(motion, Waypoints):
+        return [(f"points_m[{k}]", point) for k, point in enumerate(motion.points_m)]
+    return []

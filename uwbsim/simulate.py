@@ -15,8 +15,11 @@ from uwblink.schema import Fault, Poses, Tag
 from uwblink.ticks import REPORT_BITS, UUS_TICKS
 from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, Protocol, board_range, raw_range
 from uwbsim import air
+from uwbsim.ahead import Ahead
 from uwbsim.clock import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.errors import ScenarioError
+from uwbsim.listening import overhear, responses
+from uwbsim.plans import Schedule, schedule
 from uwbsim.radio import printed_power_dbm, printed_skew_ppm
 from uwbsim.scenario import Scenario
 from uwbsim.stamps import Draws, Stamped, draw, stamp
@@ -25,9 +28,6 @@ from uwbsim.world import World
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
-
-NOMINAL_FLIGHT_SUBTICKS = 1 << 20
-"""Flight time in the event loop: 16 ns, 5 m. The exact one is computed with the stamps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +38,8 @@ class Simulated:
     poses: Poses
     tags: list[Tag]
     faults: list[Fault]
+    overheard: dict[str, NDArray[Any]]
+    cirs: list[tuple[int, int, int, int, float, tuple[int, ...]]]
     truth_m: Floats
     meta: dict[str, Any]
 
@@ -62,20 +64,26 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
         raise ScenarioError(f"scenario.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
     protocol = PROTOCOLS[scenario.ranging.protocol]
     run = _Run(scenario, protocol, World.of(scenario), Clocks.of(scenario))
-    start, initiator, target = _plan(scenario)
-    draws = draw(scenario, len(start), len(protocol.messages))
-    slots = _slots(run, start, initiator, target, draws)
-    outcomes = air.run(protocol, slots, len(scenario.tags), progress)
-    lost = np.array([o.lost for o in outcomes])
-    begun = np.array([o.start for o in outcomes], dtype=np.int64)
+    plan = schedule(scenario)
+    draws = draw(scenario, len(plan.start), len(protocol.messages))
+    outcomes = air.run(
+        protocol, _hosts(run, plan, draws), len(scenario.tags), _powers(run.world), _rules(scenario), progress
+    )
+    lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)
     kept = np.flatnonzero(lost < 0)
-    rows = (begun[kept], initiator[kept], target[kept])
+    kept = kept[np.argsort(begun[kept], kind="stable")]
+    rows = (begun[kept], plan.initiator[kept], plan.target[kept])
     stamped = stamp(scenario, protocol, run.world, run.clocks, *rows, draws[kept])
+    exchanges = _exchanges(run, kept, len(plan.start), rows, stamped)
     return Simulated(
-        exchanges=_exchanges(run, kept, len(start), rows, stamped),
+        exchanges=exchanges,
         poses=run.world.motion_capture(),
         tags=[Tag(t.id, t.body, t.lever_arm_m) for t in scenario.tags],
-        faults=_faults(run, begun, initiator, target, lost),
+        faults=_faults(run, begun, plan, outcomes),
+        overheard=overhear(
+            scenario, protocol, run.world, run.clocks, plan.initiator[kept], plan.target[kept], stamped, exchanges
+        ),
+        cirs=responses(scenario, run.world, protocol, exchanges, stamped) if scenario.ranging.get_cir else [],
         truth_m=(stamped.distance_m[0] + stamped.distance_m[1]) / 2,
         meta=_provenance(scenario),
     )
@@ -94,36 +102,57 @@ def write(
         recording.append_poses(simulated.poses)
         recording.append_exchanges(simulated.exchanges)
         recording.append_faults(simulated.faults)
+        recording.append_columns("overheard", simulated.overheard)
+        recording.append_cirs(simulated.cirs)
         recording.append_frames(frames)
 
 
-def _plan(scenario: Scenario) -> tuple[Ints, Ints, Ints]:
-    """Round robin over the pairs at the rate: start times and places of initiator and target."""
-    count = int(scenario.scenario.duration_s * scenario.ranging.rate_hz)
-    place = {tag.id: k for k, tag in enumerate(scenario.tags)}
-    pairs = np.array([[place[a], place[b]] for a, b in scenario.pairs()], dtype=np.int64)
-    turn = pairs[np.arange(count) % len(pairs)]
-    start = np.arange(count) * (SUBTICKS_PER_SECOND / scenario.ranging.rate_hz)
-    return start.astype(np.int64), turn[:, 0], turn[:, 1]
-
-
-def _slots(run: _Run, start: Ints, initiator: Ints, target: Ints, draws: Draws) -> list[air.Slot]:
-    """Give the event loop what it needs, as plain integers: it does no arithmetic of its own."""
+def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
+    """Give the event loop what it needs, as plain integers, a list a host: it does no arithmetic of its own."""
     scenario, messages = run.scenario, run.protocol.messages
-    _, power = run.world.link(initiator, target, start)
+    power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
     heard = _heard(scenario, power, len(messages))
     scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
     at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
     delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in messages]
     columns = zip(
-        start.tolist(),
-        initiator.tolist(),
-        target.tolist(),
-        map(tuple, heard.T.tolist()),
+        range(len(plan.start)),
+        plan.start.tolist(),
+        plan.initiator.tolist(),
+        plan.target.tolist(),
+        zip(*heard.tolist(), strict=True),
         zip(*(d.tolist() for d in delay), strict=True),
+        _pauses(run, plan),
         strict=True,
     )
-    return [air.Slot(*row, NOMINAL_FLIGHT_SUBTICKS) for row in columns]
+    hosts: dict[int, list[air.Slot]] = {}
+    for host, row in zip(plan.host.tolist(), columns, strict=True):
+        hosts.setdefault(host, []).append(air.Slot(*row))
+    return list(hosts.values())
+
+
+def _pauses(run: _Run, plan: Schedule) -> list[int]:
+    """How long each slot's initiator waits first: in a common list, for what it does not hear of the one before."""
+    scenario = run.scenario
+    none = np.zeros(len(plan.start), dtype=np.int64)
+    if scenario.ranging.plan != "common-list" or len(none) < 2:
+        return [0] * len(none)
+    before, power = plan.target[:-1], np.full(len(none), np.inf)
+    mine = plan.initiator[1:]
+    other = np.flatnonzero(before != mine)
+    power[other + 1] = run.world.link(before[other], mine[other], plan.start[other + 1]).power_dbm
+    timeout = round(scenario.ranging.list_timeout_ms * 1e-3 * SUBTICKS_PER_SECOND)
+    return [timeout if weak else 0 for weak in (power < scenario.radio.sensitivity_dbm).tolist()]
+
+
+def _powers(world: World) -> air.Powers:
+    ahead = Ahead(world)
+    return lambda sender, time: ahead.from_sender(sender, max(time, 0)).power_dbm
+
+
+def _rules(scenario: Scenario) -> air.Rules:
+    radio = scenario.radio
+    return air.Rules(radio.sensitivity_dbm, radio.capture_db, radio.preamble_symbols)
 
 
 def _heard(scenario: Scenario, power_dbm: Floats, messages: int) -> NDArray[np.bool_]:
@@ -177,17 +206,21 @@ def _readings(
     )
 
 
-def _faults(run: _Run, start: Ints, initiator: Ints, target: Ints, lost: Ints) -> list[Fault]:
+def _faults(run: _Run, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
     ids = [tag.id for tag in run.scenario.tags]
-    return [
-        Fault(
-            round(int(start[k]) * (1e9 / SUBTICKS_PER_SECOND)),
-            str(ids[initiator[k]]),
-            "lost frame",
-            f"{ids[initiator[k]]} ranged with {ids[target[k]]}: message {lost[k] + 1} below sensitivity",
+    faults = []
+    for k in np.flatnonzero(np.array(outcomes.lost) >= 0):
+        a, b = ids[plan.initiator[k]], ids[plan.target[k]]
+        reason = outcomes.reason[k]
+        faults.append(
+            Fault(
+                round(int(begun[k]) * (1e9 / SUBTICKS_PER_SECOND)),
+                str(a),
+                "lost frame" if reason == air.WEAK else reason,
+                f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {reason}",
+            )
         )
-        for k in np.flatnonzero(lost >= 0)
-    ]
+    return faults
 
 
 def _provenance(scenario: Scenario) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from uwblink.ticks import (
 from uwblink.twr import Message
 from uwblink.twr import Protocol as RangingProtocol
 from uwbsim.clock import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.propagation import Link
 from uwbsim.radio import reception_bias_s, reception_noise_s
 from uwbsim.scenario import Scenario
 from uwbsim.streams import stream
@@ -35,8 +36,8 @@ GRID: Final = DELAYED_TX_GRID
 class Links(Protocol):
     """What knows how far apart tags are and how strongly they hear each other: a `World`, or `Ahead` of one."""
 
-    def link(self, initiator: Ints, target: Ints, time: Ints) -> tuple[Floats, Floats]:
-        """Return distance (m) and first-path power (dBm) between tags (n,) at true times (n,)."""
+    def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
+        """Return what reaches one tag from another (n,) at true times (n,)."""
         ...
 
 
@@ -130,14 +131,16 @@ def stamp(
         jitter = draws.transmit[k] * radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
         left = np.rint(jitter - delays[sender, 0]).astype(np.int64) + printed * SUBTICKS
         departure = clocks.when(sender, left)
-        distance, power = world.link(initiator, target, departure)
-        flight = np.rint(distance / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND + excess)
-        late_s = reception_bias_s(radio, power) + draws.receive[k] * reception_noise_s(radio, power)
+        link = world.link(initiator, target, departure)
+        power = link.power_dbm
+        flight = np.rint((link.distance_m + link.excess_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND + excess)
+        late_s = reception_bias_s(radio, power, link.total_dbm)
+        late_s = late_s + draws.receive[k] * reception_noise_s(radio, power)
         arrival = departure + flight.astype(np.int64)
         result.stamps[f"tx{k + 1}"] = printed
         result.stamps[f"rx{k + 1}"] = reception(clocks, receiver, arrival, late_s, delays[receiver, 1])
         result.departure.append(departure)
-        result.distance_m.append(distance)
+        result.distance_m.append(link.distance_m)
         result.power_dbm.append(power)
     return result
 
