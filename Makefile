@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup demo test lint format bench bench-boards endurance lock clean
+.PHONY: help setup demo test lint format bench bench-boards fidelity endurance lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -43,6 +43,9 @@ bench: setup ## measure speed and memory; prints the table of the README
 
 bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
 	$(BIN)/python -m benchmarks.boards
+
+fidelity: setup ## write docs/fidelity.md, simulated beside measured
+	$(BIN)/python -m benchmarks.fidelity
 
 endurance: setup ## kill the recorder 50 times, and serve boards for 10 minutes
 	$(BIN)/python -m benchmarks.endurance

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwblink.recording import Recording
-from uwblink.schema import TABLES
+from uwblink.schema import TABLES, Fault
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from uwblink.recorder import Progress
 
 RATE_WINDOW_S = 2.0
+_FAILED = re.compile(r"ranged with (\d+): message|ranging with (\d+) failed")
 
 
 def summarize(recording: Recording) -> dict[str, Any]:
@@ -24,6 +26,10 @@ def summarize(recording: Recording) -> dict[str, Any]:
     span_s = float(np.ptp(exchanges.time_ns)) * 1e-9 if len(exchanges) else 0.0
     ends = np.column_stack([exchanges.initiator, exchanges.target])
     pairs, counts = np.unique(ends, axis=0, return_counts=True)
+    failed = failures_by_pair(recording.faults())
+    ends = np.vstack([ends, np.array(sorted(failed), dtype=np.int64).reshape(-1, 2)])
+    pairs, counts = np.unique(ends, axis=0, return_counts=True)
+    counts -= np.array([tuple(pair) in failed for pair in pairs.tolist()], dtype=counts.dtype)
     names, rows = np.unique(exchanges.protocol, return_counts=True)
     kinds, faults = np.unique([f.kind for f in recording.faults()], return_counts=True)
     bodies, seen = np.unique(poses.body, return_counts=True)
@@ -33,7 +39,13 @@ def summarize(recording: Recording) -> dict[str, Any]:
         "counts": {table: recording.count(table) for table in TABLES if table != "meta"},
         "tags": [{"tag": t.tag, "body": t.body, "lever_arm_m": list(t.lever_arm_m)} for t in recording.tags()],
         "pairs": [
-            {"initiator": int(i), "target": int(j), "exchanges": int(n), "rate_hz": n / span_s if span_s else None}
+            {
+                "initiator": int(i),
+                "target": int(j),
+                "exchanges": int(n),
+                "failed": failed.get((int(i), int(j)), 0),
+                "rate_hz": n / span_s if span_s else None,
+            }
             for (i, j), n in zip(pairs, counts, strict=True)
         ],
         "protocols": dict(zip(names.tolist(), rows.tolist(), strict=True)),
@@ -41,6 +53,17 @@ def summarize(recording: Recording) -> dict[str, Any]:
         "poses": dict(zip(bodies.tolist(), seen.tolist(), strict=True)),
         "provenance": {k: v for k, v in meta.items() if k not in {"scenario", "planted"}},
     }
+
+
+def failures_by_pair(faults: list[Fault]) -> dict[tuple[int, int], int]:
+    """Count failed exchanges by (initiator, target), from the faults that simulator and recorder write."""
+    counts: dict[tuple[int, int], int] = {}
+    for fault in faults:
+        found = _FAILED.search(fault.detail)
+        if found and fault.board.isdecimal():
+            pair = int(fault.board), int(found[1] or found[2])
+            counts[pair] = counts.get(pair, 0) + 1
+    return counts
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:
@@ -54,10 +77,12 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     tags = Table("tag", "body", "lever arm (m)")
     for tag in summary["tags"]:
         tags.add_row(str(tag["tag"]), _plain(tag["body"]), " ".join(f"{v:+.3f}" for v in tag["lever_arm_m"]))
-    pairs = Table("initiator", "target", "exchanges", "rate (Hz)")
+    pairs = Table("initiator", "target", "exchanges", "rate (Hz)", "success")
     for pair in summary["pairs"]:
         rate = "" if pair["rate_hz"] is None else f"{pair['rate_hz']:.1f}"
-        pairs.add_row(str(pair["initiator"]), str(pair["target"]), str(pair["exchanges"]), rate)
+        tried = pair["exchanges"] + pair["failed"]
+        success = f"{100 * pair['exchanges'] / tried:.1f} %" if tried else ""
+        pairs.add_row(str(pair["initiator"]), str(pair["target"]), str(pair["exchanges"]), rate, success)
     for table in (tags, pairs):
         console.print(table)
     console.print(f"poses: {_counted(summary['poses'])}")

@@ -24,8 +24,8 @@ from uwbsim.frame_times import after_marker_s, before_marker_s, message_bytes
 PREAMBLE_TIMEOUT_S: Final = 6.521e-3
 """How long a board waits for a preamble (firmware wire format, 3.1)."""
 
-RECEIVER_ON_S: Final = 70e-6
-"""From a stamp until the receiver is on again."""
+RECEIVER_ON_S: Final = 40e-6
+"""From the end of a frame until the receiver is on again (firmware wire format, 3.1)."""
 
 TURNAROUND_S: Final = 0.5e-3
 """From the end of an exchange until the initiator's host can command the next."""
@@ -90,7 +90,7 @@ class Air:
         self._powers, self._rules = powers, rules
         self._before = _subticks(before_marker_s(rules.preamble_symbols))
         self._after = [_subticks(after_marker_s(n)) for n in message_bytes(protocol)]
-        self._patience = _subticks(PREAMBLE_TIMEOUT_S + RECEIVER_ON_S + before_marker_s(rules.preamble_symbols))
+        self._patience = _subticks(PREAMBLE_TIMEOUT_S + RECEIVER_ON_S)
         self._turnaround = _subticks(TURNAROUND_S)
         self._frames: list[_Frame] = []
         self._busy_until = [0] * tags
@@ -129,20 +129,20 @@ class Air:
             if reason:
                 outcomes.lost[number], outcomes.reason[number] = k, reason
                 # Whoever waits for the missing message gives up when its preamble does not come.
-                until = marker + self._patience
-                busy[me] = max(busy[me], until)
-                if k:
-                    busy[other] = max(busy[other], marker)
+                until = listening_since + self._patience
+                busy[me] = max(until, int(env.now))
                 yield env.timeout(max(until - int(env.now), 0))
                 return
-            listening_since = marker
-            busy[me] = busy[other] = max(frame.end, busy[me])
+            listening_since = frame.end
+            if not k:
+                # From now on both are in this exchange; the target will send its last frame whatever becomes of others.
+                busy[me] = busy[other] = marker + sum(slot.delay[1:]) + self._after[-1]
 
     def _fate(self, slot: Slot, k: int, frame: _Frame, receiver: int, since: int, marker: int) -> str:
         """Why a frame that has just ended was not received, empty if it was."""
         if not slot.heard[k]:
             return WEAK
-        if k and marker - since > self._patience:
+        if k and frame.start - since > self._patience:
             return LATE
         if not k and self._busy_until[receiver] > frame.start:
             return BUSY
@@ -156,7 +156,8 @@ class Air:
         now = int(self.env.now)
         oldest = now - 2 * self._patience
         self._frames = [f for f in self._frames if f.end > oldest]
-        others = [f for f in self._frames if f.exchange != slot.number and f.end > since and f.start < frame.end]
+        earliest = min(since, frame.start) if k else frame.start
+        others = [f for f in self._frames if f.exchange != slot.number and f.end > earliest and f.start < frame.end]
         if not others:
             return ""
         signal = float(self._powers(frame.sender, frame.start)[receiver])
@@ -167,8 +168,8 @@ class Air:
             if power < self._rules.sensitivity_dbm:
                 continue
             if f.end <= frame.start:
-                if k:
-                    return FOREIGN  # a board that waits for an answer takes the first frame that comes for it
+                if k and f.start >= since:
+                    return FOREIGN  # a board that waits for an answer takes the first frame that comes
                 continue
             captured = signal >= power + self._rules.capture_db and frame.start <= f.start
             if not captured:

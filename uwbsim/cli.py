@@ -101,6 +101,48 @@ def serve(
         server.close()
 
 
+@app.command()
+def show(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Page (.html) or picture (.png, .svg, .pdf).")],
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
+    ] = None,
+    force: Annotated[bool, typer.Option(help="Replace the output if it exists.")] = False,
+) -> None:
+    """Draw the room, the flights, and one exchange of each protocol."""
+    from uwblink.recording import check_output
+    from uwbsim.reading import load
+    from uwbsim.show import show as draw
+
+    check_output(output, force=force)
+    draw(load(scenario, settings or ()), output, force=force)
+    typer.echo(f"{output}")
+
+
+@app.command()
+def validate(
+    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say what a scenario will do, without running it."""
+    from dataclasses import asdict
+
+    from uwbsim.preview import preview, sentences
+    from uwbsim.reading import load
+
+    loaded = load(scenario, settings or ())
+    found = preview(loaded)
+    if as_json:
+        typer.echo(json.dumps(asdict(found), indent=1))
+        return
+    for line in sentences(loaded, found):
+        typer.echo(line)
+
+
 @contextmanager
 def _interrupts() -> Iterator[Callable[[], bool]]:
     """Turn Ctrl-C and a polite kill into a question to ask."""

@@ -90,7 +90,7 @@ def test_a_hanging_board_and_damage_on_the_line_are_faults_and_no_invented_range
         record(list(server.names.values()), path, Plan(), duration_s=3.0)
     exchanges, found, _, _ = stored(path)
     assert {"time-out", "garbage"} <= {fault.kind for fault in found}
-    assert len(exchanges) > 60
+    assert len(exchanges) > 25
     # A damaged line that still decoded would show as a range that its own stamps contradict.
     from uwblink.twr import raw_range
 

@@ -1,0 +1,52 @@
+"""Scenarios whose outcome is known beforehand: a month later, anchors, two tags, an office."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.dataset import load as load_ranges
+from calib.errors import UnanswerableError
+from calib.fit import fit
+from uwbsim.reading import load
+from uwbsim.simulate import simulate, write
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+
+def ranges(tmp_path, name, *settings):
+    path = tmp_path / "f.uwb"
+    write(simulate(load(SCENARIOS / name, settings)), path, force=True)
+    return load_ranges(path)
+
+
+def delays(calibration):
+    values = np.array([calibration.delays_ns[tag] for tag in sorted(calibration.delays_ns)])
+    return values - values.mean()
+
+
+def test_a_month_later_the_delays_are_the_same(tmp_path):
+    then, now = (fit(ranges(tmp_path, name)).calibration for name in ("icra2023/train.toml", "day30/train.toml"))
+    # Each fit knows a delay to 8 ps; 30 ps are 2.7 standard errors of a difference, for six of them.
+    assert np.abs(delays(then) - delays(now)).max() < 0.030
+
+
+def test_anchors_that_range_with_each_other_are_determined(tmp_path):
+    r = ranges(tmp_path, "anchors_and_tag/anchors_and_tag.toml")
+    found = fit(r).calibration
+    planted = np.array([r.planted["delays_ns"][str(tag)] for tag in sorted(found.delays_ns)])
+    spread = max(found.delays_std_ns.values())
+    assert np.abs(delays(found) - (planted - planted.mean())).max() < 4 * spread < 0.12
+
+
+@pytest.mark.parametrize("name", ["anchors_and_tag/bipartite.toml", "new_tag/new_tag.toml"])
+def test_two_groups_are_not(tmp_path, name):
+    with pytest.raises(UnanswerableError, match="do not determine"):
+        fit(ranges(tmp_path, name))
+
+
+def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
+    blocked = ranges(tmp_path, "nlos_office/office.toml")
+    free = ranges(tmp_path, "nlos_office/office.toml", "obstacles=[]", "room.reflection_loss_db=60")
+    tail = [float(np.quantile(r.raw_m - r.truth_m, 0.98) - np.median(r.raw_m - r.truth_m)) for r in (blocked, free)]
+    assert tail[0] > 1.4 * tail[1]
