@@ -30,7 +30,7 @@ from uwblink.messages import (
 )
 from uwblink.wire_fields import LONGEST_BROADCAST, write_printed
 from uwbsim import firmware
-from uwbsim.channel import impulse_response, in_transfers
+from uwbsim.channel import Echo, impulse_response, in_transfers
 from uwbsim.clock import SUBTICKS_PER_SECOND
 from uwbsim.encounter import Encounter, Radios, as_target
 from uwbsim.scenario import Scenario
@@ -336,12 +336,14 @@ class VirtualBoard:
         self._bystanders(others, met, start, end, target_reports, get_cir)
         yield env.timeout(end)
         if target.powered and target_reports:
-            later = target._print_cir(self.id, target_id, TARGET_LATER) if get_cir else TARGET_LATER
+            later = target._print_cir(self.id, target_id, TARGET_LATER, met.report.rx1) if get_cir else TARGET_LATER
             target.busy_until = int(env.now) + later
             target._say(as_target(met.report, self.id), later)
         self._say(met.report)
         if get_cir:
-            yield env.timeout(self._print_cir(self.id, target_id, ANSWER))
+            last = met.report.rx3 or met.report.rx2
+            echoes = bench.radios.echoes(target_id, self.id, met.departures[-1])
+            yield env.timeout(self._print_cir(self.id, target_id, ANSWER, last, echoes))
         return True
 
     def _give_up(self) -> Attempt:
@@ -370,12 +372,14 @@ class VirtualBoard:
             if tag in heard:
                 delay = end + (LISTENER_LATER if target_reports else LISTENER_AT_ONCE)
                 if get_cir:
-                    delay = other._print_cir(self.id, met.report.neighbour, delay)
+                    delay = other._print_cir(self.id, met.report.neighbour, delay, None)
                 other._say(heard[tag], delay)
 
-    def _print_cir(self, initiator: int, target: int, delay: int) -> int:
+    def _print_cir(
+        self, initiator: int, target: int, delay: int, stamp: int | None, echoes: list[Echo] | None = None
+    ) -> int:
         """Print a channel impulse response, a piece a millisecond; returns when it is over."""
-        index, taps = impulse_response(self._chance)
+        index, taps = impulse_response(self._chance, stamp, echoes)
         for piece in in_transfers(encode(Cir(initiator, target, index, taps))):
             self._say(piece, delay)
             delay += MS + int(self._chance.integers(0, 120 * US))

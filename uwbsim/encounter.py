@@ -51,7 +51,8 @@ class Radios:
     def __init__(self, scenario: Scenario, lost_share: float = 0.0) -> None:
         """Set up world and clocks; chance comes from the scenario's seed."""
         self.scenario = scenario
-        self.ahead = Ahead(World.of(scenario))
+        self.world = World.of(scenario)
+        self.ahead = Ahead(self.world)
         self.clocks = Clocks.of(scenario)
         self.lost_share = lost_share
         self._place = {tag.id: k for k, tag in enumerate(scenario.tags)}
@@ -102,6 +103,10 @@ class Radios:
             elif heard[0] and not heard[1] and met.protocol.name == "ds":
                 said[tag] = OverheardNothing(initiator, target)
         return said
+
+    def echoes(self, sender: int, receiver: int, time: int) -> list[tuple[float, float]]:
+        """Return the reflections at a board, as `World.echoes` does."""
+        return self.world.echoes(self._place[sender], self._place[receiver], time)
 
     def _draws(self, count: int) -> Draws:
         chance, multipath = self._chance, self.scenario.radio.multipath
