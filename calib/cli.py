@@ -38,7 +38,7 @@ def _top(
 def fit(
     recordings: Recordings,
     output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],
-    loss: Annotated[str, typer.Option(help="cauchy, huber, soft_l1 or l2.")] = "cauchy",
+    loss: Annotated[str, typer.Option(help="cauchy, huber, soft_l1, l2 or mixture.")] = "cauchy",
     scale: Annotated[str, typer.Option(help="Scale of the loss in ns, or auto.")] = "auto",
     lift: Annotated[str, typer.Option(help="mean-of-lifted or lift-of-mean.")] = "mean-of-lifted",
     force: Force = False,

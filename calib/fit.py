@@ -21,6 +21,7 @@ from calib.dataset import Ranges
 from calib.delays import check_determined, design, robust_fit
 from calib.errors import UnanswerableError
 from calib.mixture import take_apart
+from calib.mixture_fit import refine
 from calib.power import (
     ALPHA_DBM,
     BIAS_SEGMENTS,
@@ -41,6 +42,8 @@ Floats = NDArray[np.float64]
 FEWEST: Final = 100
 SMOOTHNESS: Final = 1e-4
 INLIER_SIGMAS: Final = 3.0
+MIXTURE: Final = "mixture"
+"""The loss that is no loss of residuals: the likelihood of `calib.mixture_fit`, begun from a Cauchy fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,22 +86,24 @@ def fit(
     check_determined(matrix, tags)
     error = ranges.raw_m - ranges.truth_m
     scale_m = None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT
-    alone = robust_fit(matrix, -error, loss, scale_m)
+    robust = "cauchy" if loss == MIXTURE else loss
+    alone = robust_fit(matrix, -error, robust, scale_m)
     knots = knots_for(lifted, BIAS_SEGMENTS)
     splines = basis(lifted, knots)
     centre = splines.mean(axis=0)
-    joint = robust_fit(
-        np.hstack([matrix, centre - splines]),
-        -error,
-        loss,
-        scale_m,
-        penalty=_penalty(len(tags), splines.shape[1], len(ranges)),
-        start=np.concatenate([alone.parameters, np.zeros(splines.shape[1])]),
-    )
-    delays, shape = np.split(joint.parameters, [len(tags)])
-    # Errors are raw + delays - curve; the curve so far has zero mean over the data.
-    core = error + matrix @ delays - (splines - centre) @ shape
+    both = np.hstack([matrix, centre - splines])
+    penalty = _penalty(len(tags), splines.shape[1], len(ranges))
+    start = np.concatenate([alone.parameters, np.zeros(splines.shape[1])])
+    joint = robust_fit(both, -error, robust, scale_m, penalty=penalty, start=start)
     bins = equal_bins(lifted)
+    parameters, covariance, steps, success = joint.parameters, joint.covariance, joint.steps, joint.success
+    if loss == MIXTURE:
+        likely = refine(both, error, parameters, penalty, bins)
+        parameters, covariance, success = likely.parameters, likely.covariance, likely.success
+        steps += likely.steps
+    delays, shape = np.split(parameters, [len(tags)])
+    # Errors are raw + delays - curve; the curve so far has zero mean over the data.
+    core = error + both @ parameters
     makeup = take_apart(core, bins, int(bins.max()) + 1)
     sigma = sigma_curve(lifted, bins, makeup.sigma_m)
     centre_m = makeup.location_m
@@ -115,7 +120,7 @@ def fit(
     )
     calibration = Calibration(
         delays_ns=dict(zip(tags, (delays + shift_ns).tolist(), strict=True)),
-        delays_std_ns=dict(zip(tags, np.sqrt(np.diag(joint.covariance)[: len(tags)]).tolist(), strict=True)),
+        delays_std_ns=dict(zip(tags, np.sqrt(np.diag(covariance)[: len(tags)]).tolist(), strict=True)),
         loss=loss,
         scale_ns=joint.scale / SPEED_OF_LIGHT * 1e9,
         lift=lift,
@@ -129,8 +134,8 @@ def fit(
         calibration,
         calibration.apply(ranges).full_m - ranges.truth_m,
         inliers,
-        joint.success,
-        f"{'converged' if joint.success else 'stopped'} after {joint.steps} steps",
+        success,
+        f"{'converged' if success else 'stopped'} after {steps} steps",
     )
 
 

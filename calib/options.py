@@ -7,12 +7,13 @@ from collections.abc import Iterable
 
 from calib.delays import LOSSES
 from calib.errors import BadInputError
+from calib.fit import MIXTURE
 from calib.power import LIFTS
 
 
 def loss_name(text: str) -> str:
-    """Return a key of `LOSSES`."""
-    return _one_of("--loss", text, LOSSES)
+    """Return a key of `LOSSES`, or the mixture."""
+    return _one_of("--loss", text, [*LOSSES, MIXTURE])
 
 
 def lift_name(text: str) -> str:
