@@ -41,21 +41,31 @@ def fit(
     loss: Annotated[str, typer.Option(help="cauchy, huber, soft_l1, l2 or mixture.")] = "cauchy",
     scale: Annotated[str, typer.Option(help="Scale of the loss in ns, or auto.")] = "auto",
     lift: Annotated[str, typer.Option(help="mean-of-lifted or lift-of-mean.")] = "mean-of-lifted",
+    fix: Annotated[list[str] | None, typer.Option(metavar="TAG=NS", help="Pin a tag's known delay.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     force: Force = False,
 ) -> None:
     """Fit antenna delays and power curves."""
     from calib.calibration import save
     from calib.dataset import concatenate, load
     from calib.fit import fit as run
-    from calib.options import lift_name, loss_name, scale_ns
+    from calib.options import fixed_ns, lift_name, loss_name, scale_ns
     from uwblink.recording import check_output
 
-    loss, lift, width = loss_name(loss), lift_name(lift), scale_ns(scale)
+    loss, lift, width, fixed = loss_name(loss), lift_name(lift), scale_ns(scale), fixed_ns(fix or ())
     check_output(output, force=force)
     ranges = concatenate([load(path) for path in recordings])
-    result = run(ranges, scale_ns=width, loss=loss, lift=lift)
+    try:
+        result = run(ranges, scale_ns=width, loss=loss, lift=lift, fixed_ns=fixed)
+    except UnanswerableError as error:
+        if as_json:
+            typer.echo(json.dumps({"error": str(error), "undetermined": error.undetermined}, indent=1))
+        raise
     save(result.calibration, output, force=force)
     found = result.calibration
+    if as_json:
+        typer.echo(found.to_json(), nl=False)
+        return
     typer.echo(f"{output}: {len(ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
     for tag, delay in found.delays_ns.items():
         typer.echo(f"  tag {tag:3d}  delay {delay:+.4f} ns  ± {found.delays_std_ns[tag]:.4f}")

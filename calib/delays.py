@@ -14,6 +14,7 @@ from calib.errors import UnanswerableError
 from uwblink.ticks import SPEED_OF_LIGHT
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 Loss = Callable[[Floats], tuple[Floats, Floats]]
 """Maps residuals over scale (n,) to IRLS weights rho' and to the slope of the score, both (n,)."""
@@ -98,8 +99,10 @@ def design(ranges: Ranges, tags: list[int]) -> Floats:
     return matrix
 
 
-def check_determined(matrix: Floats, tags: list[int]) -> None:
-    """Raise `UnanswerableError` naming the tags whose delays the pairs leave free.
+def check_determined(matrix: Floats, tags: list[int], initiator: Ints, target: Ints) -> None:
+    """Raise `UnanswerableError` naming the tags whose delays the pairs leave free, in groups that shift together.
+
+    `initiator` and `target` (n,) are the ids of the rows of `matrix`.
 
     Tags that range only with tags of another group (anchors against robots, a single pair) can shift
     by +a and -a without a trace in any range.
@@ -108,11 +111,30 @@ def check_determined(matrix: Floats, tags: list[int]) -> None:
     free = vectors[:, values < UNDETERMINED * values[-1]]
     if not free.size:
         return
-    loose = [str(tag) for tag, row in zip(tags, free, strict=True) if np.abs(row).max() > 1e-3]
+    loose = {tag for tag, row in zip(tags, free, strict=True) if np.abs(row).max() > 1e-3}
+    groups = _connected(loose, set(zip(initiator.tolist(), target.tolist(), strict=True)))
+    named = "; ".join(", ".join(map(str, group)) for group in groups)
     raise UnanswerableError(
-        f"the pairs do not determine the antenna delays of tags {', '.join(loose)}: some can grow as "
-        "others shrink without changing any range; record three tags that all range with each other"
+        f"the pairs do not determine the antenna delays of tags {named}: some can grow as "
+        "others shrink without changing any range; record three tags that all range with each other, or pin a known "
+        "delay with --fix TAG=NS",
+        groups,
     )
+
+
+def _connected(tags: set[int], pairs: set[tuple[int, int]]) -> list[list[int]]:
+    """Return the parts of a graph of pairs that hang together, among some tags."""
+    left, groups = set(tags), []
+    while left:
+        group, waiting = set(), [min(left)]
+        while waiting:
+            tag = waiting.pop()
+            group.add(tag)
+            linked = {b for a, b in pairs if a == tag} | {a for a, b in pairs if b == tag}
+            waiting += sorted((linked & left) - group)
+        groups.append(sorted(group))
+        left -= group
+    return groups
 
 
 def robust_fit(

@@ -10,4 +10,12 @@ class BadInputError(CalibError, ValueError):
 
 
 class UnanswerableError(CalibError, ValueError):
-    """Good input that does not determine what was asked: exit status 1."""
+    """Good input that does not determine what was asked: exit status 1.
+
+    `undetermined` are groups of tags whose delays the data leave free, where that is the reason.
+    """
+
+    def __init__(self, text: str, undetermined: list[list[int]] | None = None) -> None:
+        """Say what, where and what to do."""
+        super().__init__(text)
+        self.undetermined = undetermined or []

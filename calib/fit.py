@@ -9,7 +9,8 @@ centre of the core of the calibrated errors at zero: the core is told from the t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 import uwblink
 from calib.calibration import Calibration
 from calib.dataset import Ranges
-from calib.delays import check_determined, design, robust_fit
-from calib.errors import UnanswerableError
+from calib.delays import Solution, check_determined, design, robust_fit
+from calib.errors import BadInputError, UnanswerableError
 from calib.mixture import take_apart
 from calib.mixture_fit import refine
 from calib.power import (
@@ -57,6 +58,23 @@ class FitResult:
     message: str
 
 
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """A fit as linear algebra: residuals `error + design @ x` (n,), x = delays of `tags`, then spline coefficients.
+
+    The splines are less their average over the range, so that a constant is left to the delays. What pinned tags add
+    is in `error` already.
+    """
+
+    tags: list[int]
+    error: Floats
+    design: Floats
+    lifted: Floats
+    knots: Floats
+    averages: Floats
+    penalty: Floats
+
+
 def fit(
     ranges: Ranges,
     *,
@@ -64,14 +82,49 @@ def fit(
     scale_ns: float | None = None,
     lift: str = "mean-of-lifted",
     alpha_dbm: float = ALPHA_DBM,
+    fixed_ns: Mapping[int, float] | None = None,
 ) -> FitResult:
     """Fit a calibration to ranges with known truth.
 
-    `scale_ns` is the scale of the robust loss in time of flight; estimated from the data by default.
-    Raises `UnanswerableError` when there are too few ranges, their power does not vary, or the pairs
-    do not determine the delays.
+    `scale_ns` is the scale of the robust loss in time of flight, estimated from the data by default; `fixed_ns` are
+    delays that are known. Raises `UnanswerableError` when there are too few ranges, their power does not vary, or the
+    pairs do not determine the delays, and `BadInputError` for a pinned tag that is not in the data.
     """
-    tags = ranges.tags()
+    fixed = dict(fixed_ns or {})
+    problem = _problem(ranges, lift, alpha_dbm, fixed)
+    found = _solve(problem, loss, None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT)
+    delays, shape = np.split(found.parameters, [len(problem.tags)])
+    core, bins = problem.error + problem.design @ found.parameters, equal_bins(problem.lifted)
+    makeup = take_apart(core, bins, int(bins.max()) + 1)
+    sigma = sigma_curve(problem.lifted, bins, makeup.sigma_m)
+    constant, shift_ns = _gauge(makeup.location_m, pinned=bool(fixed))
+    coefficients = shape - problem.averages @ shape + constant
+    inliers = np.abs(core - makeup.location_m) < INLIER_SIGMAS * sigma(problem.lifted)
+    std_ns = np.sqrt(np.diag(found.covariance)[: len(problem.tags)])
+    calibration = Calibration(
+        delays_ns=dict(zip(problem.tags, (delays + shift_ns).tolist(), strict=True)) | fixed,
+        delays_std_ns=dict(zip(problem.tags, std_ns.tolist(), strict=True)) | dict.fromkeys(fixed, 0.0),
+        loss=loss,
+        scale_ns=found.scale / SPEED_OF_LIGHT * 1e9,
+        lift=lift,
+        alpha_dbm=alpha_dbm,
+        speed_of_light=SPEED_OF_LIGHT,
+        bias_curve=Curve(
+            tuple(problem.knots.tolist()), tuple(coefficients.tolist()), DEGREE, populated(problem.lifted)
+        ),
+        sigma_curve=sigma,
+        provenance=_provenance(ranges, inliers, fixed),
+    )
+    return FitResult(
+        calibration,
+        calibration.apply(ranges).full_m - ranges.truth_m,
+        inliers,
+        found.success,
+        f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
+    )
+
+
+def _problem(ranges: Ranges, lift: str, alpha_dbm: float, fixed: dict[int, float]) -> _Problem:
     if len(ranges) < FEWEST:
         raise UnanswerableError(
             f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST} are needed"
@@ -82,61 +135,56 @@ def fit(
         raise UnanswerableError(
             f"{ranges.source}: the first-path power never changes, so no curve over power can be fitted"
         )
-    matrix = design(ranges, tags)
-    check_determined(matrix, tags)
-    error = ranges.raw_m - ranges.truth_m
-    scale_m = None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT
-    robust = "cauchy" if loss == MIXTURE else loss
-    alone = robust_fit(matrix, -error, robust, scale_m)
+    everyone = ranges.tags()
+    unknown = sorted(set(fixed) - set(everyone))
+    if unknown:
+        raise BadInputError(f"--fix: found tag {unknown[0]}, the tags are {', '.join(map(str, everyone))}")
+    tags = [tag for tag in everyone if tag not in fixed]
+    if not tags:
+        raise BadInputError("--fix: every tag is pinned, so no delay is left to fit")
+    matrix = design(ranges, everyone)
+    free = np.array([tag not in fixed for tag in everyone])
+    check_determined(matrix[:, free], tags, ranges.initiator, ranges.target)
+    known = matrix[:, ~free] @ np.array([fixed[tag] for tag in everyone if tag in fixed])
     knots = knots_for(lifted, BIAS_SEGMENTS)
     splines = basis(lifted, knots)
-    centre = splines.mean(axis=0)
-    both = np.hstack([matrix, centre - splines])
-    penalty = _penalty(len(tags), splines.shape[1], len(ranges))
-    start = np.concatenate([alone.parameters, np.zeros(splines.shape[1])])
-    joint = robust_fit(both, -error, robust, scale_m, penalty=penalty, start=start)
-    bins = equal_bins(lifted)
-    parameters, covariance, steps, success = joint.parameters, joint.covariance, joint.steps, joint.success
-    if loss == MIXTURE:
-        likely = refine(both, error, parameters, penalty, bins)
-        parameters, covariance, success = likely.parameters, likely.covariance, likely.success
-        steps += likely.steps
-    delays, shape = np.split(parameters, [len(tags)])
-    # Errors are raw + delays - curve; the curve so far has zero mean over the data.
-    core = error + both @ parameters
-    makeup = take_apart(core, bins, int(bins.max()) + 1)
-    sigma = sigma_curve(lifted, bins, makeup.sigma_m)
-    centre_m = makeup.location_m
-    inliers = np.abs(core - centre_m) < INLIER_SIGMAS * sigma(lifted)
     # The integral of a B-spline is its coefficients times a quarter of each one's span.
-    average = float(shape @ (knots[DEGREE + 1 :] - knots[: -DEGREE - 1])) / (DEGREE + 1) / (high - low)
-    constant = -average
-    shift_ns = (centre @ shape - average - centre_m) / SPEED_OF_LIGHT * 1e9
-    bias = Curve(
-        tuple(knots.tolist()),
-        tuple((shape + constant).tolist()),
-        DEGREE,
-        (low, high),
+    averages = (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (high - low)
+    return _Problem(
+        tags,
+        ranges.raw_m - ranges.truth_m + known,
+        np.hstack([matrix[:, free], averages - splines]),
+        lifted,
+        knots,
+        averages,
+        _penalty(len(tags), splines.shape[1], len(ranges)),
     )
-    calibration = Calibration(
-        delays_ns=dict(zip(tags, (delays + shift_ns).tolist(), strict=True)),
-        delays_std_ns=dict(zip(tags, np.sqrt(np.diag(covariance)[: len(tags)]).tolist(), strict=True)),
-        loss=loss,
-        scale_ns=joint.scale / SPEED_OF_LIGHT * 1e9,
-        lift=lift,
-        alpha_dbm=alpha_dbm,
-        speed_of_light=SPEED_OF_LIGHT,
-        bias_curve=bias,
-        sigma_curve=sigma,
-        provenance=_provenance(ranges, inliers),
+
+
+def _solve(problem: _Problem, loss: str, scale_m: float | None) -> Solution:
+    """Delays alone first, for a start that the curve cannot lead astray; then both; then the mixture, if asked for."""
+    robust = "cauchy" if loss == MIXTURE else loss
+    count = len(problem.tags)
+    alone = robust_fit(problem.design[:, :count], -problem.error, robust, scale_m)
+    start = np.concatenate([alone.parameters, np.zeros(problem.design.shape[1] - count)])
+    joint = robust_fit(problem.design, -problem.error, robust, scale_m, penalty=problem.penalty, start=start)
+    if loss != MIXTURE:
+        return joint
+    likely = refine(problem.design, problem.error, joint.parameters, problem.penalty, equal_bins(problem.lifted))
+    return replace(
+        joint,
+        parameters=likely.parameters,
+        covariance=likely.covariance,
+        steps=joint.steps + likely.steps,
+        success=likely.success,
     )
-    return FitResult(
-        calibration,
-        calibration.apply(ranges).full_m - ranges.truth_m,
-        inliers,
-        success,
-        f"{'converged' if success else 'stopped'} after {steps} steps",
-    )
+
+
+def _gauge(location_m: float, *, pinned: bool) -> tuple[float, float]:
+    """Where the centre of the core goes: into a constant of the curve (m) if delays are pinned, else into them (ns)."""
+    if pinned:
+        return location_m, 0.0
+    return 0.0, -location_m / SPEED_OF_LIGHT * 1e9
 
 
 def _penalty(tags: int, coefficients: int, count: int) -> Floats:
@@ -147,8 +195,9 @@ def _penalty(tags: int, coefficients: int, count: int) -> Floats:
     return penalty
 
 
-def _provenance(ranges: Ranges, inliers: NDArray[np.bool_]) -> dict[str, Any]:
-    return {
+def _provenance(ranges: Ranges, inliers: NDArray[np.bool_], fixed: dict[int, float]) -> dict[str, Any]:
+    pinned = {"fixed_ns": {str(tag): delay for tag, delay in sorted(fixed.items())}} if fixed else {}
+    return pinned | {
         "writer": f"uwbcal {uwblink.__version__}",
         "recordings": ranges.source.split(", "),
         "exchanges": len(ranges),

@@ -34,6 +34,23 @@ def scale_ns(text: str) -> float | None:
     return value
 
 
+def fixed_ns(texts: Iterable[str]) -> dict[int, float]:
+    """Return pinned delays by tag from texts TAG=NS."""
+    fixed: dict[int, float] = {}
+    for text in texts:
+        tag, equals, value = text.partition("=")
+        try:
+            delay = float(value)
+        except ValueError:
+            delay = math.nan
+        if not (equals and tag.strip().isdecimal() and math.isfinite(delay)):
+            raise BadInputError(f"--fix: found {text!r}, expected TAG=NS, as in 1=-0.36")
+        if int(tag) in fixed:
+            raise BadInputError(f"--fix: tag {int(tag)} is pinned twice")
+        fixed[int(tag)] = delay
+    return fixed
+
+
 def _one_of(option: str, text: str, allowed: Iterable[str]) -> str:
     if text not in allowed:
         raise BadInputError(f"{option}: found {text!r}, allowed: {', '.join(allowed)}")

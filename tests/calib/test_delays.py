@@ -66,13 +66,13 @@ def test_bipartite_pairs_do_not_determine_delays(pairs):
     keep = np.array([(i, j) in pairs for i, j in zip(r.initiator, r.target, strict=True)])
     r = r[keep]
     with pytest.raises(UnanswerableError, match=r"tags 1, (2|3)"):
-        check_determined(design(r, r.tags()), r.tags())
+        check_determined(design(r, r.tags()), r.tags(), r.initiator, r.target)
 
 
 def test_three_tags_that_all_range_are_determined():
     r = ranges(600)
     r = r[np.isin(r.initiator, [1, 2, 3]) & np.isin(r.target, [1, 2, 3])]
-    check_determined(design(r, r.tags()), r.tags())
+    check_determined(design(r, r.tags()), r.tags(), r.initiator, r.target)
 
 
 @pytest.mark.parametrize("scale_ns", [0.005, 0.02, 0.5, 20.0])
@@ -80,3 +80,12 @@ def test_any_scale_converges_to_something_sensible(scale_ns):
     r = ranges(3000)
     found = robust_fit(design(r, r.tags()), r.truth_m - r.raw_m, "cauchy", scale_ns * METRES_A_NS)
     assert np.all(np.abs(found.parameters - list(DELAYS_NS.values())) < 0.5)
+
+
+def test_groups_that_shift_together_are_told_apart():
+    r = ranges(600)
+    keep = np.array([(i, j) in [(1, 2), (3, 7)] for i, j in zip(r.initiator, r.target, strict=True)])
+    r = r[keep]
+    with pytest.raises(UnanswerableError) as caught:
+        check_determined(design(r, r.tags()), r.tags(), r.initiator, r.target)
+    assert caught.value.undetermined == [[1, 2], [3, 7]]

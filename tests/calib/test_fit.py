@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.errors import UnanswerableError
+from calib.errors import BadInputError, UnanswerableError
 from calib.fit import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -96,3 +96,24 @@ def test_the_mixture_s_standard_errors_hold():
         scores.append((wrong - wrong.mean()) / std)
     # 120 scores, less the common shift, know their spread to 8 %; the gauge takes a little of it away.
     assert 0.7 < np.std(scores) < 1.25
+
+
+def test_a_pinned_delay_stays_and_determines_a_single_pair():
+    r = ranges(6000)
+    pair = r[(r.initiator == 1) & (r.target == 2)]
+    with pytest.raises(UnanswerableError, match="--fix"):
+        fit(pair)
+    # The curve averages zero over its range; the planted one does not, and the other delay makes up for that.
+    c = fit(pair, fixed_ns={1: DELAYS_NS[1]}).calibration
+    assert c.delays_ns[1] == DELAYS_NS[1]
+    grid = np.linspace(*c.bias_curve.range, 400)
+    both = 0.5 * (c.delays_ns[2] - DELAYS_NS[2]) * 1e-9 * SPEED_OF_LIGHT
+    assert np.sqrt(np.mean((c.bias_curve(grid) - both - bias_m(grid)) ** 2)) < 0.01
+
+
+def test_pinning_all_tags_or_unknown_ones_is_refused():
+    r = ranges(1000)
+    with pytest.raises(BadInputError, match="tag 99"):
+        fit(r, fixed_ns={99: 0.0})
+    with pytest.raises(BadInputError, match="every tag"):
+        fit(r, fixed_ns=DELAYS_NS)
