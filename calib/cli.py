@@ -20,6 +20,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+imports = typer.Typer(help="Turn other files into calibrations.", no_args_is_help=True)
+app.add_typer(imports, name="import")
+
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.uwb).")]
 CalibrationFile = Annotated[Path, typer.Option("-c", "--calibration", help="Calibration (.json).")]
 Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
@@ -121,6 +124,93 @@ def evaluate(
     print_table(evaluation, Console())
     if report:
         typer.echo(f"report: {report}")
+
+
+@app.command("add-tag")
+def add_tag(
+    recording: Annotated[Path, typer.Argument(help="Recording of the new tag with calibrated ones (.uwb).")],
+    calibration: CalibrationFile,
+    tag: Annotated[int, typer.Option(help="Id of the new tag.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],
+    force: Force = False,
+) -> None:
+    """Add a new tag to a calibration."""
+    from calib.calibration import load as load_calibration
+    from calib.calibration import save
+    from calib.dataset import load
+    from calib.new_tag import add_tag as run
+    from uwblink.recording import check_output
+
+    check_output(output, force=force)
+    found = run(load(recording), load_calibration(calibration), tag)
+    save(found, output, force=force)
+    typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {found.delays_std_ns[tag]:.4f}")
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(help="Calibration (.json).")],
+    second: Annotated[Path, typer.Argument(help="Calibration (.json).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say whether two calibrations differ by more than they do not know."""
+    from calib.calibration import load
+    from calib.compare import compare as run
+
+    found = run(load(first), load(second))
+    if as_json:
+        typer.echo(json.dumps(found.to_dict(), indent=1))
+        return
+    for tag, difference in found.difference_ns.items():
+        typer.echo(f"  tag {tag:3d}  {1e3 * difference:+8.1f} ps  ± {1e3 * found.std_ns[tag]:.1f}")
+    typer.echo(
+        f"offset of all ranges {100 * found.offset_m:+.1f} cm, "
+        f"shape of the bias curves {100 * found.curve_rms_m:.1f} cm rms"
+    )
+    for name, tags in ((first, found.only_first), (second, found.only_second)):
+        if tags:
+            typer.echo(f"only in {name}: tags {', '.join(map(str, tags))}")
+    typer.echo(
+        f"the delays are {'the same' if found.same else 'different'}: chi-square {found.chi_square:.1f} with "
+        f"{len(found.difference_ns) - 1} degrees of freedom, probability {found.probability:.3f}"
+    )
+
+
+@app.command()
+def export(
+    calibration: Annotated[Path, typer.Argument(help="Calibration (.json).")],
+    to: Annotated[str, typer.Option(help="registers, json, csv, miluv or ros-yaml.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; else it is printed.")] = None,
+    force: Force = False,
+) -> None:
+    """Write a calibration in another form."""
+    from calib.calibration import load, write_text
+    from calib.exchange_formats import FORMATS
+    from calib.options import one_of
+
+    text = FORMATS[one_of("--to", to, FORMATS)](load(calibration))
+    if output is None:
+        typer.echo(text, nl=False)
+        return
+    write_text(output, text, force=force)
+    typer.echo(f"{output}")
+
+
+@imports.command("miluv")
+def import_miluv(
+    source: Annotated[Path, typer.Argument(help="MILUV's published calibration (.json).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],
+    force: Force = False,
+) -> None:
+    """Read the calibration published with the MILUV dataset."""
+    from calib.calibration import save
+    from calib.exchange_formats import read_miluv
+    from uwblink.recording import check_output
+
+    check_output(output, force=force)
+    found = read_miluv(source)
+    save(found, output, force=force)
+    typer.echo(f"{output}: {len(found.delays_ns)} tags")
 
 
 def main() -> None:

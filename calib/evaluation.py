@@ -55,9 +55,16 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib evaluate --json` prints."""
         return {
-            "overall": asdict(self.overall),
-            "pairs": {name: asdict(group) for name, group in self.pairs.items()},
+            "overall": _plain(asdict(self.overall)),
+            "pairs": {name: _plain(asdict(group)) for name, group in self.pairs.items()},
         }
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: a figure of nothing is null."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return None if isinstance(value, float) and value != value else value
 
 
 def evaluate(ranges: Ranges, calibration: Calibration) -> Evaluation:

@@ -13,12 +13,12 @@ from calib.power import LIFTS
 
 def loss_name(text: str) -> str:
     """Return a key of `LOSSES`, or the mixture."""
-    return _one_of("--loss", text, [*LOSSES, MIXTURE])
+    return one_of("--loss", text, [*LOSSES, MIXTURE])
 
 
 def lift_name(text: str) -> str:
     """Return a key of `LIFTS`."""
-    return _one_of("--lift", text, LIFTS)
+    return one_of("--lift", text, LIFTS)
 
 
 def scale_ns(text: str) -> float | None:
@@ -51,7 +51,8 @@ def fixed_ns(texts: Iterable[str]) -> dict[int, float]:
     return fixed
 
 
-def _one_of(option: str, text: str, allowed: Iterable[str]) -> str:
+def one_of(option: str, text: str, allowed: Iterable[str]) -> str:
+    """Return a word that is allowed; raises `BadInputError` that lists what is."""
     if text not in allowed:
         raise BadInputError(f"{option}: found {text!r}, allowed: {', '.join(allowed)}")
     return text

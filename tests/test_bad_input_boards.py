@@ -119,6 +119,18 @@ def test_links_that_cannot_be(tmp_path):
     assert (tmp_path / "p.csv").read_text() == "mine"
 
 
+def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
+    from uwblink.errors import PortError
+    from uwblink.terminals import Terminal
+
+    first = Terminal(tmp_path / "tag1")
+    with pytest.raises(PortError, match="somebody serves"):
+        Terminal(tmp_path / "tag1")
+    first.unplug()
+    (tmp_path / "tag1").symlink_to(tmp_path / "gone")
+    Terminal(tmp_path / "tag1").unplug()
+
+
 def test_a_replay_is_served_as_it_was(tmp_path, ports):
     flight = tmp_path / "f.uwb"
     done = run("uwblink", "record", ports[1], ports[2], "-o", flight, "--pairs", "all", "--duration", 0.5)

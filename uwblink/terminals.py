@@ -88,9 +88,11 @@ class Terminal:
 
 
 def _point(link: Path, device: str) -> None:
+    if link.is_symlink() and link.exists():
+        raise PortError(f"{link}: is a port that somebody serves; choose another folder, or remove the link")
     try:
         link.parent.mkdir(parents=True, exist_ok=True)
-        if link.is_symlink():
+        if link.is_symlink():  # left behind by a server that was killed
             link.unlink()
         link.symlink_to(device)
     except OSError as error:

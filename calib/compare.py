@@ -1,0 +1,79 @@
+"""Two calibrations side by side: are the delays the same within what is known of them?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from calib.calibration import Calibration
+from calib.errors import UnanswerableError
+from uwblink.ticks import SPEED_OF_LIGHT
+
+SIGNIFICANT: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Differences second minus first, after a shift common to all delays has been taken out.
+
+    The shift and a constant of the curve are the same thing, so only together do they mean anything: `offset_m` is
+    what the second calibration adds to every range beyond the first, at equal power.
+    """
+
+    difference_ns: dict[int, float]
+    std_ns: dict[int, float]
+    offset_m: float
+    curve_rms_m: float
+    chi_square: float
+    probability: float
+    only_first: tuple[int, ...]
+    only_second: tuple[int, ...]
+
+    @property
+    def same(self) -> bool:
+        """Whether differences as large as these come by chance more than once in twenty."""
+        return self.probability >= SIGNIFICANT
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `calib compare --json` prints."""
+        return {
+            "difference_ns": {str(t): d for t, d in self.difference_ns.items()},
+            "std_ns": {str(t): d for t, d in self.std_ns.items()},
+            "offset_m": self.offset_m,
+            "curve_rms_m": self.curve_rms_m,
+            "chi_square": self.chi_square,
+            "probability": self.probability,
+            "verdict": "same" if self.same else "different",
+            "only_first": list(self.only_first),
+            "only_second": list(self.only_second),
+        }
+
+
+def compare(first: Calibration, second: Calibration) -> Comparison:
+    """Compare two calibrations; raises `UnanswerableError` where fewer than two tags are in both."""
+    from scipy.stats import chi2
+
+    common = sorted(set(first.delays_ns) & set(second.delays_ns))
+    if len(common) < 2:
+        raise UnanswerableError(f"{len(common)} tags are in both calibrations, at least two are needed to compare")
+    delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common])
+    std = np.array([np.hypot(first.delays_std_ns.get(t, 0.0), second.delays_std_ns.get(t, 0.0)) for t in common])
+    weight = 1 / np.maximum(std, 1e-6) ** 2
+    shift = float(np.sum(delta * weight) / np.sum(weight))
+    score = float(np.sum((delta - shift) ** 2 * weight))
+    low = max(first.bias_curve.range[0], second.bias_curve.range[0])
+    high = min(first.bias_curve.range[1], second.bias_curve.range[1])
+    grid = np.linspace(low, max(high, low + 1e-9), 400)
+    curves = second.bias_curve(grid) - first.bias_curve(grid)
+    return Comparison(
+        dict(zip(common, (delta - shift).tolist(), strict=True)),
+        dict(zip(common, std.tolist(), strict=True)),
+        shift * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),
+        float(curves.std()),
+        score,
+        float(chi2.sf(score, len(common) - 1)),
+        tuple(sorted(set(first.delays_ns) - set(common))),
+        tuple(sorted(set(second.delays_ns) - set(common))),
+    )
