@@ -148,6 +148,56 @@ def add_tag(
 
 
 @app.command()
+def localize(
+    recordings: Recordings,
+    calibration: CalibrationFile,
+    tum: Annotated[Path | None, typer.Option(help="Folder for trajectories (.tum).")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    force: Force = False,
+) -> None:
+    """Track each body with an EKF: raw, calibrated, and calibrated with its variance."""
+    from dataclasses import asdict
+
+    from calib.calibration import load as load_calibration
+    from calib.calibration import write_text
+    from calib.dataset import load_flight
+    from calib.localization import PAPER_RMSE_M, STAGES, as_tum, summarize
+    from calib.localization import localize as run
+
+    known = load_calibration(calibration)
+    found = [one for path in recordings for one in run(load_flight(path), known)]
+    if tum:
+        tum.mkdir(parents=True, exist_ok=True)
+        for one in found:
+            for stage, track in one.tracks.items():
+                name = "".join(c if c.isalnum() or c in "-_" else "_" for c in f"{one.source}-{one.body}-{stage}")
+                write_text(tum / f"{name}.tum", as_tum(track), force=force)
+    summary = summarize(found)
+    if as_json:
+        rows = [
+            {"recording": one.source, "body": one.body, "rmse_m": {s: one.tracks[s].rmse_m for s in STAGES}}
+            for one in found
+        ]
+        typer.echo(json.dumps({"scenarios": rows, "summary": asdict(summary)}, indent=1))
+        return
+    typer.echo(f"{'RMSE of the position (m)':34s}{'raw':>8s}{'calibrated':>13s}{'and variance':>14s}")
+    for one in found:
+        figures = [one.tracks[stage].rmse_m for stage in STAGES]
+        typer.echo(f"{one.source + ' ' + one.body:34s}{figures[0]:8.3f}{figures[1]:13.3f}{figures[2]:14.3f}")
+    mean, less = summary.rmse_m, summary.reduction
+    typer.echo(f"{'mean':34s}{mean['raw']:8.3f}{mean['calibrated']:13.3f}{mean['variance']:14.3f}")
+    typer.echo(f"{'':42s}{-100 * less['calibrated']:+12.0f} %{-100 * less['variance']:+12.0f} %")
+    paper = PAPER_RMSE_M
+    typer.echo(
+        f"{'ICRA 2023, its own flights':34s}{paper['raw']:8.3f}{paper['calibrated']:13.3f}{paper['variance']:14.3f}"
+    )
+    typer.echo(
+        f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected), NEES {summary.nees:.2f} (3 expected), "
+        f"{100 * summary.accepted:.1f} % of the ranges pass the gate"
+    )
+
+
+@app.command()
 def compare(
     first: Annotated[Path, typer.Argument(help="Calibration (.json).")],
     second: Annotated[Path, typer.Argument(help="Calibration (.json).")],

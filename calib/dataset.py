@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib.errors import UnanswerableError
 from uwblink.geometry import distances_m
 from uwblink.recording import Recording
+from uwblink.schema import Poses, Tag
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, delay_weights, intervals, raw_range
 
@@ -89,6 +90,28 @@ def load(path: str | os.PathLike[str]) -> Ranges:
         planted=planted if isinstance(planted, dict) else None,
     )
     return _usable(ranges, path)
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """Ranges together with where bodies and tags were."""
+
+    ranges: Ranges
+    poses: Poses
+    tags: list[Tag]
+
+    def moving_bodies(self) -> list[str]:
+        """Return the bodies whose position changes by more than a decimetre."""
+        names = sorted(set(self.poses.body.tolist()))
+        spans = {n: np.ptp(self.poses.position_m[self.poses.body == n], axis=0).max() for n in names}
+        return [name for name in names if spans[name] > 0.1]
+
+
+def load_flight(path: str | os.PathLike[str]) -> Flight:
+    """Read a recording with its poses; raises what `load` raises."""
+    ranges = load(path)
+    with Recording.open(path) as recording:
+        return Flight(ranges, recording.poses(), recording.tags())
 
 
 def concatenate(parts: Sequence[Ranges]) -> Ranges:

@@ -18,16 +18,28 @@ def distances_m(poses: Poses, tags: list[Tag], initiator: Ints, target: Ints, ti
     quaternions. NaN where a tag has no lever arm, its body no poses, or the time lies outside them;
     a body with a single pose does not move.
     """
-    ends = [np.full((len(time_ns), 3), np.nan) for _ in range(2)]
-    tracks = {body: _Track(poses, body) for body in np.unique(poses.body)}
-    for tag in tags:
-        if tag.body not in tracks:
-            continue
-        for end, ids in zip(ends, (initiator, target), strict=True):
-            rows = np.flatnonzero(ids == tag.tag)
-            end[rows] = tracks[tag.body].point_m(time_ns[rows], np.array(tag.lever_arm_m))
-    apart = ends[1] - ends[0]
+    tracks = {str(body): _Track(poses, body) for body in np.unique(poses.body)}
+    apart = _antennas(tracks, tags, target, time_ns) - _antennas(tracks, tags, initiator, time_ns)
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", apart, apart)))
+
+
+def antennas_m(poses: Poses, tags: list[Tag], ids: Ints, time_ns: Ints) -> Floats:
+    """Return where the antennas of tags `ids` (n,) are at given times, shape (n, 3); NaN as for `distances_m`."""
+    return _antennas({str(body): _Track(poses, body) for body in np.unique(poses.body)}, tags, ids, time_ns)
+
+
+def bodies_m(poses: Poses, body: str, time_ns: Ints) -> Floats:
+    """Return where a body is at given times (n,), shape (n, 3); NaN outside its poses."""
+    return _Track(poses, body).point_m(time_ns, np.zeros(3))
+
+
+def _antennas(tracks: dict[str, _Track], tags: list[Tag], ids: Ints, time_ns: Ints) -> Floats:
+    found = np.full((len(time_ns), 3), np.nan)
+    for tag in tags:
+        rows = np.flatnonzero(ids == tag.tag)
+        if len(rows) and tag.body in tracks:
+            found[rows] = tracks[tag.body].point_m(time_ns[rows], np.array(tag.lever_arm_m))
+    return found
 
 
 class _Track:
