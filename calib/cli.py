@@ -70,7 +70,7 @@ def fit(
         typer.echo(found.to_json(), nl=False)
         return
     typer.echo(f"{output}: {len(ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
-    for tag, delay in found.delays_ns.items():
+    for tag, delay in sorted(found.delays_ns.items()):
         typer.echo(f"  tag {tag:3d}  delay {delay:+.4f} ns  ± {found.delays_std_ns[tag]:.4f}")
     for reason, count in ranges.excluded.items():
         typer.echo(f"  left out: {count} exchanges, {reason}")
@@ -119,9 +119,9 @@ def evaluate(
         return
     from rich.console import Console
 
-    from calib.table import print_table
+    from calib.table import WIDE, print_table
 
-    print_table(evaluation, Console())
+    print_table(evaluation, Console(width=None if sys.stdout.isatty() else WIDE))
     if report:
         typer.echo(f"report: {report}")
 

@@ -8,9 +8,14 @@ from rich.table import Table
 
 from calib.evaluation import STAGES, Evaluation, Group
 
+WIDE = 110
+"""Columns that the table never needs more than: where nobody looks, no figure must lose its last digits."""
+
+SHORT = {"raw": "raw", "delays": "delay", "full": "full"}
+
 
 def print_table(evaluation: Evaluation, console: Console) -> None:
-    """Print errors in centimetres, a row a pair and one for all."""
+    """Print errors in centimetres, a row a pair and one for all; last, the share in % that chi-square rejects."""
     table = Table(
         title="Range error in cm", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
@@ -18,8 +23,8 @@ def print_table(evaluation: Evaluation, console: Console) -> None:
     table.add_column("n", justify="right", no_wrap=True)
     for stage in STAGES:
         for what in ("mean", "std", "rob."):
-            table.add_column(f"{stage}\n{what}", justify="right", no_wrap=True)
-    table.add_column("chi2\n>95%", justify="right", no_wrap=True)
+            table.add_column(f"{SHORT[stage]}\n{what}", justify="right", no_wrap=True)
+    table.add_column("chi2\nout%", justify="right", no_wrap=True)
     for name, group in evaluation.pairs.items():
         table.add_row(name, *_cells(group))
     table.add_section()
@@ -33,4 +38,4 @@ def _cells(group: Group) -> list[str]:
         stats = getattr(group, stage)
         figures = (stats.mean_m, stats.std_m, stats.robust_std_m)
         cells += [f"{100 * figure:.1f}" for figure in figures]
-    return [*cells, f"{100 * group.rejected:.1f}%"]
+    return [*cells, f"{100 * group.rejected:.1f}"]

@@ -82,13 +82,13 @@ def sentences(scenario: Scenario, found: Preview) -> list[str]:
     plan = scenario.ranging.plan if isinstance(scenario.ranging.plan, str) else scenario.ranging.plan.file
     lines = [
         f"{scenario.scenario.name}: {protocol.title}, plan {plan}, {found.duration_s:g} s",
-        f"{found.exchanges} exchanges planned among {len(found.pairs)} pairs, {found.rate_hz:.1f} a second "
+        f"{found.exchanges} exchanges planned among {len(found.pairs)} pairs, {found.rate_hz:.3g} a second "
         f"(one after the other at most {found.fastest_hz:.0f}); "
         f"frames on the air {100 * found.air_share:.1f} % of the time",
     ]
     for pair in found.pairs:
         lines.append(
-            f"  {pair.initiator:3d} -> {pair.target:3d}  {pair.exchanges:6d} exchanges  {pair.rate_hz:6.1f} Hz  "
+            f"  {pair.initiator:3d} -> {pair.target:3d}  {pair.exchanges:6d} exchanges  {pair.rate_hz:6.3g} Hz  "
             f"{pair.distance_m[0]:5.2f} to {pair.distance_m[1]:5.2f} m  {pair.power_dbm[0]:6.1f} to "
             f"{pair.power_dbm[1]:6.1f} dBm  bias by skew in SS-TWR {100 * pair.ss_bias_m:+.1f} cm"
         )

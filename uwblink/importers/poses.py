@@ -30,7 +30,9 @@ def read_poses(path: Path, body: str | None = None) -> Poses:
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
     reader = _READERS.get(kind)
     if reader is None:
-        raise ImportTableError(f"{path}: found .{kind}, expected one of .{', .'.join(sorted(_READERS))}")
+        raise ImportTableError(
+            f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(sorted(_READERS))}"
+        )
     poses = _as_poses(path, reader(path, body))
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
