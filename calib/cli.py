@@ -148,6 +148,28 @@ def add_tag(
 
 
 @app.command()
+def doctor(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Name what is wrong with a recording, with the evidence and the remedy."""
+    from dataclasses import asdict
+
+    from calib.doctor import examine
+
+    findings = examine(recording)
+    if as_json:
+        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
+        return
+    if not findings:
+        typer.echo(f"{recording}: nothing found")
+    for finding in findings:
+        typer.echo(f"{finding.fault} (confidence {finding.confidence:.2f})")
+        typer.echo(f"  evidence: {finding.evidence}")
+        typer.echo(f"  remedy:   {finding.remedy}")
+
+
+@app.command()
 def localize(
     recordings: Recordings,
     calibration: CalibrationFile,

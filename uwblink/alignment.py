@@ -23,6 +23,7 @@ Ints = NDArray[np.int64]
 STEP_S: Final = 0.1
 PARABOLA_S: Final = 0.02
 MOST_EXCHANGES: Final = 4000
+MOST_OFFSETS: Final = 5000
 LEAST_OVERLAP: Final = 0.5
 CLEARLY: Final = 0.7
 """The best spread must be below this share of the typical one, or motion does not tell the time."""
@@ -37,22 +38,29 @@ class Alignment:
     typical_m: float
 
 
-def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag]) -> Alignment:
-    """Search every offset at which at least half the exchanges lie within the poses; raises `ImportTableError`."""
+def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: float | None = None) -> Alignment:
+    """Search every offset at which at least half the exchanges lie within the poses; raises `ImportTableError`.
+
+    With `within_s` only offsets of that size are looked at. In very long recordings the first grid is coarser, so
+    that it never has more than `MOST_OFFSETS` points.
+    """
     rows = np.unique(np.linspace(0, len(exchanges) - 1, min(len(exchanges), MOST_EXCHANGES)).astype(np.int64))
     some = exchanges[rows]
     ranges = raw_range(some)
     first, last = int(poses.time_ns.min()), int(poses.time_ns.max())
     begin, end = int(some.time_ns.min()), int(some.time_ns.max())
     overlap_ns = int(LEAST_OVERLAP * min(end - begin, last - first))
-    step = int(STEP_S * 1e9)
-    offsets = np.arange(begin + overlap_ns - last, end - overlap_ns - first + step, step, dtype=np.int64)
+    low, high = begin + overlap_ns - last, end - overlap_ns - first
+    if within_s is not None:
+        low, high = max(low, -int(within_s * 1e9)), min(high, int(within_s * 1e9))
+    step = max(int(STEP_S * 1e9), (high - low) // MOST_OFFSETS)
+    offsets = np.arange(low, high + step, step, dtype=np.int64)
     spreads = np.array([_spread(some, ranges, poses, tags, int(o)) for o in offsets])
     if not np.isfinite(spreads).any():
         raise ImportTableError("no offset puts the poses over the exchanges; are the bodies of the tags in the file?")
     typical = float(np.nanmedian(spreads))
     best = int(offsets[np.nanargmin(spreads)])
-    best = _refined(some, ranges, poses, tags, best, float(np.nanmin(spreads)))
+    best = _refined(some, ranges, poses, tags, best, float(np.nanmin(spreads)), step)
     spread = _spread(some, ranges, poses, tags, best)
     if spread > CLEARLY * typical:
         raise ImportTableError(
@@ -62,10 +70,12 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag]) -> Alignmen
     return Alignment(best, spread, typical)
 
 
-def _refined(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], start: int, scale_m: float) -> int:
+def _refined(
+    exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], start: int, scale_m: float, step: int
+) -> int:
     """Move to the least Cauchy loss, which uses more of the data than their median: grids, then a parabola."""
-    best, step = start, int(STEP_S * 1e9)
-    for _ in range(3):
+    best = start
+    for _ in range(3 + max(step // int(STEP_S * 1e9) - 1, 0).bit_length()):
         step //= 5
         near = best + step * np.arange(-6, 7, dtype=np.int64)
         losses = np.array([_loss(exchanges, ranges, poses, tags, int(o), scale_m) for o in near])
