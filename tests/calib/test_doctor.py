@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.doctor import VACUUM_OVER_AIR, examine
+from calib.ailments_of_stamps import VACUUM_OVER_AIR
+from calib.doctor import examine
 from uwblink.schema import Fault
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import STAMPS, board_range

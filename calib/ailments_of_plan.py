@@ -1,0 +1,86 @@
+"""What can be wrong with who ranges with whom, and how bodies move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.delays import check_determined
+from calib.errors import UnanswerableError
+from calib.patient import Finding, Patient, pair_ids
+from uwblink.listing import failures_by_pair
+from uwblink.twr import delay_weights
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def pairs(patient: Patient) -> Iterator[Finding]:
+    """Pairs that leave antenna delays undetermined."""
+    e = patient.exchanges
+    with np.errstate(all="ignore"):
+        first, second = delay_weights(e)
+    good = np.isfinite(first) & np.isfinite(second)
+    if not good.any():
+        return
+    tags = sorted({*e.initiator[good].tolist(), *e.target[good].tolist()})
+    place = np.array(tags)
+    matrix = np.zeros((np.count_nonzero(good), len(tags)))
+    rows = np.arange(len(matrix))
+    matrix[rows, np.searchsorted(place, e.initiator[good])] += first[good]
+    matrix[rows, np.searchsorted(place, e.target[good])] += second[good]
+    try:
+        check_determined(matrix, tags, e.initiator[good], e.target[good])
+    except UnanswerableError as error:
+        groups = "; ".join(", ".join(map(str, group)) for group in error.undetermined)
+        yield Finding(
+            "too few pairs",
+            f"the pairs do not determine the delays of tags {groups}",
+            "record three tags that all range with each other, or pin a known delay with --fix TAG=NS",
+            0.99,
+        )
+
+
+def silent(patient: Patient) -> Iterator[Finding]:
+    """A tag whose exchanges nearly all fail, where those of others do not."""
+    e = patient.exchanges
+    failed = failures_by_pair(patient.faults)
+    for tag in sorted({t.tag for t in patient.tags}):
+        bad = sum(n for pair, n in failed.items() if tag in pair)
+        done = int(np.count_nonzero((e.initiator == tag) | (e.target == tag)))
+        others = len(e) + sum(failed.values()) - bad - done
+        if bad > 20 and bad > 3 * done and others:
+            yield Finding(
+                "dead or deaf tag",
+                f"tag {tag} took part in {done} exchanges, {bad} failed",
+                f"check power, antenna and USB of tag {tag}",
+                0.9,
+            )
+
+
+def still(patient: Patient) -> Iterator[Finding]:
+    """Tags that keep their distances."""
+    pair = pair_ids(patient.exchanges)
+    good = np.isfinite(patient.truth_m)
+    spans = [float(np.ptp(patient.truth_m[good & (pair == p)])) for p in np.unique(pair[good])]
+    if spans and max(spans) < 0.1:
+        yield Finding(
+            "static data",
+            f"no distance changes by more than {100 * max(spans):.0f} cm",
+            "move the tags while recording, so that powers and reflections vary",
+            0.9,
+        )
+
+
+def no_truth(patient: Patient) -> Iterator[Finding]:
+    """Exchanges without a true distance."""
+    known = float(np.mean(np.isfinite(patient.truth_m)))
+    if known < 0.5:
+        yield Finding(
+            "no true distances",
+            f"{100 * known:.0f} % of the exchanges have one: poses are missing or do not cover the recording",
+            "add motion capture with uwblink poses, or measured distances in gt_range_m",
+            0.95,
+        )

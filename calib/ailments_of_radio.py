@@ -1,0 +1,115 @@
+"""What can be wrong with radios, antennas and surroundings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.mixture import take_apart
+from calib.patient import Finding, Patient, pair_ids, spread_m
+from uwblink.ticks import TICKS_PER_SECOND
+from uwblink.twr import intervals
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def skew(patient: Patient) -> Iterator[Finding]:
+    """Errors that follow the relative skew of a pair times its reply delay, as uncorrected single-sided ones do."""
+    e = patient.exchanges
+    single = (e.protocol == "ss") & np.isfinite(patient.error_m) & np.isfinite(e.skew1_ppm)
+    if np.count_nonzero(single) < 100:
+        return
+    dt32_s = intervals(e[single]).dt32 / TICKS_PER_SECOND
+    expected = -0.5 * 299_702_547.0 * e.skew1_ppm[single] * 1e-6 * dt32_s
+    error = patient.error_m[single]
+    slope = float(np.polyfit(expected, error, 1)[0]) if np.std(expected) > 0.05 else 0.0
+    if 0.5 < slope < 1.5:
+        yield Finding(
+            "skew in single-sided ranges",
+            f"errors follow c/2 times skew times reply delay with slope {slope:.2f}, over {np.ptp(expected):.1f} m",
+            "use double-sided ranging, or correct single-sided ranges with the measured skew",
+            0.9,
+        )
+
+
+def moved_delay(patient: Patient) -> Iterator[Finding]:
+    """A tag all of whose pairs shift at one time: the largest change of medians between before and after."""
+    e, error = patient.exchanges, patient.error_m
+    good = np.isfinite(error)
+    if np.count_nonzero(good) < 1000:
+        return
+    time = (e.time_ns - e.time_ns[good].min()) * 1e-9
+    length = float(time[good].max())
+    if length < 10:
+        return
+    pair = pair_ids(e)
+    centred = error.copy()
+    for p in np.unique(pair):
+        centred[pair == p] -= np.nanmedian(error[pair == p])
+    spread, moved = spread_m(patient), []
+    for tag in sorted({*e.initiator.tolist(), *e.target.tolist()}):
+        mine = good & ((e.initiator == tag) | (e.target == tag))
+        rest = good & ~mine
+        best, at = 0.0, 0.0
+        for cut in np.linspace(0.15, 0.85, 15) * length:
+            step = _step(centred, mine, time, cut) - (_step(centred, rest, time, cut) if rest.any() else 0.0)
+            if abs(step) > abs(best):
+                best, at = step, float(cut)
+        if abs(best) > 0.12 and abs(best) > 12 * spread / np.sqrt(np.count_nonzero(mine) / 4):
+            moved.append((abs(best), tag, best, at))
+    # Partners of the tag that moved shift with it, by less.
+    for _, tag, best, at in sorted(moved)[-1:]:
+        yield Finding(
+            "delay changed mid-flight",
+            f"ranges of tag {tag} shift by {100 * best:+.1f} cm about {at:.0f} s after the start, others do not",
+            f"look for a loose antenna or another voltage on tag {tag}; calibrate the two parts apart",
+            0.8,
+        )
+
+
+def _step(values: Floats, rows: NDArray[np.bool_], time: Floats, cut: float) -> float:
+    before, after = values[rows & (time < cut)], values[rows & (time >= cut)]
+    return float(np.median(after) - np.median(before)) if len(before) > 50 and len(after) > 50 else 0.0
+
+
+def reflections(patient: Patient) -> Iterator[Finding]:
+    """A large share of ranges with a detour."""
+    good = np.isfinite(patient.error_m) & (np.abs(patient.error_m) < 20)
+    if np.count_nonzero(good) < 300:
+        return
+    error = patient.error_m[good]
+    for p in np.unique(pair_ids(patient.exchanges)[good]):
+        rows = pair_ids(patient.exchanges)[good] == p
+        error[rows] -= np.median(error[rows])
+    makeup = take_apart(error, np.zeros(len(error), dtype=np.int64), 1)
+    if makeup.tail_share > 0.3 and makeup.tail_mean_m > 3 * makeup.sigma_m[0]:
+        yield Finding(
+            "reflections",
+            f"about {100 * makeup.tail_share:.0f} % of the ranges are longer than noise explains, by "
+            f"{100 * makeup.tail_mean_m:.0f} cm on average",
+            "move antennas away from bodies and walls, or fit with --loss mixture",
+            0.75,
+        )
+
+
+def confounded(patient: Patient) -> Iterator[Finding]:
+    """Power that is a function of distance and nothing else lets the curve learn distance."""
+    e = patient.exchanges
+    power = np.nanmean(np.stack([e.fpp1_dbm, e.fpp2_dbm]), axis=0) if np.isfinite(e.fpp1_dbm).any() else e.fpp2_dbm
+    good = np.isfinite(power) & np.isfinite(patient.truth_m) & (patient.truth_m > 0)
+    if np.count_nonzero(good) < 300 or np.ptp(patient.truth_m[good]) < 0.5:
+        return
+    order = np.argsort(patient.truth_m[good])
+    groups = np.array_split(power[good][order], 40)
+    within = np.median([np.var(g) for g in groups])
+    between = np.var([np.mean(g) for g in groups])
+    if within < 0.12 * (within + between):
+        yield Finding(
+            "power confounded with distance",
+            f"distance explains {100 * between / (within + between):.0f} % of the power's variance",
+            "turn the antennas while recording; until then the curve may hold what belongs to distance",
+            0.8,
+        )
