@@ -32,7 +32,6 @@ from uwblink.messages import (
     SetResponseDelay,
     Skipped,
     TestsDone,
-    TextLine,
 )
 from uwblink.ports import SerialPort, Transport
 
@@ -184,6 +183,3 @@ class Board:
         while (left_s := until_s - self._transport.now_s()) > 0:
             events, _ = self._dialogue.receive(self._transport.read(left_s), self._transport.now_s())
             self._keep(events, None)
-
-
-__all__ = ["Board", "TextLine"]

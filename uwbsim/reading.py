@@ -93,7 +93,9 @@ def _explain(error: ValidationError) -> str:
         return f"{where}: missing, and it must be given"
     message = str(first["msg"]).removeprefix("Value error, ")
     if first["type"] == "value_error":
-        return f"{where}.{message}" if where else message
+        # A table's own check begins with the key it is about; that of a single value begins with what was found.
+        joint = ": " if message.startswith("found") else "."
+        return f"{where}{joint}{message}" if where else message
     found = repr(first["input"])
     found = found if len(found) <= 60 else found[:57] + "..."
     return f"{where}: found {found}, {message[0].lower()}{message[1:]}"

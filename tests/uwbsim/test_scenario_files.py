@@ -51,7 +51,11 @@ def changed(tmp_path, old, new):
         ("rate_hz = 120.0", "rate_hz = 400.0", ["ranging.rate_hz", "400", "at most 329"]),
         ('material = "brick"', "", ["obstacles[1].material", "missing"]),
         ('material = "brick"', 'material = "cheese"', ["obstacles[1].material", "cheese", "concrete"]),
-        ('bias = "aps011"', 'bias = "magic"', ["radio.bias", "magic", "none, icra2023, icra2023-july, miluv, aps011"]),
+        (
+            'bias = "aps011"',
+            'bias = "magic"',
+            ["radio.bias: found 'magic'", "none, icra2023, icra2023-july, miluv, aps011"],
+        ),
         ("monopole.csv", "nothing.csv", ["radio.antenna.file", "no such file"]),
         ("min_separation_m = 0.3", "min_separation_m = 9.0", ["min_separation_m", "robot"]),
         ("speed_mps = 0.8\nacceleration", "times_s = [1, 2]\nspeed_mps = 0.8\nacceleration", ["times_s", "either"]),
