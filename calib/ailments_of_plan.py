@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.delays import check_determined
-from calib.errors import UnanswerableError
+from calib.delays import determined
 from calib.patient import Finding, Patient, pair_ids
 from uwblink.listing import failures_by_pair
 from uwblink.twr import delay_weights
@@ -31,10 +30,9 @@ def pairs(patient: Patient) -> Iterator[Finding]:
     rows = np.arange(len(matrix))
     matrix[rows, np.searchsorted(place, e.initiator[good])] += first[good]
     matrix[rows, np.searchsorted(place, e.target[good])] += second[good]
-    try:
-        check_determined(matrix, tags, e.initiator[good], e.target[good])
-    except UnanswerableError as error:
-        groups = "; ".join(", ".join(map(str, group)) for group in error.undetermined)
+    _, free = determined(matrix, tags, e.initiator[good], e.target[good])
+    if free:
+        groups = "; ".join(", ".join(map(str, group)) for group in free)
         yield Finding(
             "too few pairs",
             f"the pairs do not determine the delays of tags {groups}",

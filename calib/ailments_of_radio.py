@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.confounding import explained_by_distance
 from calib.mixture import take_apart
 from calib.patient import Finding, Patient, pair_ids, spread_m
 from uwblink.ticks import TICKS_PER_SECOND
@@ -99,17 +100,11 @@ def confounded(patient: Patient) -> Iterator[Finding]:
     """Power that is a function of distance and nothing else lets the curve learn distance."""
     e = patient.exchanges
     power = np.nanmean(np.stack([e.fpp1_dbm, e.fpp2_dbm]), axis=0) if np.isfinite(e.fpp1_dbm).any() else e.fpp2_dbm
-    good = np.isfinite(power) & np.isfinite(patient.truth_m) & (patient.truth_m > 0)
-    if np.count_nonzero(good) < 300 or np.ptp(patient.truth_m[good]) < 0.5:
-        return
-    order = np.argsort(patient.truth_m[good])
-    groups = np.array_split(power[good][order], 40)
-    within = np.median([np.var(g) for g in groups])
-    between = np.var([np.mean(g) for g in groups])
-    if within < 0.12 * (within + between):
+    share = explained_by_distance(power, patient.truth_m)
+    if share is not None:
         yield Finding(
             "power confounded with distance",
-            f"distance explains {100 * between / (within + between):.0f} % of the power's variance",
+            f"distance explains {100 * share:.0f} % of the power's variance",
             "turn the antennas while recording; until then the curve may hold what belongs to distance",
             0.8,
         )

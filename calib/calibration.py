@@ -5,21 +5,25 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass, field
+import re
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.dataset import Ranges
 from calib.errors import BadInputError
-from calib.power import LIFTS, Curve, lifted_power
+from calib.json_reader import Matrix, Reader
+from calib.power import LIFTS, Curve, basis, lifted_power
 from uwblink.recording import check_output
 
 Floats = NDArray[np.float64]
 
 SCHEMA_VERSION: Final = 1
+GROUPED_VERSION: Final = 2
+"""A calibration with groups of tags says so by its version: whoever knows only one curve must not read it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +42,34 @@ class Applied:
 
 
 @dataclass(frozen=True, slots=True)
+class TagGroup:
+    """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""
+
+    tags: tuple[int, ...]
+    bias_curve: Curve
+    sigma_curve: Curve
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """What is known of a fit's errors: covariance matrices as tuples of rows.
+
+    `delays_ns2` (tags, tags) goes with `tags`; `bias_m2` and `sigma_m2` (m, m) go with the coefficients of the curves.
+    """
+
+    tags: tuple[int, ...]
+    delays_ns2: Matrix
+    bias_m2: Matrix
+    sigma_m2: Matrix
+
+
+@dataclass(frozen=True, slots=True)
 class Calibration:
-    """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation."""
+    """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation.
+
+    A standard error is infinite where the data did not determine the delay. With `groups`, each has its own curves, and
+    the plain ones are the groups' average, for a look only.
+    """
 
     delays_ns: dict[int, float]
     delays_std_ns: dict[int, float]
@@ -51,6 +81,8 @@ class Calibration:
     bias_curve: Curve
     sigma_curve: Curve
     provenance: dict[str, Any] = field(default_factory=dict)
+    uncertainty: Uncertainty | None = None
+    groups: dict[str, TagGroup] = field(default_factory=dict)
 
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""
@@ -76,18 +108,41 @@ class Calibration:
         return Applied(
             raw_m=ranges.raw_m,
             delays_m=delays,
-            full_m=delays - self.bias_curve(lifted),
-            sigma_m=self.sigma_curve(lifted),
+            full_m=delays - self._curve_of(ranges, lifted, "bias_curve"),
+            sigma_m=self._curve_of(ranges, lifted, "sigma_curve"),
             lifted=lifted,
             clamped=~self.bias_curve.inside(lifted),
         )
 
+    def _curve_of(self, ranges: Ranges, lifted: Floats, name: str) -> Floats:
+        if not self.groups:
+            return np.asarray(getattr(self, name)(lifted))
+        member = {tag: group for group, known in self.groups.items() for tag in known.tags}
+        lonely = [tag for tag in ranges.tags() if tag not in member]
+        if lonely:
+            raise BadInputError(f"{ranges.source}: tag {lonely[0]} is in none of the calibration's groups of tags")
+        values = np.zeros(len(ranges))
+        for known in self.groups.values():
+            share = 0.5 * np.isin(ranges.initiator, known.tags) + 0.5 * np.isin(ranges.target, known.tags)
+            rows = np.flatnonzero(share)
+            values[rows] += share[rows] * getattr(known, name)(lifted[rows])
+        return values
+
+    def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
+        """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""
+        if self.uncertainty is None:
+            return None
+        curve = self.bias_curve if which == "bias" else self.sigma_curve
+        covariance = np.array(self.uncertainty.bias_m2 if which == "bias" else self.uncertainty.sigma_m2)
+        splines = basis(np.clip(lifted, *curve.range), np.array(curve.knots))
+        return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", splines, covariance, splines), 0)))
+
     def to_json(self) -> str:
         """Return the calibration as JSON text."""
-        document = {
-            "schema_version": SCHEMA_VERSION,
+        document: dict[str, Any] = {
+            "schema_version": GROUPED_VERSION if self.groups else SCHEMA_VERSION,
             "delays_ns": {str(t): d for t, d in sorted(self.delays_ns.items())},
-            "delays_std_ns": {str(t): d for t, d in sorted(self.delays_std_ns.items())},
+            "delays_std_ns": {str(t): d if math.isfinite(d) else None for t, d in sorted(self.delays_std_ns.items())},
             "loss": self.loss,
             "scale_ns": self.scale_ns,
             "lift": self.lift,
@@ -97,7 +152,18 @@ class Calibration:
             "sigma_curve": _curve_table(self.sigma_curve),
             "provenance": self.provenance,
         }
-        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+        if self.groups:
+            document["groups"] = {
+                name: {
+                    "tags": list(group.tags),
+                    "bias_curve": _curve_table(group.bias_curve),
+                    "sigma_curve": _curve_table(group.sigma_curve),
+                }
+                for name, group in self.groups.items()
+            }
+        if self.uncertainty:
+            document["uncertainty"] = asdict(self.uncertainty)
+        return _rows_on_lines(json.dumps(document, indent=1, allow_nan=False)) + "\n"
 
     @classmethod
     def from_json(cls, text: str, where: str = "calibration") -> Self:
@@ -108,17 +174,18 @@ class Calibration:
             raise BadInputError(f"{where}: not JSON ({error})") from error
         if not isinstance(table, dict) or "schema_version" not in table:
             raise BadInputError(f"{where}: not a calibration (no schema_version)")
-        if table["schema_version"] != SCHEMA_VERSION:
+        if table["schema_version"] not in (SCHEMA_VERSION, GROUPED_VERSION):
             raise BadInputError(
-                f"{where}: schema version {table['schema_version']!r}, this uwbcal reads {SCHEMA_VERSION}"
+                f"{where}: schema version {table['schema_version']!r}, this uwbcal reads {SCHEMA_VERSION} and "
+                f"{GROUPED_VERSION}"
             )
-        read = _Reader(table, where)
+        read = Reader(table, where)
         lift = read.word("lift")
         if lift not in LIFTS:
             raise BadInputError(f"{where}: lift: found {lift!r}, allowed: {', '.join(LIFTS)}")
         return cls(
             delays_ns=read.delays("delays_ns"),
-            delays_std_ns=read.delays("delays_std_ns"),
+            delays_std_ns=read.delays("delays_std_ns", missing=math.inf),
             loss=read.word("loss"),
             scale_ns=read.number("scale_ns"),
             lift=lift,
@@ -127,6 +194,8 @@ class Calibration:
             bias_curve=read.curve("bias_curve"),
             sigma_curve=read.curve("sigma_curve"),
             provenance=read.table("provenance"),
+            uncertainty=_uncertainty(read),
+            groups=_groups(read),
         )
 
 
@@ -152,15 +221,27 @@ def save(calibration: Calibration, path: str | os.PathLike[str], *, force: bool 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
     """Write a text file by way of a neighbour that takes its name when complete."""
+    write_bytes(path, text.encode(), force=force)
+
+
+def write_bytes(path: Path, data: bytes, *, force: bool) -> None:
+    """Write a file by way of a neighbour that takes its name when complete."""
     check_output(path, force=force)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(data)
         partial.replace(path)
     except OSError as error:
         raise BadInputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _rows_on_lines(text: str) -> str:
+    """Put lists of numbers on one line each: a matrix reads as rows."""
+    return re.sub(
+        r"\[[-+.e\d,\s]+\]", lambda found: " ".join(found[0].split()).replace("[ ", "[").replace(" ]", "]"), text
+    )
 
 
 def _curve_table(curve: Curve) -> dict[str, Any]:
@@ -172,58 +253,26 @@ def _curve_table(curve: Curve) -> dict[str, Any]:
     }
 
 
-class _Reader:
-    """Takes typed values out of a table; every mistake names the key."""
+def _uncertainty(read: Reader) -> Uncertainty | None:
+    if not read.has("uncertainty"):
+        return None
+    inner = read.inside("uncertainty")
+    tags = tuple(int(tag) for tag in inner.numbers("tags"))
+    bias, sigma = (len(read.curve(name).coefficients) for name in ("bias_curve", "sigma_curve"))
+    return Uncertainty(
+        tags,
+        inner.matrix("delays_ns2", len(tags)),
+        inner.matrix("bias_m2", bias),
+        inner.matrix("sigma_m2", sigma),
+    )
 
-    def __init__(self, table: dict[str, Any], where: str) -> None:
-        self._table, self._where = table, where
 
-    def _value(self, key: str) -> Any:
-        if key not in self._table:
-            raise BadInputError(f"{self._where}: {key}: missing")
-        return self._table[key]
-
-    def _wrong(self, key: str, expected: str) -> BadInputError:
-        found = repr(self._table[key])
-        return BadInputError(f"{self._where}: {key}: found {found[:60]}, expected {expected}")
-
-    def number(self, key: str) -> float:
-        value = self._value(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self._wrong(key, "a finite number")
-        return float(value)
-
-    def word(self, key: str) -> str:
-        value = self._value(key)
-        if not isinstance(value, str):
-            raise self._wrong(key, "text")
-        return value
-
-    def table(self, key: str) -> dict[str, Any]:
-        value = self._value(key)
-        if not isinstance(value, dict):
-            raise self._wrong(key, "a table")
-        return value
-
-    def delays(self, key: str) -> dict[int, float]:
-        table = self.table(key)
-        inner = _Reader(table, f"{self._where}: {key}")
-        if not all(tag.isdecimal() and tag.isascii() for tag in table):
-            raise self._wrong(key, "tag ids as keys")
-        return {int(tag): inner.number(tag) for tag in table}
-
-    def numbers(self, key: str) -> tuple[float, ...]:
-        value = self._value(key)
-        if not isinstance(value, list) or not value:
-            raise self._wrong(key, "a list of numbers")
-        inner = _Reader({str(k): v for k, v in enumerate(value)}, f"{self._where}: {key}")
-        return tuple(inner.number(str(k)) for k in range(len(value)))
-
-    def curve(self, key: str) -> Curve:
-        inner = _Reader(self.table(key), f"{self._where}: {key}")
-        knots, coefficients = inner.numbers("knots"), inner.numbers("coefficients")
-        span, degree = inner.numbers("range"), int(inner.number("degree"))
-        fits = len(knots) == len(coefficients) + degree + 1 and 0 <= degree <= 5
-        if not fits or list(knots) != sorted(knots) or len(span) != 2 or span[0] >= span[1]:
-            raise BadInputError(f"{self._where}: {key}: knots, coefficients, degree, range do not fit")
-        return Curve(knots, coefficients, degree, (span[0], span[1]))
+def _groups(read: Reader) -> dict[str, TagGroup]:
+    if not read.has("groups"):
+        return {}
+    every, found = read.inside("groups"), {}
+    for name in read.table("groups"):
+        inner = every.inside(name)
+        tags = tuple(int(tag) for tag in inner.numbers("tags"))
+        found[name] = TagGroup(tags, inner.curve("bias_curve"), inner.curve("sigma_curve"))
+    return found

@@ -55,7 +55,8 @@ class Ranges:
 
     def tags(self) -> list[int]:
         """Return the ids of the tags that range, in order."""
-        return sorted({*np.unique(self.initiator).tolist(), *np.unique(self.target).tolist()})
+        counts = [np.bincount(ids) > 0 for ids in (self.initiator, self.target)]
+        return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
 
 
 COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted"})
@@ -126,6 +127,31 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
     )
 
 
+STATIC_S = 2.0
+STATIC_M = 0.02
+
+
+def without_static(ranges: Ranges) -> Ranges:
+    """Leave out spans of two seconds in which a pair's distance stays within two centimetres.
+
+    A flight that waits on the ground repeats one geometry, and with it one error. Raises `UnanswerableError` where
+    nothing ever moves.
+    """
+    low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
+    span = (ranges.time_ns - ranges.time_ns.min()) // int(STATIC_S * 1e9)
+    order = np.lexsort((span, high, low))
+    keys = np.column_stack([low, high, span])[order]
+    starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=keys[:1] - 1) != 0, axis=1))
+    truth = ranges.truth_m[order]
+    reach = np.maximum.reduceat(truth, starts) - np.minimum.reduceat(truth, starts)
+    moves = np.empty(len(ranges), dtype=bool)
+    moves[order] = np.repeat(reach > STATIC_M, np.diff(starts, append=len(ranges)))
+    if not moves.any():
+        raise UnanswerableError(f"{ranges.source}: nothing moves, so --trim-static leaves nothing")
+    count = int(np.count_nonzero(~moves))
+    return replace(ranges[moves], excluded=ranges.excluded | ({"static": count} if count else {}))
+
+
 def _truth(recording: Recording, exchanges: Exchanges) -> Floats:
     if np.isfinite(exchanges.truth_m).all() or not recording.count("poses"):
         return exchanges.truth_m
@@ -135,7 +161,19 @@ def _truth(recording: Recording, exchanges: Exchanges) -> Floats:
     return np.where(np.isfinite(exchanges.truth_m), exchanges.truth_m, computed)
 
 
+LOUDEST_DBM = -30.0
+FAINTEST_DBM = -140.0
+"""Powers beyond these bounds were not measured: a board that cannot tell a strong power prints 0."""
+
+
+def _powers(fpp_dbm: Floats) -> Floats:
+    """Return first-path powers (n,), NaN where the number cannot be one."""
+    with np.errstate(invalid="ignore"):
+        return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
+
+
 def _usable(ranges: Ranges, path: str | os.PathLike[str]) -> Ranges:
+    ranges = replace(ranges, fpp1_dbm=_powers(ranges.fpp1_dbm), fpp2_dbm=_powers(ranges.fpp2_dbm))
     reasons = {
         "no true distance": np.isfinite(ranges.truth_m),
         "no power": np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm),

@@ -67,7 +67,10 @@ SETTLING: Final = 4
 NEWTON_M: Final = 0.01
 """Newton's steps begin when reweighting moves no range by more than this, and may not move one further."""
 
-CHUNK: Final = 2048
+CHORD_M: Final = 1e-4
+"""Below this movement Newton's steps keep their curvature."""
+
+CHUNK: Final = 512
 """Rows of a matrix worked on at once, so that they stay in the cache."""
 
 STILL_M: Final = 1e-8
@@ -99,25 +102,28 @@ def design(ranges: Ranges, tags: list[int]) -> Floats:
     return matrix
 
 
-def check_determined(matrix: Floats, tags: list[int], initiator: Ints, target: Ints) -> None:
-    """Raise `UnanswerableError` naming the tags whose delays the pairs leave free, in groups that shift together.
+def determined(matrix: Floats, tags: list[int], initiator: Ints, target: Ints) -> tuple[Floats, list[list[int]]]:
+    """Return the directions that the rows of `matrix` (n, tags) determine, (tags, rank), and the tags left free.
 
-    `initiator` and `target` (n,) are the ids of the rows of `matrix`.
-
-    Tags that range only with tags of another group (anchors against robots, a single pair) can shift
-    by +a and -a without a trace in any range.
+    `initiator` and `target` (n,) are the ids of the rows. The free tags come in groups that shift together: tags that
+    range only with tags of another group (anchors against robots, a single pair) can shift by +a and -a without a
+    trace in any range. Where nothing is free, the directions are the tags themselves.
     """
     values, vectors = np.linalg.eigh(matrix.T @ matrix)
-    free = vectors[:, values < UNDETERMINED * values[-1]]
-    if not free.size:
-        return
-    loose = {tag for tag, row in zip(tags, free, strict=True) if np.abs(row).max() > 1e-3}
-    groups = _connected(loose, set(zip(initiator.tolist(), target.tolist(), strict=True)))
+    loose = values < UNDETERMINED * values[-1]
+    if not loose.any():
+        return np.eye(len(tags)), []
+    free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max() > 1e-3}
+    return np.asarray(vectors[:, ~loose]), _connected(free, set(zip(initiator.tolist(), target.tolist(), strict=True)))
+
+
+def undetermined(groups: list[list[int]]) -> UnanswerableError:
+    """Return the error that names groups of tags whose delays are free, and what would settle them."""
     named = "; ".join(", ".join(map(str, group)) for group in groups)
-    raise UnanswerableError(
+    return UnanswerableError(
         f"the pairs do not determine the antenna delays of tags {named}: some can grow as "
         "others shrink without changing any range; record three tags that all range with each other, or pin a known "
-        "delay with --fix TAG=NS",
+        "delay with --fix TAG=NS (--minimum-norm fits regardless, and says so)",
         groups,
     )
 
@@ -144,36 +150,45 @@ def robust_fit(
     scale: float | None = None,
     penalty: Floats | None = None,
     start: Floats | None = None,
+    blocks: Ints | None = None,
+    *,
+    near: bool = False,
 ) -> Solution:
-    """Minimise the robust loss of `aim - matrix @ x` plus x' penalty x.
+    """Minimise the robust loss of `aim - matrix @ x` plus half of x' penalty x.
 
     `matrix` (n, m) and `aim` (n,) share a unit, which is that of `scale` (estimated from the
     residuals where not given). The covariance is the sandwich H^-1 S H^-1, which holds under a heavy
-    tail where the usual one does not.
+    tail where the usual one does not. S sums the scores of each of the `blocks` (n,), numbered from 0 in the order of
+    rows, before it squares them, so errors that persist within a block do not pass for independent ones; by default
+    every row is a block of its own. `near` says that `start` is so near the optimum that Newton's steps may begin at
+    once.
     """
     ridge = np.zeros((matrix.shape[1],) * 2) if penalty is None else penalty
     x = start if start is not None else _absolute_start(matrix, aim, ridge)
     function = LOSSES[loss]
     reach = np.abs(matrix).max(axis=0)
     residual = aim - matrix @ x
-    width = scale or _scale(residual)
-    steps, moved = 0, np.inf
+    width = scale or scale_of(residual)
+    steps, moved, curvature = 0, 0.5 * NEWTON_M if near else np.inf, None
     while moved > STILL_M and steps < MAX_STEPS:
         weight, slope = function(residual / width)
         gradient = matrix.T @ (weight * residual) - ridge @ x
-        # Reweighting descends from anywhere; Newton is faster, where it descends at all.
-        step = _newton(matrix, slope, ridge, gradient) if steps >= SETTLING and moved < NEWTON_M else None
+        # Reweighting descends from anywhere; Newton is faster, where it descends at all. Near the end the curvature no
+        # longer changes, and the last one serves on.
+        if (near or steps >= SETTLING) and moved < NEWTON_M and (curvature is None or moved > CHORD_M):
+            curvature = _descending(_normal(matrix, slope, ridge))
+        step = None if curvature is None else np.linalg.solve(curvature, gradient)
         if step is None or np.max(np.abs(reach * step)) > NEWTON_M:
-            step = np.asarray(np.linalg.lstsq(_normal(matrix, weight, ridge), gradient, rcond=1e-13)[0])
+            step, curvature = np.linalg.lstsq(_normal(matrix, weight, ridge), gradient, rcond=1e-13)[0], None
         x = np.asarray(x + step)
         residual = aim - matrix @ x
         moved = float(np.max(np.abs(reach * step)))
         steps += 1
         if scale is None and steps <= SETTLING:
-            width = _scale(residual)
+            width = scale_of(residual)
     return Solution(
         x,
-        _sandwich(matrix, residual, function, width, ridge),
+        sandwich(matrix, residual, function, width, ridge, blocks),
         residual,
         width,
         steps,
@@ -181,17 +196,14 @@ def robust_fit(
     )
 
 
-def _newton(matrix: Floats, slope: Floats, ridge: Floats, gradient: Floats) -> Floats | None:
-    """Return Newton's step, None where the loss is not convex."""
-    curvature = _normal(matrix, slope, ridge)
+def _descending(curvature: Floats) -> Floats | None:
+    """Return a curvature, None where the loss is not convex, so that Newton's step might climb."""
     values = np.linalg.eigvalsh(curvature)
-    if values[0] <= 1e-10 * values[-1]:
-        return None
-    return np.asarray(np.linalg.solve(curvature, gradient))
+    return None if values[0] <= 1e-10 * values[-1] else curvature
 
 
-def _scale(residual: Floats) -> float:
-    """The loss's scale from the median absolute deviation of residuals in metres."""
+def scale_of(residual: Floats) -> float:
+    """Return the loss's scale from the median absolute deviation of residuals in metres."""
     spread = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
     return max(SCALE_OF_SPREAD * spread, SCALE_FLOOR_NS * 1e-9 * SPEED_OF_LIGHT)
 
@@ -217,8 +229,56 @@ def _normal(matrix: Floats, weight: Floats, ridge: Floats) -> Floats:
     return normal
 
 
-def _sandwich(matrix: Floats, residual: Floats, function: Loss, width: float, ridge: Floats) -> Floats:
+@dataclass(frozen=True, slots=True)
+class Local:
+    """A robust loss near a point, as a quadratic: curvature (m, m), pull (m,), and the variance an error counts for.
+
+    `dispersion` is the mean squared score over the mean slope of the score: sigma squared for least squares.
+    """
+
+    curvature: Floats
+    pull: Floats
+    dispersion: float
+
+
+def local(matrix: Floats, residual: Floats, loss: str, width: float) -> Local:
+    """Return the quadratic that a loss looks like at `residual` (n,)."""
+    weight, slope = LOSSES[loss](residual / width)
+    score = weight * residual
+    nothing = np.zeros((matrix.shape[1],) * 2)
+    return Local(
+        _normal(matrix, slope, nothing),
+        matrix.T @ score,
+        float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope)),
+    )
+
+
+def sandwich(
+    matrix: Floats, residual: Floats, function: Loss, width: float, ridge: Floats, blocks: Ints | None = None
+) -> Floats:
+    """Return the covariance of parameters at the optimum, where `residual` (n,) is what is left.
+
+    The penalty counts as what is known beforehand (Wahba 1983; Nychka 1988), so that bands of a penalised curve hold
+    its bias too.
+    """
     weight, slope = function(residual / width)
     bread = np.linalg.pinv(_normal(matrix, slope, ridge), rcond=1e-12)
-    score = matrix * (weight * residual)[:, None]
-    return np.asarray(bread @ (score.T @ score) @ bread)
+    score = weight * residual
+    dispersion = float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope))
+    meat = summed_squares(matrix, score, blocks) + dispersion * ridge
+    return np.asarray(bread @ meat @ bread)
+
+
+def summed_squares(matrix: Floats, score: Floats, blocks: Ints | None) -> Floats:
+    """Return the sum over blocks of the outer square of the block's summed score, (m, m)."""
+    columns = matrix.shape[1]
+    if blocks is None:
+        return _normal(matrix, score**2, np.zeros((columns, columns)))
+    count = int(blocks[-1]) + 1
+    sums = np.zeros((count, columns))
+    for begin in range(0, len(matrix), CHUNK):
+        some = blocks[begin : begin + CHUNK]
+        starts = np.flatnonzero(np.diff(some, prepend=-1))
+        part = matrix[begin : begin + CHUNK] * score[begin : begin + CHUNK, None]
+        sums[some[starts]] += np.add.reduceat(part, starts)
+    return np.asarray(sums.T @ sums) * (count / max(count - 1, 1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.calibration import Applied, Calibration
 from calib.dataset import Ranges
-from calib.evaluation import STAGES, pair_rows
+from calib.evaluation import STAGES, beside_planted, pair_rows, planted_curve
 from uwblink.ticks import SPEED_OF_LIGHT
 
 Floats = NDArray[np.float64]
@@ -38,7 +37,7 @@ def histogram(ranges: Ranges, applied: Applied) -> Figure:
     names = [f"{t:.0f}" for t in ticks]
     names[0], names[-1] = f"≤ {names[0]}", f"≥ {names[-1]}"
     axes.set_xticks(ticks, names)
-    _label(axes, "range error (cm)", "exchanges")
+    label(axes, "range error (cm)", "exchanges")
     axes.legend(frameon=False)
     return figure
 
@@ -49,12 +48,14 @@ def bias_over_power(ranges: Ranges, applied: Applied, calibration: Calibration) 
     figure = _over_power(ranges, applied, error, np.median)
     axes = figure.axes[0]
     grid = np.linspace(*calibration.bias_curve.range, 300)
+    _band(axes, grid, 100 * calibration.bias_curve(grid), calibration.band(grid, "bias"))
     axes.plot(grid, 100 * calibration.bias_curve(grid), color=COLOURS["full"], lw=2.2, label="fitted")
     planted = planted_curve(ranges, "bias_curve", grid)
     if planted is not None:
-        shift = common_shift_ns(ranges, calibration) * 1e-9 * SPEED_OF_LIGHT
+        beside = beside_planted(ranges, applied, calibration)
+        shift = beside.shift_ns * 1e-9 * SPEED_OF_LIGHT if beside else 0.0
         axes.plot(grid, 100 * (planted + shift), "--", color=COLOURS["planted"], lw=2.2, label="planted")
-    _label(axes, "lifted first-path power", "bias (cm)")
+    label(axes, "lifted first-path power", "bias (cm)")
     axes.legend(frameon=False)
     return figure
 
@@ -65,12 +66,13 @@ def sigma_over_power(ranges: Ranges, applied: Applied, calibration: Calibration)
     figure = _over_power(ranges, applied, error, _robust_std)
     axes = figure.axes[0]
     grid = np.linspace(*calibration.sigma_curve.range, 300)
+    _band(axes, grid, 100 * calibration.sigma_curve(grid), calibration.band(grid, "sigma"))
     axes.plot(grid, 100 * calibration.sigma_curve(grid), color=COLOURS["full"], lw=2.2, label="fitted")
     planted = planted_curve(ranges, "sigma_curve", grid)
     if planted is not None:
         axes.plot(grid, 100 * planted, "--", color=COLOURS["planted"], lw=2.2, label="planted")
     axes.set_ylim(bottom=0)
-    _label(axes, "lifted first-path power", "standard deviation (cm)")
+    label(axes, "lifted first-path power", "standard deviation (cm)")
     axes.legend(frameon=False)
     return figure
 
@@ -99,32 +101,6 @@ def over_time(ranges: Ranges, applied: Applied) -> Figure:
     return figure
 
 
-def png(figure: Figure) -> bytes:
-    """Return a figure as a PNG picture."""
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=130)
-    return data.getvalue()
-
-
-def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
-    """Return a curve that the simulation planted, at lifted powers, or None."""
-    from scipy.interpolate import BSpline
-
-    curve: dict[str, Any] | None = (ranges.planted or {}).get(which)
-    if not curve:
-        return None
-    knots, degree = np.array(curve["knots"], dtype=float), int(curve["degree"])
-    spline = BSpline(knots, np.array(curve["coefficients"], dtype=float), degree)
-    return np.asarray(spline(np.clip(lifted, knots[degree], knots[-1 - degree])))
-
-
-def common_shift_ns(ranges: Ranges, calibration: Calibration) -> float:
-    """Mean of fitted minus planted delays: the part that a constant in the curve makes up for."""
-    planted = (ranges.planted or {}).get("delays_ns", {})
-    known = [calibration.delays_ns[int(t)] - d for t, d in planted.items() if int(t) in calibration.delays_ns]
-    return float(np.mean(known)) if known else 0.0
-
-
 def _over_power(ranges: Ranges, applied: Applied, values: Floats, summary: Any) -> Figure:
     figure = Figure(figsize=WIDE, layout="constrained")
     axes = figure.subplots()
@@ -134,6 +110,13 @@ def _over_power(ranges: Ranges, applied: Applied, values: Floats, summary: Any) 
     everything = _binned(applied.lifted, values, summary)
     axes.plot(*everything, "o", color="0.2", ms=4, label="all pairs")
     return figure
+
+
+def _band(axes: Axes, grid: Floats, middle: Floats, std_m: Floats | None) -> None:
+    if std_m is not None:
+        axes.fill_between(
+            grid, middle - 196 * std_m, middle + 196 * std_m, color=COLOURS["full"], alpha=0.25, lw=0, label="95 % band"
+        )
 
 
 def _binned(x: Floats, y: Floats, summary: Any) -> tuple[Floats, Floats]:
@@ -148,7 +131,8 @@ def _robust_std(values: Floats) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def _label(axes: Axes, x: str, y: str) -> None:
+def label(axes: Axes, x: str, y: str) -> None:
+    """Name the axes, and take away what carries nothing."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.grid(alpha=0.25)

@@ -10,69 +10,41 @@ centre of the core of the calibrated errors at zero: the core is told from the t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 import uwblink
-from calib.calibration import Calibration
+from calib.calibration import Calibration, TagGroup, Uncertainty
+from calib.caveats import warnings_of
 from calib.dataset import Ranges
-from calib.delays import Solution, check_determined, design, robust_fit
-from calib.errors import BadInputError, UnanswerableError
+from calib.json_reader import Matrix
 from calib.mixture import take_apart
-from calib.mixture_fit import refine
-from calib.power import (
-    ALPHA_DBM,
-    BIAS_SEGMENTS,
-    DEGREE,
-    Curve,
-    basis,
-    equal_bins,
-    knots_for,
-    lifted_power,
-    populated,
-    roughness,
-    sigma_curve,
-)
+from calib.power import ALPHA_DBM, DEGREE, Curve
+from calib.problem import Problem, state
+from calib.sigma import fit_sigma
+from calib.solve import MIXTURE, Solved, solve
 from uwblink.ticks import SPEED_OF_LIGHT
+
+__all__ = ["MIXTURE", "FitResult", "fit"]
 
 Floats = NDArray[np.float64]
 
-FEWEST: Final = 100
-SMOOTHNESS: Final = 1e-4
 INLIER_SIGMAS: Final = 3.0
-MIXTURE: Final = "mixture"
-"""The loss that is no loss of residuals: the likelihood of `calib.mixture_fit`, begun from a Cauchy fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class FitResult:
-    """A calibration and how it came about; residuals are full-corrected errors (n,), metres."""
+    """A calibration and how it came about; residuals are full-corrected errors (n,), metres, in order of time."""
 
     calibration: Calibration
     residuals_m: Floats
     inliers: NDArray[np.bool_]
     success: bool
     message: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Problem:
-    """A fit as linear algebra: residuals `error + design @ x` (n,), x = delays of `tags`, then spline coefficients.
-
-    The splines are less their average over the range, so that a constant is left to the delays. What pinned tags add
-    is in `error` already.
-    """
-
-    tags: list[int]
-    error: Floats
-    design: Floats
-    lifted: Floats
-    knots: Floats
-    averages: Floats
-    penalty: Floats
+    warnings: list[str]
 
 
 def fit(
@@ -83,125 +55,127 @@ def fit(
     lift: str = "mean-of-lifted",
     alpha_dbm: float = ALPHA_DBM,
     fixed_ns: Mapping[int, float] | None = None,
+    groups: Mapping[str, tuple[int, ...]] | None = None,
+    sequential: bool = False,
+    minimum_norm: bool = False,
 ) -> FitResult:
     """Fit a calibration to ranges with known truth.
 
     `scale_ns` is the scale of the robust loss in time of flight, estimated from the data by default; `fixed_ns` are
-    delays that are known. Raises `UnanswerableError` when there are too few ranges, their power does not vary, or the
-    pairs do not determine the delays, and `BadInputError` for a pinned tag that is not in the data.
+    delays that are known; `groups` name tags that share a curve (by default all do). `sequential` is the recipe of ICRA
+    2023, section V: delays first, then the curve on what they leave. `minimum_norm` fits even where the pairs leave
+    delays free, with the smallest ones that agree with the data. Raises `UnanswerableError` when there are too few
+    ranges, their power does not vary, or the pairs do not determine the delays, and `BadInputError` for pinned tags or
+    groups that are not in the data.
     """
     fixed = dict(fixed_ns or {})
-    problem = _problem(ranges, lift, alpha_dbm, fixed)
-    found = _solve(problem, loss, None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT)
-    delays, shape = np.split(found.parameters, [len(problem.tags)])
-    core, bins = problem.error + problem.design @ found.parameters, equal_bins(problem.lifted)
-    makeup = take_apart(core, bins, int(bins.max()) + 1)
-    sigma = sigma_curve(problem.lifted, bins, makeup.sigma_m)
-    constant, shift_ns = _gauge(makeup.location_m, pinned=bool(fixed))
-    coefficients = shape - problem.averages @ shape + constant
-    inliers = np.abs(core - makeup.location_m) < INLIER_SIGMAS * sigma(problem.lifted)
-    std_ns = np.sqrt(np.diag(found.covariance)[: len(problem.tags)])
+    problem = state(ranges, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups or {}, minimum_norm=minimum_norm)
+    found = solve(problem, loss, None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT, sequential=sequential)
+    core = problem.error + problem.design @ found.parameters
+    makeup = take_apart(core, problem.bins.number, len(problem.bins.count))
+    sigma = fit_sigma(problem, core - makeup.location_m, makeup)
+    delays = problem.directions @ found.parameters[: problem.rank]
+    # The centre of the core goes into a constant of the curve if delays are pinned, else into the delays.
+    constant = makeup.location_m if fixed else 0.0
+    shift_ns = 0.0 if fixed else -makeup.location_m / SPEED_OF_LIGHT * 1e9
+    biases = _bias_curves(problem, found, constant)
+    std = _standard_errors(problem, found)
+    covariance = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
     calibration = Calibration(
         delays_ns=dict(zip(problem.tags, (delays + shift_ns).tolist(), strict=True)) | fixed,
-        delays_std_ns=dict(zip(problem.tags, std_ns.tolist(), strict=True)) | dict.fromkeys(fixed, 0.0),
+        delays_std_ns=dict(zip(problem.tags, std.tolist(), strict=True)) | dict.fromkeys(fixed, 0.0),
         loss=loss,
         scale_ns=found.scale / SPEED_OF_LIGHT * 1e9,
         lift=lift,
         alpha_dbm=alpha_dbm,
         speed_of_light=SPEED_OF_LIGHT,
-        bias_curve=Curve(
-            tuple(problem.knots.tolist()), tuple(coefficients.tolist()), DEGREE, populated(problem.lifted)
+        bias_curve=_average(list(biases.values())),
+        sigma_curve=_average(list(sigma.curves.values())),
+        uncertainty=Uncertainty(
+            tuple(problem.tags), _rows(covariance), _rows(_bias_covariance(problem, found)), _rows(sigma.covariance)
         ),
-        sigma_curve=sigma,
-        provenance=_provenance(ranges, inliers, fixed),
-    )
+        groups={
+            name: TagGroup(tuple(groups[name]), biases[name], sigma.curves[name]) for name in problem.groups
+        } if groups else {},
+    )  # fmt: skip
+    applied = calibration.apply(ranges)
+    residuals = applied.full_m - ranges.truth_m
+    inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
+    warnings = warnings_of(ranges, applied, float(np.mean(inliers)), problem.free)
+    provenance = _provenance(ranges, inliers, fixed, sequential, problem, warnings)
     return FitResult(
-        calibration,
-        calibration.apply(ranges).full_m - ranges.truth_m,
+        _with_provenance(calibration, provenance),
+        residuals,
         inliers,
         found.success,
         f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
+        warnings,
     )
 
 
-def _problem(ranges: Ranges, lift: str, alpha_dbm: float, fixed: dict[int, float]) -> _Problem:
-    if len(ranges) < FEWEST:
-        raise UnanswerableError(
-            f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST} are needed"
-        )
-    lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
-    low, high = populated(lifted)
-    if not high - low > 1e-6:
-        raise UnanswerableError(
-            f"{ranges.source}: the first-path power never changes, so no curve over power can be fitted"
-        )
-    everyone = ranges.tags()
-    unknown = sorted(set(fixed) - set(everyone))
-    if unknown:
-        raise BadInputError(f"--fix: found tag {unknown[0]}, the tags are {', '.join(map(str, everyone))}")
-    tags = [tag for tag in everyone if tag not in fixed]
-    if not tags:
-        raise BadInputError("--fix: every tag is pinned, so no delay is left to fit")
-    matrix = design(ranges, everyone)
-    free = np.array([tag not in fixed for tag in everyone])
-    check_determined(matrix[:, free], tags, ranges.initiator, ranges.target)
-    known = matrix[:, ~free] @ np.array([fixed[tag] for tag in everyone if tag in fixed])
-    knots = knots_for(lifted, BIAS_SEGMENTS)
-    splines = basis(lifted, knots)
-    # The integral of a B-spline is its coefficients times a quarter of each one's span.
-    averages = (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (high - low)
-    return _Problem(
-        tags,
-        ranges.raw_m - ranges.truth_m + known,
-        np.hstack([matrix[:, free], averages - splines]),
-        lifted,
-        knots,
-        averages,
-        _penalty(len(tags), splines.shape[1], len(ranges)),
-    )
+def _bias_curves(problem: Problem, found: Solved, constant: float) -> dict[str, Curve]:
+    knots = tuple(problem.knots.tolist())
+    curves = {}
+    for name, columns in problem.curves():
+        shape = found.parameters[columns]
+        curves[name] = Curve(knots, tuple((shape - problem.averages @ shape + constant).tolist()), DEGREE, problem.span)
+    return curves
 
 
-def _solve(problem: _Problem, loss: str, scale_m: float | None) -> Solution:
-    """Delays alone first, for a start that the curve cannot lead astray; then both; then the mixture, if asked for."""
-    robust = "cauchy" if loss == MIXTURE else loss
-    count = len(problem.tags)
-    alone = robust_fit(problem.design[:, :count], -problem.error, robust, scale_m)
-    start = np.concatenate([alone.parameters, np.zeros(problem.design.shape[1] - count)])
-    joint = robust_fit(problem.design, -problem.error, robust, scale_m, penalty=problem.penalty, start=start)
-    if loss != MIXTURE:
-        return joint
-    likely = refine(problem.design, problem.error, joint.parameters, problem.penalty, equal_bins(problem.lifted))
-    return replace(
-        joint,
-        parameters=likely.parameters,
-        covariance=likely.covariance,
-        steps=joint.steps + likely.steps,
-        success=likely.success,
-    )
+def _standard_errors(problem: Problem, found: Solved) -> Floats:
+    """Standard errors of the delays (tags,) in ns, infinite where the data leave one free."""
+    part = found.covariance[: problem.rank, : problem.rank]
+    std = np.sqrt(np.maximum(np.diag(problem.directions @ part @ problem.directions.T), 0))
+    free = {tag for group in problem.free for tag in group}
+    return np.where([tag in free for tag in problem.tags], np.inf, std)
 
 
-def _gauge(location_m: float, *, pinned: bool) -> tuple[float, float]:
-    """Where the centre of the core goes: into a constant of the curve (m) if delays are pinned, else into them (ns)."""
-    if pinned:
-        return location_m, 0.0
-    return 0.0, -location_m / SPEED_OF_LIGHT * 1e9
+def _bias_covariance(problem: Problem, found: Solved) -> Floats:
+    """Covariance of the coefficients of the plain curve, which is the groups' average, less its own average."""
+    each = len(problem.averages)
+    average = np.zeros((each, len(found.parameters)))
+    for _, columns in problem.curves():
+        average[:, columns] = np.eye(each) / len(problem.groups)
+    centred = (np.eye(each) - np.outer(np.ones(each), problem.averages)) @ average
+    return np.asarray(centred @ found.covariance @ centred.T)
 
 
-def _penalty(tags: int, coefficients: int, count: int) -> Floats:
-    """Smoothness of the curve; its constant, which the delays carry, is held at zero."""
-    penalty = np.zeros((tags + coefficients,) * 2)
-    smooth = SMOOTHNESS * roughness(coefficients) + 1e-9 * np.eye(coefficients)
-    penalty[tags:, tags:] = count / coefficients * smooth
-    return penalty
+def _average(curves: list[Curve]) -> Curve:
+    """Return the mean of curves over the same knots."""
+    mean = np.mean([curve.coefficients for curve in curves], axis=0)
+    return Curve(curves[0].knots, tuple(mean.tolist()), curves[0].degree, curves[0].range)
 
 
-def _provenance(ranges: Ranges, inliers: NDArray[np.bool_], fixed: dict[int, float]) -> dict[str, Any]:
-    pinned = {"fixed_ns": {str(tag): delay for tag, delay in sorted(fixed.items())}} if fixed else {}
-    return pinned | {
+def _rows(matrix: Floats) -> Matrix:
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def _with_provenance(calibration: Calibration, provenance: dict[str, Any]) -> Calibration:
+    calibration.provenance.update(provenance)
+    return calibration
+
+
+def _provenance(
+    ranges: Ranges,
+    inliers: NDArray[np.bool_],
+    fixed: dict[int, float],
+    sequential: bool,
+    problem: Problem,
+    warnings: list[str],
+) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    if fixed:
+        found["fixed_ns"] = {str(tag): delay for tag, delay in sorted(fixed.items())}
+    if problem.free:
+        found["undetermined"] = problem.free
+    return found | {
         "writer": f"uwbcal {uwblink.__version__}",
         "recordings": ranges.source.split(", "),
         "exchanges": len(ranges),
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,
+        "recipe": "sequential" if sequential else "joint",
+        "standard_errors": f"sandwich over {int(problem.blocks[-1]) + 1} blocks of time",
+        "warnings": warnings,
         "gauge": "average of the bias curve over its range is zero; the delays carry the constant",
     }

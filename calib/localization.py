@@ -47,11 +47,15 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """How one filter did: times (n,), estimates and truth (n, 3), normalised errors, and what was refused."""
+    """How one filter did: times (n,), estimates and truth (n, 3), normalised errors, and what was refused.
+
+    `std_m` (n,) is the filter's own opinion of its error: the root of the sum of its three variances.
+    """
 
     time_ns: Ints
     estimate_m: Floats
     truth_m: Floats
+    std_m: Floats
     nis: Floats
     nees: Floats
     accepted: NDArray[np.bool_]
@@ -139,7 +143,7 @@ def _filter(problem: _Problem, measured_m: Floats, std_m: Floats, settings: Sett
     variance = std_m**2
     x = problem.place[0] + rng.normal(size=3) * settings.initial_std_m
     p = np.eye(3) * settings.initial_std_m**2
-    estimate, nis, nees = np.empty((count, 3)), np.empty(count), np.empty(count)
+    estimate, nis, nees, opinion = np.empty((count, 3)), np.empty(count), np.empty(count), np.empty(count)
     accepted, refused = np.zeros(count, dtype=bool), 0
     eye = np.eye(3)
     for k in range(count):
@@ -161,9 +165,10 @@ def _filter(problem: _Problem, measured_m: Floats, std_m: Floats, settings: Sett
             if refused >= settings.reopen:
                 p, refused = p + eye * settings.initial_std_m**2, 0
         estimate[k] = x
+        opinion[k] = p[0, 0] + p[1, 1] + p[2, 2]
         wrong = x - problem.place[k]
         nees[k] = wrong @ np.linalg.solve(p, wrong)
-    return Track(problem.time_ns, estimate, problem.place, nis, nees, accepted)
+    return Track(problem.time_ns, estimate, problem.place, np.sqrt(opinion), nis, nees, accepted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,12 +176,19 @@ class Summary:
     """Over all bodies of all recordings: mean RMSE by stage, its reduction, mean NIS and NEES of the last stage.
 
     `nis` is over accepted ranges, of which a gate at 99.9 % leaves 0.99; `nees` should be 3, a state's dimension.
+    `nis_bounds` and `nees_bounds` hold 95 % of such means if the filter is consistent: chi-square over the number of
+    independent values (Bar-Shalom, Li and Kirubarajan 2001, section 5.4), where a NEES counts once in the time that the
+    error takes to forget. `nis_inside` and `nees_inside` are the shares of single values within their 95 % bounds.
     """
 
     rmse_m: dict[str, float]
     reduction: dict[str, float]
     nis: float
+    nis_bounds: tuple[float, float]
+    nis_inside: float
     nees: float
+    nees_bounds: tuple[float, float]
+    nees_inside: float
     accepted: float
 
 
@@ -184,13 +196,49 @@ def summarize(found: list[Localization]) -> Summary:
     """Average over bodies and recordings, each counting the same, as in the paper."""
     rmse = {stage: float(np.mean([one.tracks[stage].rmse_m for one in found])) for stage in STAGES}
     last = [one.tracks["variance"] for one in found]
+    nis = np.concatenate([track.nis[track.accepted] for track in last])
+    nees = np.concatenate([track.nees for track in last])
     return Summary(
         rmse,
         {stage: 1 - rmse[stage] / rmse["raw"] for stage in STAGES[1:]},
-        float(np.mean([np.mean(track.nis[track.accepted]) for track in last])),
-        float(np.mean([np.mean(track.nees) for track in last])),
+        float(np.mean(nis)),
+        _bounds(len(nis), 1),
+        _inside(nis, 1),
+        float(np.mean(nees)),
+        _bounds(sum(_independent(track.nees) for track in last), 3),
+        _inside(nees, 3),
         float(np.mean([np.mean(track.accepted) for track in last])),
     )
+
+
+def _bounds(count: float, degrees: int) -> tuple[float, float]:
+    """Bounds that hold the mean of `count` independent chi-squares with 95 %."""
+    from scipy.stats import chi2
+
+    some = max(count, 1.0)
+    return float(chi2.ppf(0.025, some * degrees) / some), float(chi2.ppf(0.975, some * degrees) / some)
+
+
+def _inside(values: Floats, degrees: int) -> float:
+    from scipy.stats import chi2
+
+    low, high = float(chi2.ppf(0.025, degrees)), float(chi2.ppf(0.975, degrees))
+    return float(np.mean((values >= low) & (values <= high)))
+
+
+def _independent(values: Floats) -> float:
+    """Return how many independent values a correlated series is worth: n over the sum of its autocorrelations.
+
+    The sum ends where the autocorrelation first falls below a twentieth.
+    """
+    centred = values - values.mean()
+    size = 1 << int(2 * len(centred) - 1).bit_length()
+    power = np.abs(np.fft.rfft(centred, size)) ** 2
+    correlation = np.fft.irfft(power, size)[: len(centred)]
+    correlation = correlation / max(float(correlation[0]), 1e-300)
+    small = np.flatnonzero(correlation < 0.05)
+    end = int(small[0]) if len(small) else len(centred)
+    return len(centred) / (1 + 2 * float(correlation[1:end].sum()))
 
 
 def as_tum(track: Track) -> str:

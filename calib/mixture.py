@@ -82,8 +82,11 @@ def expect(error_m: Floats, sigma_m: Floats, makeup: Makeup, stray_density: floa
     return Expected(core / total, tail / total, stray / total, noise, noise**2 + spread, total)
 
 
-def take_apart(error_m: Floats, bins: Ints, count: int) -> Makeup:
-    """Return the make-up of errors (n,) whose bins (n,) number 0 to `count` - 1; at least 3 errors a bin."""
+def take_apart(error_m: Floats, bins: Ints, count: int, near: Makeup | None = None) -> Makeup:
+    """Return the make-up of errors (n,) whose bins (n,) number 0 to `count` - 1; at least 3 errors a bin.
+
+    `near` is a make-up that is near the truth already, if there is one.
+    """
     median = float(np.median(error_m))
     spread = max(1.4826 * float(np.median(np.abs(error_m - median))), 1e-9)
     edges = np.arange(-REACH_BELOW, REACH_ABOVE, 1 / CELLS_A_SIGMA) * spread + median
@@ -94,14 +97,16 @@ def take_apart(error_m: Floats, bins: Ints, count: int) -> Makeup:
     counts = np.bincount(flat, minlength=count * len(middle)).reshape(count, len(middle)).astype(np.float64)
     beyond = float(np.count_nonzero(~inside))
     span = max(float(edges[-1]), float(error_m.max())) - min(float(edges[0]), float(error_m.min()))
-    return _maximise(middle, counts, beyond, spread, 1 / span)
+    return _maximise(middle, counts, beyond, spread, 1 / span, near)
 
 
-def _maximise(middle: Floats, counts: Floats, beyond: float, spread: float, density: float) -> Makeup:
+def _maximise(
+    middle: Floats, counts: Floats, beyond: float, spread: float, density: float, near: Makeup | None
+) -> Makeup:
     """Iterate to the likeliest make-up of counts (bins, cells); `beyond` errors are stray for certain."""
     total = float(counts.sum()) + beyond
     start = float(np.sum(counts.sum(axis=0) * middle) / counts.sum())
-    makeup = Makeup(min(start, middle[len(middle) // 4]), np.full(len(counts), spread), 0.1, 4 * spread, 0.001)
+    makeup = near or Makeup(min(start, middle[len(middle) // 4]), np.full(len(counts), spread), 0.1, 4 * spread, 0.001)
     for _ in range(ITERATIONS):
         sigma = makeup.sigma_m[:, None]
         e = middle[None, :] - makeup.location_m
@@ -120,7 +125,7 @@ def _maximise(middle: Floats, counts: Floats, beyond: float, spread: float, dens
             makeup.location_m + float(moved),
             width,
             tail_sum / total,
-            max(tau, SHORTEST_TAIL * float(np.median(width))),
+            max(tau, SHORTEST_TAIL * float(np.sort(width)[len(width) // 2])),
             max((float(np.sum(counts * x.stray)) + beyond) / total, 1e-6),
         )
         still = abs(float(moved)) < SETTLED * spread and np.all(np.abs(width - makeup.sigma_m) < 10 * SETTLED * spread)

@@ -13,13 +13,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.mixture import Expected, Makeup, expect, take_apart
+from calib.delays import summed_squares
+from calib.mixture import Makeup, expect, take_apart
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-ROUNDS: Final = 12
-STEPS_A_ROUND: Final = 4
+ROUNDS: Final = 20
+STEPS_A_ROUND: Final = 2
 STILL_M: Final = 1e-6
 
 
@@ -34,45 +35,47 @@ class MixtureFit:
     success: bool
 
 
-def refine(matrix: Floats, error: Floats, start: Floats, ridge: Floats, bins: Ints) -> MixtureFit:
+def refine(
+    matrix: Floats, error: Floats, start: Floats, ridge: Floats, bins: Ints, blocks: Ints | None = None
+) -> MixtureFit:
     """Improve parameters x of residuals `error + matrix @ x` (n,), metres, from a robust `start`.
 
-    `ridge` (m, m) is a penalty in the unit of counts, as for `robust_fit`; `bins` (n,) number the bins of power. The
-    covariance is the inverse of the sum of squared scores (Berndt, Hall, Hall, Hausman 1974).
+    `ridge` (m, m) is the inverse covariance of what is known of x beforehand, in 1/m^2; `bins` (n,) number the bins of
+    power, `blocks` (n,) the spans of time within which errors may persist. The covariance is the inverse of the sum of
+    squared scores (Berndt, Hall, Hall, Hausman 1974), widened to a sandwich by the scores summed over blocks.
     """
     x, count = start.copy(), int(bins.max()) + 1
-    span = float(np.ptp(error)) + 1e-9
+    density = 1 / (float(np.ptp(error)) + 1e-9)
     steps, moved = 0, np.inf
     reach = np.abs(matrix).max(axis=0)
+    makeup = take_apart(error + matrix @ x, bins, count)
     for _ in range(ROUNDS):
-        makeup = take_apart(error + matrix @ x, bins, count)
-        sigma = makeup.sigma_m[bins]
-        scale = float(np.median(makeup.sigma_m)) ** 2
-        begin = x
+        begin, precision = x, 1 / makeup.sigma_m[bins] ** 2
+        # Fisher's scoring: the information of a range is its precision times a share that all have in common, so one
+        # matrix serves all steps of a round.
+        information = _weighted_square(matrix, precision)
         for _ in range(STEPS_A_ROUND):
-            residual = error + matrix @ x - makeup.location_m
-            found = expect(residual, sigma, makeup, 1 / span)
-            noise, weight = _noise(residual, found, sigma)
-            # The penalty counts ranges; here they are weighed by their precision.
-            normal = (matrix * weight[:, None]).T @ matrix + ridge / scale
-            step = np.linalg.lstsq(normal, -(matrix.T @ (weight * noise)) - ridge @ x / scale, rcond=1e-13)[0]
-            x = x + step
+            score = _score(error + matrix @ x, bins, makeup, density)
+            share = float(np.sum(score**2) / np.sum(precision))
+            x = x + np.linalg.lstsq(share * information + ridge, -(matrix.T @ score) - ridge @ x, rcond=1e-13)[0]
             steps += 1
         moved = float(np.max(reach * np.abs(x - begin)))
+        makeup = take_apart(error + matrix @ x, bins, count, makeup)
         if moved < STILL_M:
             break
-    makeup = take_apart(error + matrix @ x, bins, count)
-    residual = error + matrix @ x - makeup.location_m
-    sigma = makeup.sigma_m[bins]
-    noise, weight = _noise(residual, expect(residual, sigma, makeup, 1 / span), sigma)
-    score = matrix * (weight * noise)[:, None]
-    scale = float(np.median(makeup.sigma_m)) ** 2
-    covariance = np.linalg.pinv(score.T @ score + ridge / scale, rcond=1e-12)
+    score = _score(error + matrix @ x, bins, makeup, density)
+    bread = np.linalg.pinv(summed_squares(matrix, score, None) + ridge, rcond=1e-12)
+    covariance = bread @ (summed_squares(matrix, score, blocks) + ridge) @ bread
     return MixtureFit(x, np.asarray(covariance), makeup, steps, moved < 100 * STILL_M)
 
 
-def _noise(residual: Floats, found: Expected, sigma: Floats) -> tuple[Floats, Floats]:
-    """Return the noise expected in each residual, and its weight: the share that is not stray, over the variance."""
-    share = np.maximum(found.core + found.tail, 1e-12)
-    noise = (found.core * residual + found.tail * found.noise) / share
-    return noise, share / sigma**2
+def _score(residual: Floats, bins: Ints, makeup: Makeup, density: float) -> Floats:
+    """Slope of the log likelihood of each residual: the noise expected in it, by its share in the core and the tail."""
+    sigma = makeup.sigma_m[bins]
+    centred = residual - makeup.location_m
+    found = expect(centred, sigma, makeup, density)
+    return np.asarray((found.core * centred + found.tail * found.noise) / sigma**2)
+
+
+def _weighted_square(matrix: Floats, weight: Floats) -> Floats:
+    return summed_squares(matrix, np.sqrt(weight), None)

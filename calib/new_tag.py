@@ -47,7 +47,7 @@ def add_tag(ranges: Ranges, calibration: Calibration, tag: int, loss: str = "cau
     found = robust_fit(mine[:, None], -error, loss, start=start)
     core = error + mine * found.parameters[0]
     bins = equal_bins(applied.lifted)
-    delay = float(found.parameters[0] - take_apart(core, bins, int(bins.max()) + 1).location_m / np.mean(mine))
+    delay = float(found.parameters[0] - take_apart(core, bins.number, len(bins.count)).location_m / np.mean(mine))
     added = {"tag": tag, "recording": ranges.source, "exchanges": int(np.count_nonzero(useful))}
     return replace(
         calibration,

@@ -1,36 +1,61 @@
-"""The report: one HTML file with everything in it, readable on a screen, a phone and on paper."""
+"""The reports: of an evaluation, and of a whole campaign from recordings to localization."""
 
 from __future__ import annotations
 
-import base64
 import json
-from html import escape
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from calib.calibration import Calibration, write_text
+from calib import report_parts as parts
+from calib.calibration import Calibration, write_bytes, write_text
 from calib.dataset import Ranges, concatenate
-from calib.evaluation import STAGES, Evaluation, Group, evaluate
+from calib.evaluation import Evaluation, evaluate
+from calib.fit import FitResult
+from calib.listeners import Heard
+from calib.localization import Localization
+from calib.page_html import to_html
+from calib.pages import Block, Document, Heading, Listing, Text, rendered
+from calib.patient import Finding
+from calib.report_localization import localization
 
-STYLE: Final = """
-:root { color-scheme: light dark; --ink: #1a1a1a; --page: #fff; --line: #ccc; --soft: #f3f5f7; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e8e8e8; --page: #16181b; --line: #444; --soft: #22262b; } }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--page); max-width: 1040px;
-  margin: 0 auto; padding: 1rem; }
-h1 { line-height: 1.2; } h2 { margin-top: 2.2rem; border-bottom: 1px solid var(--line); }
-.lead { font-size: 1.15rem; background: var(--soft); padding: .8rem 1rem; border-radius: .4rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .2rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } tr.all { font-weight: bold; }
-tr.above th { text-align: center; border-left: 1px solid var(--line); }
-figure { margin: 1rem 0; } figure img { width: 100%; height: auto; background: #fff; border-radius: .4rem; }
-figcaption { font-size: .9rem; } pre { background: var(--soft); padding: .6rem; overflow-x: auto; }
-@media print { body { max-width: none; } h2 { break-after: avoid; } figure, tr { break-inside: avoid; } }
-"""
+PAPER_KINDS: Final = ("pdf", "svg")
+Progress = Callable[[str], None]
 
 
-def write_report(path: Path, recordings: list[Ranges], calibration: Calibration, *, force: bool = False) -> None:
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """Everything that a report tells of: what was fitted from which recordings, and how it does on which tests.
+
+    `refits` are calibrations for other scales of the loss, by scale in ns; `heard` delays as passive listeners see
+    them; `findings` the doctor's, by recording.
+    """
+
+    training: list[Ranges]
+    tests: list[Ranges]
+    fit: FitResult
+    refits: dict[float, Calibration] = field(default_factory=dict)
+    heard: dict[int, Heard] = field(default_factory=dict)
+    findings: list[tuple[str, Finding]] = field(default_factory=list)
+    tracks: list[Localization] = field(default_factory=list)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Return the calibration that was fitted."""
+        return self.fit.calibration
+
+    def evaluation(self) -> Evaluation:
+        """Evaluate on the tests, or on the training where there are none."""
+        return evaluate(concatenate(self.tests or self.training), self.calibration)
+
+
+def render(recordings: Sequence[Ranges], calibration: Calibration) -> str:
+    """Return the report of an evaluation as HTML text."""
+    return _html(_evaluated(list(recordings), calibration))
+
+
+def write_report(path: Path, recordings: Sequence[Ranges], calibration: Calibration, *, force: bool = False) -> None:
     """Evaluate a calibration on recordings and write what came out as one HTML file.
 
     Raises what `Calibration.apply` and `check_output` raise; nothing is written then.
@@ -38,139 +63,130 @@ def write_report(path: Path, recordings: list[Ranges], calibration: Calibration,
     write_text(path, render(recordings, calibration), force=force)
 
 
-def render(recordings: list[Ranges], calibration: Calibration) -> str:
-    """Return the report as HTML text. All text that comes from files is escaped."""
+def write_campaign(
+    campaign: Campaign,
+    html: Path,
+    pdf: Path | None = None,
+    figures: Path | None = None,
+    *,
+    force: bool = False,
+    progress: Progress = lambda _: None,
+) -> None:
+    """Write the report of a campaign as HTML, as PDF and as figures at paper size (PDF and SVG) in a folder."""
+    document = _campaign(campaign)
+    pictures: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
+    for picture in document.pictures():
+        progress(f"drawing {picture.name}")
+        figure = picture.draw()
+        pictures[picture.name] = rendered(figure, "png")
+        if figures:
+            files |= {f"{picture.name}.{kind}": rendered(figure, kind, 200) for kind in PAPER_KINDS}
+    text = to_html(document, pictures)
+    if pdf:
+        from calib.page_pdf import to_pdf
+
+        progress("setting the PDF")
+        write_bytes(pdf, to_pdf(document, pictures), force=force)
+    if figures:
+        figures.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            write_bytes(figures / name, data, force=True)
+    write_text(html, text, force=force)
+
+
+def _html(document: Document) -> str:
+    return to_html(document, {p.name: rendered(p.draw(), "png") for p in document.pictures()})
+
+
+def _evaluated(recordings: list[Ranges], calibration: Calibration) -> Document:
     ranges = concatenate(recordings)
-    evaluation = evaluate(ranges, calibration)
-    parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<title>Calibration report</title><style>{STYLE}</style></head><body>",
-        "<h1>Calibration report</h1>",
-        _summary(evaluation),
-        "<h2>Recordings</h2>",
-        _recordings(recordings),
-        "<h2>Antenna delays</h2>",
-        _delays(ranges, calibration),
-        "<h2>Before and after</h2>",
-        _before_after(evaluation),
-        *_figures(recordings, ranges, calibration),
-        "<h2>Provenance</h2>",
-        f"<pre>{escape(json.dumps(calibration.provenance, indent=1))}</pre>",
-        "</body></html>\n",
-    ]
-    return "\n".join(parts)
-
-
-def _summary(evaluation: Evaluation) -> str:
-    group = evaluation.overall
-    cm = {stage: (100 * getattr(group, stage).mean_m, 100 * getattr(group, stage).std_m) for stage in STAGES}
-    return (
-        f"<p class='lead'>Over {group.raw.n} ranges the mean error goes from {cm['raw'][0]:+.1f} cm (raw) to "
-        f"{cm['delays'][0]:+.1f} cm (delays corrected) and {cm['full'][0]:+.1f} cm (fully corrected); the standard "
-        f"deviation from {cm['raw'][1]:.1f} to {cm['full'][1]:.1f} cm, its robust estimate from "
-        f"{100 * group.raw.robust_std_m:.1f} to {100 * group.full.robust_std_m:.1f} cm. A chi-square test at 95 % "
-        f"rejects {100 * group.rejected:.1f} % of the corrected ranges; the others have a mean of "
-        f"{100 * group.accepted.mean_m:+.1f} cm and a standard deviation of {100 * group.accepted.std_m:.1f} cm.</p>"
-    )
-
-
-def _recordings(recordings: list[Ranges]) -> str:
-    rows = [
+    evaluation, applied = evaluate(ranges, calibration), calibration.apply(ranges)
+    return Document(
+        "Calibration report",
         [
-            escape(r.source),
-            str(len(r)),
-            f"{(r.time_ns.max() - r.time_ns.min()) * 1e-9:.0f}",
-            escape(", ".join(map(str, r.tags()))),
-            escape(", ".join(f"{n} {why}" for why, n in r.excluded.items()) or "none"),
-        ]
-        for r in recordings
+            Text(parts.summary(evaluation), "lead"),
+            *_warnings(calibration.provenance.get("warnings", [])),
+            Heading("Recordings"),
+            parts.recordings(recordings),
+            Heading("Antenna delays"),
+            *parts.delays(calibration, evaluation.planted, ranges.planted or {}, {}),
+            Heading("Before and after"),
+            *parts.before_after(evaluation),
+            *parts.errors(ranges, applied, calibration),
+            *parts.curves(ranges, applied, calibration),
+            *parts.over_time(recordings, calibration),
+            *_provenance(calibration),
+        ],
+    )
+
+
+def _campaign(campaign: Campaign) -> Document:
+    calibration, training = campaign.calibration, concatenate(campaign.training)
+    judged = campaign.tests or campaign.training
+    ranges = concatenate(judged)
+    evaluation, applied = campaign.evaluation(), calibration.apply(ranges)
+    trained = calibration.apply(training)
+    on_what = "tests" if campaign.tests else "the recordings it was fitted from"
+    warnings = [*campaign.fit.warnings]
+    if not campaign.tests:
+        warnings.append("no tests were given: the figures below are of the recordings that the fit has seen")
+    warnings += [f"{name}: {f.fault}. {_sentence(f.evidence)} {_sentence(f.remedy)}" for name, f in campaign.findings]
+    blocks: list[Block] = [
+        Text(parts.summary(evaluation, on_what), "lead"),
+        *_warnings(warnings),
+        Heading("What was recorded"),
+        parts.recordings(campaign.training, campaign.tests),
+        Heading("Is it determined?"),
+        *parts.determined(training, calibration, campaign.fit),
+        Heading("Antenna delays"),
+        *parts.delays(calibration, evaluation.planted, training.planted or {}, campaign.heard),
+        *parts.sensitivity(calibration, campaign.refits),
+        *parts.curves(training, trained, calibration),
+        Heading("Before and after"),
+        *parts.before_after(evaluation),
+        *parts.errors(ranges, applied, calibration),
+        Heading("Outliers"),
+        *parts.outliers(ranges, applied),
+        *localization(campaign.tracks),
+        *parts.over_time(judged, calibration),
+        *_provenance(calibration),
     ]
-    return _table(["recording", "ranges", "seconds", "tags", "left out"], rows)
+    return Document("Calibration of ultra-wideband ranges", blocks)
 
 
-def _delays(ranges: Ranges, calibration: Calibration) -> str:
-    from calib.figures import common_shift_ns
+def to_dict(campaign: Campaign) -> dict[str, Any]:
+    """Return what `calib report --json` prints."""
+    from dataclasses import asdict
 
-    planted = (ranges.planted or {}).get("delays_ns", {})
-    shift = common_shift_ns(ranges, calibration)
-    header = ["tag", "fitted (ns)", "± 1 std (ns)"]
-    rows = []
-    for tag, delay in calibration.delays_ns.items():
-        row = [str(tag), f"{delay:+.4f}", f"{calibration.delays_std_ns.get(tag, float('nan')):.4f}"]
-        if str(tag) in planted:
-            truth = float(planted[str(tag)])
-            row += [f"{truth:+.4f}", f"{1e3 * (delay - shift - truth):+.1f}"]
-        rows.append(row)
-    if not planted:
-        return _table(header, rows)
-    note = (
-        "<p>A constant in the bias curve and a shift common to all delays are the same thing: the last column, and the "
-        f"planted curve in the figure, are compared after moving the common {shift:+.4f} ns from one to the other.</p>"
-    )
-    return _table([*header, "planted (ns)", "difference (ps)"], rows) + note
+    from calib.localization import STAGES, summarize
 
-
-def _before_after(evaluation: Evaluation) -> str:
-    header = ["pair", "n", *["mean", "std", "robust"] * len(STAGES), "rejected", "clamped"]
-    rows = [[escape(name), *_cells(group)] for name, group in evaluation.pairs.items()]
-    rows.append(["all", *_cells(evaluation.overall)])
-    note = (
-        "<p>Errors in cm. Robust is 1.4826 median absolute deviations. Rejected: share beyond the 95 % quantile of "
-        "chi-square with the calibrated variance. Clamped: share at powers the curves were not fitted at.</p>"
-    )
-    spans = "<th colspan='2'></th>" + "".join(f"<th colspan='3'>{s}</th>" for s in STAGES) + "<th colspan='2'></th>"
-    return _table(header, rows, last="all", above=f"<tr class='above'>{spans}</tr>") + note
+    calibration = campaign.calibration
+    document: dict[str, Any] = {
+        "calibration": json.loads(calibration.to_json()),
+        "warnings": campaign.fit.warnings,
+        "evaluation": campaign.evaluation().to_dict(),
+        "heard": {str(tag): asdict(heard) for tag, heard in campaign.heard.items()},
+        "findings": [{"recording": name} | asdict(finding) for name, finding in campaign.findings],
+    }
+    if campaign.tracks:
+        document["localization"] = {
+            "scenarios": [
+                {"recording": t.source, "body": t.body, "rmse_m": {s: t.tracks[s].rmse_m for s in STAGES}}
+                for t in campaign.tracks
+            ],
+            "summary": asdict(summarize(campaign.tracks)),
+        }
+    return document
 
 
-def _cells(group: Group) -> list[str]:
-    cells = [str(group.raw.n)]
-    for stage in STAGES:
-        stats = getattr(group, stage)
-        cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.std_m, stats.robust_std_m)]
-    return [*cells, f"{100 * group.rejected:.1f} %", f"{100 * group.clamped:.1f} %"]
+def _warnings(sentences: list[str]) -> list[Block]:
+    return [Text(f"Warning: {sentence}", "warning") for sentence in sentences]
 
 
-def _figures(recordings: list[Ranges], ranges: Ranges, calibration: Calibration) -> list[str]:
-    from calib import figures
-
-    applied = calibration.apply(ranges)
-    parts = [
-        "<h2>Errors</h2>",
-        _figure(
-            figures.png(figures.histogram(ranges, applied)),
-            "Range errors. The outermost bins hold everything beyond them.",
-        ),
-        "<h2>Bias and standard deviation over power</h2>",
-        _figure(
-            figures.png(figures.bias_over_power(ranges, applied, calibration)),
-            "Bias over lifted first-path power: medians of the delay-corrected errors, and the curve.",
-        ),
-        _figure(
-            figures.png(figures.sigma_over_power(ranges, applied, calibration)),
-            "Standard deviation over lifted first-path power: robust estimates, and the curve of the core.",
-        ),
-        "<h2>Over time</h2>",
-    ]
-    for recording in recordings:
-        picture = figures.png(figures.over_time(recording, calibration.apply(recording)))
-        caption = f"{escape(recording.source)}: calibrated errors, and the band in which 95 % should lie."
-        parts.append(_figure(picture, caption))
-    return parts
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."
 
 
-def _figure(png: bytes, caption: str) -> str:
-    picture = base64.b64encode(png).decode()
-    return (
-        f"<figure><img alt='{escape(caption, quote=True)}' src='data:image/png;base64,{picture}'>"
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _table(header: list[str], rows: list[list[str]], last: str = "", above: str = "") -> str:
-    head = "".join(f"<th>{name}</th>" for name in header)
-    body = "".join(
-        f"<tr class='{last if row is rows[-1] else ''}'>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>"
-        for row in rows
-    )
-    return f"<div class='wide'><table><thead>{above}<tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+def _provenance(calibration: Calibration) -> list[Block]:
+    return [Heading("Provenance"), Listing(json.dumps(calibration.provenance, indent=1))]

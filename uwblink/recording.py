@@ -253,6 +253,10 @@ class Recording:
         bits = self.meta().get("timestamp_bits", REPORT_BITS)
         return Exchanges(protocol=protocol, bits=int(bits), **columns)
 
+    def overheard(self) -> dict[str, NDArray[Any]]:
+        """Return the passively heard exchanges as columns of the table `overheard`, in order of time."""
+        return self._read(f"SELECT {', '.join(TABLES['overheard'])} FROM overheard ORDER BY time_ns")  # noqa: S608
+
     def poses(self) -> Poses:
         """Return all poses in order of time."""
         r = self._read("SELECT * FROM poses ORDER BY time_ns, body")

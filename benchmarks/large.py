@@ -1,0 +1,94 @@
+"""Measure a calibration of 3.8 million exchanges: time, peak memory, and that the cost grows with the size and no faster.
+
+Each size runs in a process of its own on one core. Exchanges are synthetic ranges with the poses of a flight; loading
+is not counted, true distances are.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+SIZES = (38_000, 380_000, 3_800_000)
+RATE_HZ = 160
+POSES_HZ = 100
+
+
+def main() -> None:
+    """Print one row a size; with an argument, run that size."""
+    if len(sys.argv) > 1:
+        print("| " + " | ".join(one_size(int(sys.argv[1]))) + " |", flush=True)
+        return
+    print("| exchanges | true distances | joint Cauchy fit with intervals, and apply | together | peak memory |")
+    print("|---|---|---|---|---|")
+    for size in SIZES:
+        environment = dict(os.environ) | {"OPENBLAS_NUM_THREADS": "1"}
+        subprocess.run([sys.executable, "-m", "benchmarks.large", str(size)], check=True, env=environment)
+
+
+def one_size(size: int) -> list[str]:
+    """Return the cells of a row."""
+    from calib.fit import fit
+    from uwblink.geometry import distances_m
+
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    poses, tags, ranges = flight(size)
+    runs = 5 if size < 1_000_000 else 1
+    distances, fits = [], []
+    for _ in range(runs + (runs > 1)):
+        start = time.perf_counter()
+        distances_m(poses, tags, ranges.initiator, ranges.target, ranges.time_ns)
+        middle = time.perf_counter()
+        result = fit(ranges)
+        fits.append(time.perf_counter() - middle)
+        distances.append(middle - start)
+        if not result.success:
+            sys.exit("the fit did not converge")
+    seconds = [float(np.median(times[runs > 1 :])) for times in (distances, fits)]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    unit = [f"{1e3 * s:.0f} ms" if s < 1 else f"{s:.1f} s" for s in (*seconds, sum(seconds))]
+    return [f"{size:,}".replace(",", " "), *unit, f"{peak:.0f} MB"]
+
+
+def flight(size: int):  # type: ignore[no-untyped-def]
+    """Return poses, tags and ranges of three bodies with two tags each, with planted delays, curve and tail."""
+    from calib.dataset import Ranges
+    from uwblink.geometry import distances_m
+    from uwblink.schema import Poses, Tag
+    from uwblink.ticks import SPEED_OF_LIGHT
+
+    rng = np.random.default_rng(1)
+    seconds = size / RATE_HZ + 1
+    time_s = np.arange(int(seconds * POSES_HZ) + 1) / POSES_HZ
+    bodies = ("a", "b", "c")
+    phase = np.arange(3)[:, None] + time_s * 0.3
+    place = np.stack([2 * np.sin(phase), 2 * np.cos(1.3 * phase), 1 + np.sin(0.7 * phase)], axis=-1)
+    turn = np.stack([0 * phase, 0 * phase, np.sin(phase / 2), np.cos(phase / 2)], axis=-1)
+    count = len(time_s)
+    poses = Poses(
+        np.tile((time_s * 1e9).astype(np.int64), 3), np.repeat(bodies, count), place.reshape(-1, 3), turn.reshape(-1, 4)
+    )
+    tags = [Tag(k + 1, bodies[k // 2], (0.17 * (-1) ** k, -0.17 * (-1) ** k, -0.05)) for k in range(6)]
+    pairs = np.array([(i, j) for i in range(1, 7) for j in range(i + 1, 7) if (i - 1) // 2 != (j - 1) // 2])
+    initiator, target = pairs[np.arange(size) % len(pairs)].T
+    time_ns = (np.arange(size) * (1e9 / RATE_HZ)).astype(np.int64)
+    truth = distances_m(poses, tags, initiator, target, time_ns)
+    power = -78 - 20 * np.log10(truth) + rng.normal(size=(2, size)) * 2
+    lifted = np.mean(10 ** ((power + 82) / 10), axis=0)
+    delay = np.array([0, -0.36, 0.0, -0.07, -0.36, -0.17, -0.12])
+    raw = truth + 0.08 * np.sin(3 * lifted) - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
+    raw += 0.08 * rng.normal(size=size) + np.where(rng.random(size) < 0.11, rng.exponential(0.34, size), 0)
+    ranges = Ranges(
+        "synthetic", time_ns, initiator, target, np.full(size, "ds"), raw, truth, np.full(size, 0.5), np.full(size, 0.5),
+        power[0], power[1], {}, None,
+    )  # fmt: skip
+    return poses, tags, ranges
+
+
+if __name__ == "__main__":
+    main()

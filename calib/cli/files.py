@@ -1,0 +1,69 @@
+"""Commands that turn files into others: apply, export, import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.arguments import CalibrationFile, Force
+
+imports = typer.Typer(help="Turn other files into calibrations.", no_args_is_help=True)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command()(apply)
+    app.command()(export)
+    app.add_typer(imports, name="import")
+
+
+def apply(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    calibration: CalibrationFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
+    force: Force = False,
+) -> None:
+    """Write a recording whose ranges are corrected."""
+    from calib.calibration import load
+    from calib.correction import correct
+
+    count, clamped = correct(recording, load(calibration), output, force=force)
+    typer.echo(f"{output}: {count} ranges corrected, {clamped} beyond the fitted power")
+
+
+def export(
+    calibration: Annotated[Path, typer.Argument(help="Calibration (.json).")],
+    to: Annotated[str, typer.Option(help="registers, json, csv, miluv or ros-yaml.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; else it is printed.")] = None,
+    force: Force = False,
+) -> None:
+    """Write a calibration in another form."""
+    from calib.calibration import load, write_text
+    from calib.exchange_formats import FORMATS
+    from calib.options import one_of
+
+    text = FORMATS[one_of("--to", to, FORMATS)](load(calibration))
+    if output is None:
+        typer.echo(text, nl=False)
+        return
+    write_text(output, text, force=force)
+    typer.echo(f"{output}")
+
+
+@imports.command("miluv")
+def import_miluv(
+    source: Annotated[Path, typer.Argument(help="MILUV's published calibration (.json).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],
+    force: Force = False,
+) -> None:
+    """Read the calibration published with the MILUV dataset."""
+    from calib.calibration import save
+    from calib.exchange_formats import read_miluv
+    from uwblink.recording import check_output
+
+    check_output(output, force=force)
+    found = read_miluv(source)
+    save(found, output, force=force)
+    typer.echo(f"{output}: {len(found.delays_ns)} tags")

@@ -1,0 +1,112 @@
+"""Commands that make calibrations: fit, add-tag."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calib.cli.arguments import (
+    AsJson,
+    CalibrationFile,
+    Fix,
+    Force,
+    Group,
+    Lift,
+    Loss,
+    MinimumNorm,
+    NewCalibration,
+    Recordings,
+    Scale,
+    Sequential,
+    TrimStatic,
+)
+
+if TYPE_CHECKING:
+    from calib.calibration import Calibration
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command()(fit)
+    app.command("add-tag")(add_tag)
+
+
+def fit(
+    recordings: Recordings,
+    output: NewCalibration,
+    loss: Loss = "cauchy",
+    scale: Scale = "auto",
+    lift: Lift = "mean-of-lifted",
+    fix: Fix = None,
+    group: Group = None,
+    sequential: Sequential = False,
+    trim_static: TrimStatic = False,
+    minimum_norm: MinimumNorm = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Fit antenna delays and power curves."""
+    from calib.calibration import save
+    from calib.errors import UnanswerableError
+    from calib.fit import fit as run
+    from calib.options import fit_options, load_all
+    from uwblink.recording import check_output
+
+    options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
+    check_output(output, force=force)
+    ranges = load_all(recordings, trim_static=trim_static)
+    try:
+        result = run(ranges, **options)
+    except UnanswerableError as error:
+        if as_json:
+            typer.echo(json.dumps({"error": str(error), "undetermined": error.undetermined}, indent=1))
+        raise
+    save(result.calibration, output, force=force)
+    if as_json:
+        typer.echo(result.calibration.to_json(), nl=False)
+        return
+    found = result.calibration
+    typer.echo(f"{output}: {len(ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
+    for line in delay_lines(found):
+        typer.echo(line)
+    for reason, count in ranges.excluded.items():
+        typer.echo(f"  left out: {count} exchanges, {reason}")
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+
+
+def delay_lines(found: Calibration) -> Iterator[str]:
+    """Yield a line a tag: the delay and its 95 % interval."""
+    for tag, delay in sorted(found.delays_ns.items()):
+        half = 1.96 * found.delays_std_ns[tag]
+        if math.isinf(half):
+            yield f"  tag {tag:3d}  delay {delay:+.4f} ns  undetermined"
+        else:
+            pinned = "  pinned" if half == 0 else f"  ± {half:.4f} (95 %)"
+            yield f"  tag {tag:3d}  delay {delay:+.4f} ns{pinned}"
+
+
+def add_tag(
+    recording: Annotated[Path, typer.Argument(help="Recording of the new tag with calibrated ones (.uwb).")],
+    calibration: CalibrationFile,
+    tag: Annotated[int, typer.Option(help="Id of the new tag.")],
+    output: NewCalibration,
+    force: Force = False,
+) -> None:
+    """Add a new tag to a calibration."""
+    from calib.calibration import load as load_calibration
+    from calib.calibration import save
+    from calib.dataset import load
+    from calib.new_tag import add_tag as run
+    from uwblink.recording import check_output
+
+    check_output(output, force=force)
+    found = run(load(recording), load_calibration(calibration), tag)
+    save(found, output, force=force)
+    half = 1.96 * found.delays_std_ns[tag]
+    typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")
