@@ -1,4 +1,4 @@
-"""Measure a calibration of 3.8 million exchanges: time, peak memory, and that the cost grows with the size and no faster.
+"""Measure a calibration of 3.8 million exchanges: time, peak memory, and that the cost grows no faster than the size.
 
 Each size runs in a process of its own on one core. Exchanges are synthetic ranges with the poses of a flight; loading
 is not counted, true distances are.
@@ -84,8 +84,8 @@ def flight(size: int):  # type: ignore[no-untyped-def]
     raw = truth + 0.08 * np.sin(3 * lifted) - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
     raw += 0.08 * rng.normal(size=size) + np.where(rng.random(size) < 0.11, rng.exponential(0.34, size), 0)
     ranges = Ranges(
-        "synthetic", time_ns, initiator, target, np.full(size, "ds"), raw, truth, np.full(size, 0.5), np.full(size, 0.5),
-        power[0], power[1], {}, None,
+        "synthetic", time_ns, initiator, target, np.full(size, "ds"), raw, truth, np.full(size, 0.5),
+        np.full(size, 0.5), power[0], power[1], {}, None,
     )  # fmt: skip
     return poses, tags, ranges
 

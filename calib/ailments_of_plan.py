@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from uwblink.twr import delay_weights
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+STATIC: Final = "static data"
 
 
 def pairs(patient: Patient) -> Iterator[Finding]:
@@ -65,7 +68,7 @@ def still(patient: Patient) -> Iterator[Finding]:
     spans = [float(np.ptp(patient.truth_m[good & (pair == p)])) for p in np.unique(pair[good])]
     if spans and max(spans) < 0.1:
         yield Finding(
-            "static data",
+            STATIC,
             f"no distance changes by more than {100 * max(spans):.0f} cm",
             "move the tags while recording, so that powers and reflections vary",
             0.9,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from uwblink.twr import intervals
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+CONFOUNDED: Final = "power confounded with distance"
 
 
 def skew(patient: Patient) -> Iterator[Finding]:
@@ -103,7 +106,7 @@ def confounded(patient: Patient) -> Iterator[Finding]:
     share = explained_by_distance(power, patient.truth_m)
     if share is not None:
         yield Finding(
-            "power confounded with distance",
+            CONFOUNDED,
             f"distance explains {100 * share:.0f} % of the power's variance",
             "turn the antennas while recording; until then the curve may hold what belongs to distance",
             0.8,

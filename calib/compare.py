@@ -55,9 +55,12 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     """Compare two calibrations; raises `UnanswerableError` where fewer than two tags are in both."""
     from scipy.stats import chi2
 
-    common = sorted(set(first.delays_ns) & set(second.delays_ns))
+    known = [{t for t in c.delays_ns if np.isfinite(c.delays_std_ns.get(t, 0.0))} for c in (first, second)]
+    common = sorted(known[0] & known[1])
     if len(common) < 2:
-        raise UnanswerableError(f"{len(common)} tags are in both calibrations, at least two are needed to compare")
+        raise UnanswerableError(
+            f"{len(common)} tags have determined delays in both calibrations, at least two are needed to compare"
+        )
     delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common])
     std = np.array([np.hypot(first.delays_std_ns.get(t, 0.0), second.delays_std_ns.get(t, 0.0)) for t in common])
     weight = 1 / np.maximum(std, 1e-6) ** 2

@@ -70,6 +70,7 @@ def load(path: str | os.PathLike[str]) -> Ranges:
     with Recording.open(path) as recording:
         exchanges = recording.exchanges()
         truth = _truth(recording, exchanges)
+        uncovered = _uncovered(recording, exchanges, truth)
         planted = recording.meta().get("planted")
     if not len(exchanges):
         raise UnanswerableError(f"{path}: holds no exchanges")
@@ -90,7 +91,7 @@ def load(path: str | os.PathLike[str]) -> Ranges:
         excluded={},
         planted=planted if isinstance(planted, dict) else None,
     )
-    return _usable(ranges, path)
+    return _usable(ranges, path, uncovered)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +162,22 @@ def _truth(recording: Recording, exchanges: Exchanges) -> Floats:
     return np.where(np.isfinite(exchanges.truth_m), exchanges.truth_m, computed)
 
 
+def _uncovered(recording: Recording, exchanges: Exchanges, truth_m: Floats) -> str:
+    """Say how poses and exchanges lie in time, where no exchange has a true distance although there are poses."""
+    if np.isfinite(truth_m).any() or not recording.count("poses") or not len(exchanges):
+        return ""
+    poses = recording.poses()
+    missing = sorted({t.body for t in recording.tags()} - set(np.unique(poses.body).tolist()))
+    if missing:
+        return f"no poses of body {missing[0]}"
+    start = int(poses.time_ns[0])
+    spans = [((int(t.min()) - start) * 1e-9, (int(t.max()) - start) * 1e-9) for t in (poses.time_ns, exchanges.time_ns)]
+    return (
+        f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s, its exchanges {spans[1][0]:.1f} to "
+        f"{spans[1][1]:.1f} s after the first pose; shift the poses with 'uwblink poses --offset'"
+    )
+
+
 LOUDEST_DBM = -30.0
 FAINTEST_DBM = -140.0
 """Powers beyond these bounds were not measured: a board that cannot tell a strong power prints 0."""
@@ -172,7 +189,7 @@ def _powers(fpp_dbm: Floats) -> Floats:
         return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
 
 
-def _usable(ranges: Ranges, path: str | os.PathLike[str]) -> Ranges:
+def _usable(ranges: Ranges, path: str | os.PathLike[str], uncovered: str) -> Ranges:
     ranges = replace(ranges, fpp1_dbm=_powers(ranges.fpp1_dbm), fpp2_dbm=_powers(ranges.fpp2_dbm))
     reasons = {
         "no true distance": np.isfinite(ranges.truth_m),
@@ -188,6 +205,6 @@ def _usable(ranges: Ranges, path: str | os.PathLike[str]) -> Ranges:
         most = max(excluded, key=lambda reason: excluded[reason])
         raise UnanswerableError(
             f"{path}: none of its {len(ranges)} exchanges can be used: {most}"
-            + ("; it needs poses and lever arms, or measured distances" if "true" in most else "")
+            + (f"; {uncovered or 'it needs poses and lever arms, or measured distances'}" if "true" in most else "")
         )
     return replace(ranges[keep], excluded={r: n for r, n in excluded.items() if n})

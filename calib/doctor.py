@@ -45,7 +45,10 @@ def examine(path: Path) -> list[Finding]:
             findings += examination(patient)
     for always in STRUCTURE:
         findings += always(patient)
-    return sorted(findings, key=lambda f: -f.confidence)
+    found = {finding.fault for finding in findings}
+    # Where nothing moves, every pair has one distance and one power, and the one explains the other.
+    implied = {radio.CONFOUNDED} if plan.STATIC in found else set()
+    return sorted((f for f in findings if f.fault not in implied), key=lambda f: -f.confidence)
 
 
 def _admitted(name: str, e: Exchanges, poses: Poses, tags: list[Tag], faults: list[Fault]) -> Patient:

@@ -158,3 +158,102 @@ def test_a_table_without_truth_is_status_1(tmp_path):
     (tmp_path / "t.csv").write_text(HEADER + "\n" + GOOD + "\n")
     assert run("uwblink", "import", "csv", tmp_path / "t.csv", "-o", tmp_path / "o.uwb").returncode == 0
     refused(run("calib", "fit", tmp_path / "o.uwb", "-o", tmp_path / "c.json"), 1, "no true distance")
+
+
+def altered(source, target, change):
+    """Copy a recording with its exchanges or poses changed."""
+    from uwblink.recording import Recording
+
+    with Recording.open(source) as opened:
+        exchanges, poses, tags, meta = opened.exchanges(), opened.poses(), opened.tags(), opened.meta()
+    exchanges, poses = change(exchanges, poses)
+    with Recording.create(target, meta=meta, force=True) as written:
+        written.append_tags(tags)
+        written.append_poses(poses)
+        written.append_exchanges(exchanges)
+    return target
+
+
+def test_poses_that_do_not_cover_the_flight(tmp_path, flight):
+    from dataclasses import replace
+
+    late = altered(
+        flight / "f.uwb", tmp_path / "late.uwb", lambda e, p: (e, replace(p, time_ns=p.time_ns + 100_000_000_000))
+    )
+    done = run("calib", "fit", late, "-o", tmp_path / "c.json")
+    refused(done, 1, "late.uwb", "poses cover 0.0 to 5.1 s", "exchanges -100.0 to -95.0 s", "--offset")
+
+    def half(e, p):
+        keep = p.time_ns < p.time_ns.min() + 2_500_000_000
+        return e, replace(p, **{n: getattr(p, n)[keep] for n in ("time_ns", "body", "position_m", "quaternion")})
+
+    cut = altered(flight / "f.uwb", tmp_path / "cut.uwb", half)
+    done = run("calib", "fit", cut, "-o", tmp_path / "c.json")
+    assert done.returncode == 0
+    assert "50 % of the exchanges were left out: no true distance" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("powers", "fragment"),
+    [((-82.0, -82.0), "power never changes"), ((float("nan"),) * 2, "no power"), ((0.0, 3.0), "no power")],
+)
+def test_powers_that_say_nothing(tmp_path, flight, powers, fragment):
+    from dataclasses import replace
+
+    def change(e, p):
+        return replace(e, fpp1_dbm=e.fpp1_dbm * 0 + powers[0], fpp2_dbm=e.fpp2_dbm * 0 + powers[1]), p
+
+    bad = altered(flight / "f.uwb", tmp_path / "bad.uwb", change)
+    refused(run("calib", "fit", bad, "-o", tmp_path / "c.json"), 1, "bad.uwb", fragment)
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_stamps_that_leave_nothing(tmp_path, flight):
+    from dataclasses import replace
+
+    bad = altered(flight / "f.uwb", tmp_path / "bad.uwb", lambda e, p: (replace(e, rx2=e.rx2 + 2**30 & 2**32 - 1), p))
+    refused(run("calib", "fit", bad, "-o", tmp_path / "c.json"), 1, "bad.uwb", "none of its", "impossible stamps")
+
+
+@pytest.mark.parametrize(
+    ("text", "fragments"),
+    [
+        ("groups", ["not valid TOML"]),
+        ("x = 1", ["expected one table [groups]"]),
+        ("[groups]\na = 1", ["a:", "list of tag ids"]),
+        ("[groups]\na = [1, 2]\nb = [2]", ["tag 2", "'a'", "'b'"]),
+        ("[groups]\na = [1, 2]", ["tag 3", "in no group"]),
+    ],
+)
+def test_designs_that_cannot_be(tmp_path, flight, text, fragments):
+    (tmp_path / "d.toml").write_text(text)
+    done = run("calib", "fit", flight / "f.uwb", "-o", tmp_path / "c.json", "--group", tmp_path / "d.toml")
+    refused(done, 2, "--group", *fragments)
+
+
+def test_reports_that_cannot_be_written(tmp_path, flight):
+    (tmp_path / "mine").write_text("mine")
+    base = ["calib", "report", flight / "f.uwb", "-o", tmp_path / "r.html"]
+    refused(run(*base, "--pdf", tmp_path / "mine"), 2, "mine", "--force")
+    refused(run(*base, "--figures", tmp_path / "mine"), 2, "mine", "is a file")
+    refused(run(*base, "--figures", tmp_path / "no" / "figures"), 2, "no", "does not exist")
+    refused(run(*base, "--loss", "mixture", "--sequential"), 2, "--sequential")
+    refused(run("calib", "report", tmp_path / "no.uwb", "-o", tmp_path / "r.html"), 2, "no.uwb", "no such")
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_calibrations_of_other_tags_and_versions(tmp_path, flight):
+    import json
+
+    document = json.loads((flight / "c.json").read_text())
+    del document["delays_ns"]["3"]
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "no delay for tag 3")
+    (tmp_path / "c.json").write_text(json.dumps(document | {"schema_version": 7}))
+    refused(
+        run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "schema version 7", "reads 1 and 2"
+    )
+    document["uncertainty"]["bias_m2"] = [[1.0]]
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "uncertainty", "bias_m2", "rows")

@@ -139,16 +139,31 @@ def test_the_fault_is_found_and_nothing_else(flight, tmp_path, plant, fault):
     assert faults(plant(flight), tmp_path) == ([fault] if fault else [])
 
 
+STILL = [
+    f'bodies.{k}.motion={{ model = "static", position_m = {place} }}'
+    for k, place in enumerate(([-1.5, -1.5, 1.0], [1.5, -1.0, 1.2], [0.0, 1.6, 0.9]))
+]
+
+
 @pytest.mark.parametrize(
-    ("scenario", "settings", "fault"),
+    ("fault", "settings"),
     [
-        ("icra2023/test1.toml", ["ranging.protocol=ss", "scenario.duration_s=30"], "skew in single-sided ranges"),
-        ("icra2023/test1.toml", ["radio.multipath.probability=0.5", "scenario.duration_s=30"], "reflections"),
-        ("two_boards_on_a_bench/bench.toml", ["scenario.duration_s=20"], "static data"),
+        ("skew in single-sided ranges", ["ranging.protocol=ss", "scenario.duration_s=30"]),
+        ("reflections", ["radio.multipath.probability=0.5", "scenario.duration_s=30"]),
+        ("static data", ["scenario.duration_s=20", *STILL]),
+        (
+            "power confounded with distance",
+            ["radio.antenna=isotropic", "radio.shadowing_db=0", "radio.power_noise_db=0.05", "scenario.duration_s=30"],
+        ),
     ],
 )
-def test_faults_that_a_scenario_plants(tmp_path, scenario, settings, fault):
-    assert fault in faults(simulate(load(SCENARIOS / scenario, settings)), tmp_path)
+def test_faults_that_a_scenario_plants_and_nothing_else(tmp_path, fault, settings):
+    assert faults(simulate(load(SCENARIOS / "icra2023/test1.toml", settings)), tmp_path) == [fault]
+
+
+def test_two_boards_on_a_bench_are_too_few_and_too_still(tmp_path):
+    scenario = load(SCENARIOS / "two_boards_on_a_bench/bench.toml", ["scenario.duration_s=20"])
+    assert faults(simulate(scenario), tmp_path) == ["too few pairs", "static data"]
 
 
 def test_the_offset_is_estimated(flight, tmp_path):
