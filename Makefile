@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup demo test lint format bench bench-boards fidelity endurance lock clean
+.PHONY: help setup demo test lint format bench bench-large bench-boards accuracy fidelity endurance lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -40,6 +40,12 @@ format: setup ## rewrite the code in the house style
 
 bench: setup ## measure speed and memory; prints the table of the README
 	$(BIN)/python -m benchmarks
+
+bench-large: setup ## measure a calibration of 3.8 million exchanges (a minute, 3 GB)
+	$(BIN)/python -m benchmarks.large
+
+accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
+	$(BIN)/python -m benchmarks.accuracy
 
 bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
 	$(BIN)/python -m benchmarks.boards

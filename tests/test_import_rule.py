@@ -17,7 +17,8 @@ FORBIDDEN = {
 CONFINED = {
     "serial": lambda path: path == "uwblink/ports.py",
     "simpy": lambda path: path.startswith("uwbsim/"),
-    "matplotlib": lambda path: Path(path).name == "figures.py",
+    "matplotlib": lambda path: Path(path).name.startswith("figures") or path.startswith("calib/page"),
+    "fpdf": lambda path: path == "calib/page_pdf.py",
     "typer": lambda path: Path(path).name == "cli.py" or "/cli/" in path,
     "rich": lambda path: Path(path).name in {"cli.py", "listing.py"} or "/cli/" in path or path == "calib/table.py",
     "duckdb": lambda path: path.startswith("uwblink/"),
