@@ -71,7 +71,7 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
 def table(outcomes: dict[float, list[dict[str, Outcome]]]) -> str:
     """Return the rows of the page."""
     rows = [
-        "| reflections, a reception | loss | delays, rms (median / 95 % of seeds) | 95 % intervals that hold | "
+        "| reflections | loss | delays, rms (median / 95 % of seeds) | 95 % intervals that hold | "
         "bias curve, rms | whole correction, rms | chi-square rejects |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -109,8 +109,8 @@ def main() -> None:
 PREFACE = """# How well a calibration finds what was planted
 
 Written by `make accuracy`: {seeds} seeds of [the icra2023 training flight](../scenarios/icra2023/train.toml), 38 400 exchanges each, every seed with
-other noise, motion and clocks. Reflections are a share of receptions that come late by an exponential detour of 34 cm on average; an exchange
-has two receptions that matter. Errors are taken after the shift common to all delays has been exchanged with the curve's constant.
+other noise, motion and clocks. Reflections are the share of
+exchanges whose messages take a detour, exponential with 34 cm on average. Errors are taken after the shift common to all delays has been exchanged with the curve's constant.
 
 """
 AFTERWORD = """

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.patient import PLAUSIBLE_M, Finding, Patient, pair_ids, plausible_share
 from uwblink.ticks import TICKS_PER_SECOND
-from uwblink.twr import board_range, intervals, raw_range
+from uwblink.twr import SINGLE_SIDED, board_range, intervals, raw_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -57,7 +57,7 @@ def width(patient: Patient) -> Iterator[Finding]:
 def single_as_double(patient: Patient) -> Iterator[Finding]:
     """Double-sided exchanges without a third message."""
     e = patient.exchanges
-    empty = (e.protocol != "ss") & (e.tx3 == 0) & (e.rx3 == 0)
+    empty = ~np.isin(e.protocol, SINGLE_SIDED) & (e.tx3 == 0) & (e.rx3 == 0)
     if empty.mean() > 0.5:
         yield Finding(
             "single-sided data taken for double-sided",

@@ -69,13 +69,15 @@ class Intervals:
     """Durations of an exchange in ticks of the clock that measured them, float64, shape (n,).
 
     `turn` is the time between receiving one message and sending the next, `wait` the time between
-    sending one and receiving the next: first of the initiator (1), then of the target (2).
+    sending one and receiving the next: first of the initiator (1), then of the target (2). `carrier_ppm` is how much
+    faster than the target's the initiator's clock runs by its carrier integrator, on the response; NaN if unknown.
     """
 
     dt41: Floats
     dt32: Floats
     dt53: Floats
     dt64: Floats
+    carrier_ppm: Floats
 
 
 def intervals(exchanges: Exchanges) -> Intervals:
@@ -94,12 +96,19 @@ def intervals(exchanges: Exchanges) -> Intervals:
         dt32=elapsed(e.tx2, e.rx1, bits).astype(np.float64),
         dt53=elapsed(e.tx3, before_tx3, bits).astype(np.float64),
         dt64=elapsed(e.rx3, before_rx3, bits).astype(np.float64),
+        carrier_ppm=e.skew2_ppm,
     )
 
 
 def _single_sided(t: Intervals) -> Floats:
     """ICRA 2023, eq. (1)."""
     return (t.dt41 - t.dt32) / 2
+
+
+def _carrier_corrected(t: Intervals) -> Floats:
+    """ICRA 2023, eq. (1), with the reply rescaled by the clocks' ratio as the carrier integrator has it."""
+    # Taken apart, so that what is left of two long times is not rounded twice.
+    return (t.dt41 - t.dt32 - t.carrier_ppm * 1e-6 * t.dt32) / 2
 
 
 def _double_sided(t: Intervals) -> Floats:
@@ -126,6 +135,10 @@ def _alternative(t: Intervals) -> Floats:
 def _ones(t: Intervals) -> tuple[Floats, Floats]:
     half = np.full_like(t.dt41, 0.5)
     return half, half
+
+
+def _carrier_delays(t: Intervals) -> tuple[Floats, Floats]:
+    return np.full_like(t.dt41, 0.5), (1 + t.carrier_ppm * 1e-6) / 2
 
 
 def _double_sided_delays(t: Intervals) -> tuple[Floats, Floats]:
@@ -180,6 +193,13 @@ PROTOCOLS: Final[dict[str, Protocol]] = {
             _ones,
         ),
         Protocol(
+            "ss-cfo",
+            "SS-TWR, corrected with the carrier integrator",
+            (_POLL, Message("target", "rx1", "scheduled")),
+            _carrier_corrected,
+            _carrier_delays,
+        ),
+        Protocol(
             "ds",
             "DS-TWR, third message from the target",
             (_POLL, Message("target", "rx1", "at once"), Message("target", "tx2", "scheduled")),
@@ -193,8 +213,20 @@ PROTOCOLS: Final[dict[str, Protocol]] = {
             _alternative,
             _alternative_delays,
         ),
+        Protocol(
+            "ds-sym",
+            "DS-TWR, third message from the initiator, equal replies",
+            (_POLL, Message("target", "rx1", "scheduled"), Message("initiator", "rx2", "scheduled")),
+            _alternative,
+            _alternative_delays,
+        ),
     )
 }
+
+ON_BOARDS: Final = ("ss", "ds")
+"""The protocols that the boards' firmware executes."""
+
+SINGLE_SIDED: Final = tuple(name for name, row in PROTOCOLS.items() if len(row.messages) == 2)
 
 THIRD_FROM_TARGET: Final = tuple(
     name for name, row in PROTOCOLS.items() if len(row.messages) == 3 and row.messages[2].sender == "target"
@@ -254,4 +286,4 @@ def _rows_by_protocol(exchanges: Exchanges) -> list[tuple[str, NDArray[np.bool_]
 def _pick(spans: Intervals, rows: NDArray[np.bool_]) -> Intervals:
     if rows.all():
         return spans
-    return Intervals(spans.dt41[rows], spans.dt32[rows], spans.dt53[rows], spans.dt64[rows])
+    return Intervals(*(getattr(spans, field.name)[rows] for field in fields(Intervals)))

@@ -92,7 +92,8 @@ class Ranging(Section):
 
     def fastest_hz(self) -> float:
         """Return how many exchanges a second one after the other allow."""
-        return 1 / (OVERHEAD_S + self.response_delay_uus * UUS_S)
+        scheduled = sum(message.timing == "scheduled" for message in PROTOCOLS[self.protocol].messages)
+        return 1 / (OVERHEAD_S + scheduled * self.response_delay_uus * UUS_S)
 
     def air_share(self, preamble_symbols: int) -> float:
         """Return the share of time for which the plan keeps the air busy."""

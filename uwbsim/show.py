@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from uwblink.recording import check_output
-from uwblink.twr import PROTOCOLS
+from uwblink.twr import PROTOCOLS, Protocol
 from uwbsim.errors import ScenarioError
 from uwbsim.figures import png, room, timing
 from uwbsim.preview import preview, sentences
@@ -53,11 +53,20 @@ def page(scenario: Scenario) -> str:
         "<h2>One exchange</h2>",
         *(
             _figure(png(timing(scenario, name)), f"{row.title}: every stamp, and what the paper calls it")
-            for name, row in PROTOCOLS.items()
+            for name, row in _distinct().items()
         ),
         "</body></html>\n",
     ]
     return "\n".join(parts)
+
+
+def _distinct() -> dict[str, Protocol]:
+    """Return one protocol of each course of messages: formulas make no difference to a picture of them."""
+    found: dict[str, Protocol] = {}
+    for name, row in PROTOCOLS.items():
+        if row.messages not in [other.messages for other in found.values()]:
+            found[name] = row
+    return found
 
 
 def _figure(data: bytes, caption: str) -> str:

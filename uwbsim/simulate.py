@@ -18,6 +18,7 @@ from uwbsim import air
 from uwbsim.ahead import Ahead
 from uwbsim.clock import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.errors import ScenarioError
+from uwbsim.frame_times import before_marker_s
 from uwbsim.listening import overhear, responses
 from uwbsim.plans import Schedule, schedule
 from uwbsim.radio import printed_power_dbm, printed_skew_ppm
@@ -54,11 +55,14 @@ class _Run:
     clocks: Clocks
 
 
-def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Simulated:
+def simulate(
+    scenario: Scenario, progress: Callable[[float], None] | None = None, *, contention: bool = True
+) -> Simulated:
     """Simulate a scenario; the same scenario gives the same result on every machine.
 
-    `progress` is called with the done fraction. Raises `ScenarioError` for a run longer than the
-    integer true time carries (36 h).
+    Without `contention` there is no event loop: every exchange begins when it is planned and disturbs no other, so
+    where exchanges do not meet the stamps are the same, sooner. `progress` is called with the done fraction. Raises
+    `ScenarioError` for a run longer than the integer true time carries (36 h).
     """
     if scenario.scenario.duration_s > LONGEST_RUN_S:
         raise ScenarioError(f"scenario.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
@@ -66,9 +70,11 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     run = _Run(scenario, protocol, World.of(scenario), Clocks.of(scenario))
     plan = schedule(scenario)
     draws = draw(scenario, len(plan.start), len(protocol.messages))
-    outcomes = air.run(
-        protocol, _hosts(run, plan, draws), len(scenario.tags), _powers(run.world), _rules(scenario), progress
-    )
+    if contention:
+        hosts, powers = _hosts(run, plan, draws), _powers(run.world)
+        outcomes = air.run(protocol, hosts, len(scenario.tags), powers, _rules(scenario), progress)
+    else:
+        outcomes = _undisturbed(run, plan)
     lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
@@ -129,6 +135,16 @@ def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
     for host, row in zip(plan.host.tolist(), columns, strict=True):
         hosts.setdefault(host, []).append(air.Slot(*row))
     return list(hosts.values())
+
+
+def _undisturbed(run: _Run, plan: Schedule) -> air.Outcomes:
+    """What becomes of exchanges that do not meet: only a message too weak to be heard is lost."""
+    power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
+    heard = _heard(run.scenario, power, len(run.protocol.messages))
+    lost = np.where(heard.all(axis=0), -1, np.argmin(heard, axis=0))
+    marker = round(before_marker_s(run.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
+    reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
+    return air.Outcomes((plan.start + marker).tolist(), lost.tolist(), reasons)
 
 
 def _pauses(run: _Run, plan: Schedule) -> list[int]:

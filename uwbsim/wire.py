@@ -11,7 +11,7 @@ from uwblink.columns import ColumnDecoder
 from uwblink.frames import encode
 from uwblink.messages import Ranged
 from uwblink.ticks import TICK_S, elapsed
-from uwblink.twr import COLUMNS
+from uwblink.twr import COLUMNS, ON_BOARDS
 from uwbsim.errors import ScenarioError
 from uwbsim.simulate import Simulated
 
@@ -24,8 +24,11 @@ def frames_of(simulated: Simulated) -> list[Frame]:
     Raises `ScenarioError` for a protocol that the boards do not know.
     """
     e = simulated.exchanges
-    if np.any(e.protocol == "ds-alt"):
-        raise ScenarioError("ranging.protocol: found 'ds-alt', but the boards report only 'ss' and 'ds'")
+    strange = sorted(set(np.unique(e.protocol).tolist()) - set(ON_BOARDS))
+    if strange:
+        raise ScenarioError(
+            f"ranging.protocol: found {strange[0]!r}, but the boards report only {', '.join(ON_BOARDS)}"
+        )
     last = np.where(e.rx3 != 0, e.rx3, e.rx2)
     time_ns = e.time_ns + np.rint(elapsed(last, e.tx1) * (TICK_S * 1e9)).astype(np.int64)
     names = [name for name in Ranged.FIELDS if name != "neighbour"]

@@ -149,7 +149,7 @@ def test_show_and_validate(tmp_path):
 
     assert run("show", OFFICE, "-o", tmp_path / "s.html").returncode == 0
     page = (tmp_path / "s.html").read_text()
-    assert page.count("<figure>") == 4
+    assert page.count("<figure>") == 5
     assert "src='http" not in page
     assert run("show", OFFICE, "-o", tmp_path / "s.png").returncode == 0
     assert (tmp_path / "s.png").stat().st_size > 20_000

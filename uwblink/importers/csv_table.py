@@ -22,7 +22,7 @@ from uwblink.errors import ImportTableError
 from uwblink.importers.mapping import LEVELS, POSITIONS, STAMP_UNITS, TIME_UNITS, ColumnMap
 from uwblink.recording import Recording, check_output
 from uwblink.schema import Tag
-from uwblink.twr import STAMPS, Exchanges, raw_range
+from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, raw_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -95,14 +95,15 @@ class _Table:
         """Return all rows, checked."""
         has_third = self._has("tx3") and self._has("rx3")
         protocol = self._map.protocol or ("ds" if has_third else "ss")
-        if protocol != "ss" and not has_third:
+        messages = len(PROTOCOLS[protocol].messages)
+        if messages == 3 and not has_third:
             raise self._missing("tx3" if not self._has("tx3") else "rx3")
         initiator, target = (self._integers(n, LARGEST_ID) for n in ("from_id", "to_id"))
         self._reject("to_id", initiator == target, "the same tag as from_id")
         time = self._numbers("time_s") * TIME_UNITS[self._map.time_unit]
         self._reject("time_s", np.abs(time) > LATEST_NS, "a time")
         count = len(time)
-        stamps = {name: self._stamps(name) for name in STAMPS[: 4 if protocol == "ss" else 6]}
+        stamps = {name: self._stamps(name) for name in STAMPS[: 2 * messages]}
         none = np.zeros(count, dtype=np.int64)
         fpp1, fpp2, skew1, skew2, truth = (self._optional(name) for name in LEVELS)
         exchanges = Exchanges(
