@@ -47,12 +47,12 @@ def page(scenario: Scenario) -> str:
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
         f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
-        _figure(png(room(scenario)), "Bodies' paths (two minutes at most), tags where they start, obstacles"),
+        figure_html(png(room(scenario)), "Bodies' paths (two minutes at most), tags where they start, obstacles"),
         "<h2>What will happen</h2>",
         f"<pre>{escape(chr(10).join(sentences(scenario, preview(scenario))))}</pre>",
         "<h2>One exchange</h2>",
         *(
-            _figure(png(timing(scenario, name)), f"{row.title}: every stamp, and what the paper calls it")
+            figure_html(png(timing(scenario, name)), f"{row.title}: every stamp, and what the paper calls it")
             for name, row in _distinct().items()
         ),
         "</body></html>\n",
@@ -69,7 +69,8 @@ def _distinct() -> dict[str, Protocol]:
     return found
 
 
-def _figure(data: bytes, caption: str) -> str:
+def figure_html(data: bytes, caption: str) -> str:
+    """Return a PNG picture and its caption as HTML."""
     picture = base64.b64encode(data).decode()
     text = escape(caption, quote=True)
     return f"<figure><img alt='{text}' src='data:image/png;base64,{picture}'><figcaption>{text}</figcaption></figure>"

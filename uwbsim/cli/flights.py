@@ -1,10 +1,9 @@
-"""The `uwbsim` command."""
+"""Commands on one scenario: run, serve, show, validate, schema."""
 
 from __future__ import annotations
 
 import json
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,39 +11,24 @@ from typing import Annotated
 
 import typer
 
-import uwblink
-from uwblink.errors import UwblinkError
-from uwbsim.errors import UwbsimError
-
-app = typer.Typer(
-    help="Simulate tags that range with ultra-wideband radios.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
 
 
-@app.callback(invoke_without_command=True)
-def _top(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-) -> None:
-    if version:
-        typer.echo(uwblink.__version__)
-        raise typer.Exit
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    for command in (run, serve, show, validate, schema):
+        app.command()(command)
 
 
-@app.command()
 def run(
-    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
+    scenario: ScenarioFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
     seed: Annotated[int | None, typer.Option(min=0, help="Seed instead of the file's.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
-    ] = None,
+    settings: Settings = None,
     wire: Annotated[
         bool, typer.Option("--through-wire", help="Encode and decode every report, and record the bytes.")
     ] = False,
-    force: Annotated[bool, typer.Option(help="Replace the output if it exists.")] = False,
+    force: Force = False,
 ) -> None:
     """Simulate a scenario and write what its boards and motion capture record."""
     from uwblink.recording import check_output
@@ -54,7 +38,7 @@ def run(
 
     check_output(output, force=force)
     loaded = load(scenario, settings or (), seed)
-    with _progress(loaded.scenario.name) as report:
+    with progress(loaded.scenario.name) as report:
         simulated = simulate(loaded, report)
     frames: list[tuple[int, str, str, bytes]] = []
     if wire:
@@ -67,16 +51,13 @@ def run(
     )
 
 
-@app.command()
 def serve(
-    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
+    scenario: ScenarioFile,
     link_dir: Annotated[Path | None, typer.Option(help="Folder for stable links, tag10 and so on.")] = None,
     faults: Annotated[Path | None, typer.Option(help="What goes wrong (.toml).")] = None,
     poses: Annotated[Path | None, typer.Option(help="Motion capture to write (.csv), in host time.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
-    ] = None,
+    settings: Settings = None,
     force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
@@ -101,14 +82,11 @@ def serve(
         server.close()
 
 
-@app.command()
 def show(
-    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
+    scenario: ScenarioFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Page (.html) or picture (.png, .svg, .pdf).")],
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
-    ] = None,
-    force: Annotated[bool, typer.Option(help="Replace the output if it exists.")] = False,
+    settings: Settings = None,
+    force: Force = False,
 ) -> None:
     """Draw the room, the flights, and one exchange of each protocol."""
     from uwblink.recording import check_output
@@ -120,13 +98,10 @@ def show(
     typer.echo(f"{output}")
 
 
-@app.command()
 def validate(
-    scenario: Annotated[Path, typer.Argument(help="Scenario file (.toml).")],
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    scenario: ScenarioFile,
+    settings: Settings = None,
+    as_json: AsJson = False,
 ) -> None:
     """Say what a scenario will do, without running it."""
     from dataclasses import asdict
@@ -156,33 +131,8 @@ def _interrupts() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-@app.command()
 def schema() -> None:
     """Print the JSON Schema of scenario files."""
     from uwbsim.scenario import Scenario
 
     typer.echo(json.dumps(Scenario.model_json_schema(), indent=2))
-
-
-@contextmanager
-def _progress(name: str) -> Iterator[Callable[[float], None] | None]:
-    """Show a bar on a terminal, and nothing elsewhere."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(escape(name), total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
-
-
-def main() -> None:
-    """Run the command; a user's mistake is one line on standard error and exit status 2."""
-    try:
-        app()
-    except (UwbsimError, UwblinkError) as error:
-        typer.echo(f"error: {error}", err=True)
-        sys.exit(2)

@@ -1,0 +1,31 @@
+"""Arguments that several commands share, and the bar that shows how far long work has come."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ScenarioFile = Annotated[Path, typer.Argument(help="Scenario file (.toml).")]
+Settings = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+
+
+@contextmanager
+def progress(name: str, *, eta: bool = False) -> Iterator[Callable[[float], None] | None]:
+    """Show a bar on a terminal, and nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=not eta) as bar:
+        task = bar.add_task(escape(name), total=1.0)
+        yield lambda fraction: bar.update(task, completed=fraction)

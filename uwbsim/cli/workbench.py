@@ -1,0 +1,192 @@
+"""The protocol workbench: compare, predict, optimum, sweep."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
+
+if TYPE_CHECKING:
+    from uwbsim.compare import Outcome
+
+Protocols = Annotated[str, typer.Option(help="Names, separated by commas.")]
+ALL = "ss,ss-cfo,ds,ds-alt,ds-sym"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    for command in (compare, predict, optimum, sweep):
+        app.command()(command)
+
+
+def compare(
+    scenario: ScenarioFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, .csv and .parquet.")],
+    protocols: Protocols = ALL,
+    count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Range with every protocol in the same random world, and say what each knows and costs."""
+    from uwblink.recording import check_output
+    from uwblink.tables import write_csv, write_parquet
+    from uwbsim.compare import chosen, winners
+    from uwbsim.compare import compare as run
+    from uwbsim.comparison_page import page
+    from uwbsim.folders import check_folder
+    from uwbsim.reading import load
+
+    rows = chosen([name.strip() for name in protocols.split(",") if name.strip()])
+    loaded = load(scenario, settings or ())
+    check_folder(output)
+    files = {kind: output / f"compare.{kind}" for kind in ("html", "csv", "parquet")}
+    for path in files.values() if output.is_dir() else ():
+        check_output(path, force=force)
+    with progress(loaded.scenario.name) as report:
+        outcomes, samples = run(loaded, rows, count, report)
+    won = winners(loaded, rows)
+    text = page(loaded, outcomes, samples, won)
+    output.mkdir(exist_ok=True)
+    files["html"].write_text(text, encoding="utf-8")
+    table = [o.to_dict() for o in outcomes]
+    write_csv(files["csv"], table)
+    files["parquet"].unlink(missing_ok=True)
+    write_parquet(files["parquet"], table)
+    if as_json:
+        typer.echo(json.dumps({"protocols": table, "winners": won}, indent=1))
+        return
+    _print_outcomes(outcomes)
+    typer.echo(f"{files['html']}, {files['csv'].name}, {files['parquet'].name}")
+
+
+def _print_outcomes(outcomes: list[Outcome]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from uwbsim.comparison_page import COLUMNS
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for k, name in enumerate(COLUMNS):
+        head = name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors")
+        table.add_column(head, justify="left" if k == 0 else "right", no_wrap=True)
+    for outcome in outcomes:
+        table.add_row(*(show(outcome) for show in COLUMNS.values()))
+    Console(width=None if sys.stdout.isatty() else 140).print(table)
+
+
+def predict(
+    protocol: Annotated[str, typer.Option(help="ss, ss-cfo, ds, ds-alt or ds-sym.")] = "ds",
+    skew_ppm: Annotated[float, typer.Option(help="How much faster the initiator's clock runs.")] = 0.0,
+    reply_delay_us: Annotated[float, typer.Option(min=0.0, help="The target's reply, dt32.")] = 300.0,
+    final_delay_us: Annotated[float, typer.Option(min=0.0, help="The third message's delay, dt53.")] = 1538.7,
+    distance_m: Annotated[float, typer.Option(min=0.0, help="Distance.")] = 5.0,
+    speed_mps: Annotated[float, typer.Option(help="Speed apart.")] = 0.0,
+    drift_ppm_per_s: Annotated[float, typer.Option(help="Change of the relative skew.")] = 0.0,
+    tx_noise_ps: Annotated[float, typer.Option(min=0.0, help="Noise of transmit stamps.")] = 0.0,
+    rx_noise_ps: Annotated[float, typer.Option(min=0.0, help="Noise of receive stamps.")] = 150.0,
+    carrier_noise_ppm: Annotated[float, typer.Option(min=0.0, help="Noise of the carrier integrator.")] = 0.2,
+    carrier_bias_ppm: Annotated[float, typer.Option(help="Its bias.")] = 0.0,
+    delay_initiator_ns: Annotated[float, typer.Option(help="Antenna delay of the initiator.")] = 0.0,
+    delay_target_ns: Annotated[float, typer.Option(help="Antenna delay of the target.")] = 0.0,
+    whole_ticks: Annotated[bool, typer.Option("--whole-ticks", help="Stamps are whole ticks of 15.65 ps.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Say mean and standard deviation of a range without simulating any."""
+    from uwbsim.question import Question, answer
+
+    found = answer(
+        Question(
+            protocol,
+            skew_ppm,
+            reply_delay_us,
+            final_delay_us,
+            distance_m,
+            speed_mps,
+            drift_ppm_per_s,
+            tx_noise_ps,
+            rx_noise_ps,
+            carrier_noise_ppm,
+            carrier_bias_ppm,
+            delay_initiator_ns,
+            delay_target_ns,
+            whole_ticks,
+        )
+    )
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+        return
+    typer.echo(f"{found['title']}")
+    typer.echo(f"  bias                 {100 * found['bias_m']:+10.4f} cm")
+    typer.echo(f"  standard deviation   {100 * found['std_m']:10.4f} cm")
+    for name, part in found["parts_m"].items():
+        typer.echo(f"    of {name:17s} {100 * part:10.4f} cm")
+
+
+def optimum(
+    scenario: ScenarioFile,
+    protocols: Protocols = ALL,
+    overhead_us: Annotated[float, typer.Option(min=0.0, help="What an exchange takes besides.")] = 0.0,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture of the curves' folder.")] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Find the delay of the scheduled message that gives the least variance per second of air time."""
+    import math
+
+    from uwblink.recording import check_output
+    from uwbsim.compare import chosen
+    from uwbsim.folders import check_folder
+    from uwbsim.optimum import optimum as run
+    from uwbsim.reading import load
+
+    rows = chosen([name.strip() for name in protocols.split(",") if name.strip()])
+    loaded = load(scenario, settings or ())
+    if output:
+        check_folder(output)
+        for row in rows if output.is_dir() else ():
+            check_output(output / f"optimum-{row.name}.png", force=force)
+    found = [run(loaded, row, overhead_us * 1e-6) for row in rows]
+    if output:
+        from uwbsim.figures import png
+        from uwbsim.figures_of_protocols import optimum_curve
+
+        output.mkdir(exist_ok=True)
+        for one in found:
+            (output / f"optimum-{one.protocol}.png").write_bytes(png(optimum_curve(one)))
+    if as_json:
+        typer.echo(json.dumps([one.to_dict() for one in found], indent=1))
+        return
+    typer.echo(f"{'protocol':10s}{'best delay':>12s}{'one range':>12s}{'takes':>10s}{'mean of 1 s':>14s}")
+    for one in found:
+        typer.echo(
+            f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} us{100 * one.std_m:9.2f} cm{1e6 * one.duration_s:7.0f} us"
+            f"{1e3 * math.sqrt(one.score_m2s):11.3f} mm" + ("  (the edge of what boards take)" if one.on_edge else "")
+        )
+
+
+def sweep(
+    plan: Annotated[Path, typer.Argument(help="What to vary (.toml).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")],
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; all cores if not given.")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler that runs already.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where a killed sweep ended.")] = False,
+) -> None:
+    """Run a scenario many times with other settings and seeds; killed and resumed it repeats nothing."""
+    from uwbsim.sweep import run_sweep
+    from uwbsim.sweep_plan import load_plan
+
+    loaded = load_plan(plan)
+    with progress(loaded.name, eta=True) as report:
+        summary = run_sweep(loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=report)
+    typer.echo(
+        f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} were there "
+        "already; results.csv, results.parquet"
+    )
