@@ -66,10 +66,20 @@ class Store:
     def create(cls, path: Path, identity: Mapping[str, Any]) -> Self:
         """Make a new store; `identity` says what its results are of."""
         db = _connect(path)
+        db.execute("BEGIN")
         db.execute("CREATE TABLE identity (key VARCHAR, value VARCHAR)")
         db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
         db.execute("CREATE TABLE results (number BIGINT, part BIGINT, document VARCHAR)")
+        db.execute("COMMIT")
         return cls(db)
+
+    @staticmethod
+    def begun(path: Path) -> bool:
+        """Return whether a file is there and holds anything: a kill at the very start leaves an empty one."""
+        if not path.exists():
+            return False
+        with _connect(path) as db:
+            return bool(db.execute("SELECT 1 FROM information_schema.tables").fetchall())
 
     @classmethod
     def open(cls, path: Path) -> Self:

@@ -58,7 +58,7 @@ def run_sweep(
     try:
         folder.mkdir(exist_ok=True)
         path = folder / STORE
-        with Store.open(path) if path.exists() else Store.create(path, _identity(plan)) as store:
+        with Store.open(path) if Store.begun(path) else Store.create(path, _identity(plan)) as store:
             known = store.done()
             done, failed = _work(plan, store, team, known, progress)
             export(store, folder / "results.csv", folder / "results.parquet")
@@ -73,10 +73,10 @@ def _identity(plan: Plan) -> dict[str, Any]:
 
 def _check(plan: Plan, folder: Path, *, resume: bool) -> None:
     path = folder / STORE
-    if not path.exists():
-        if resume:
+    if not Store.begun(path):
+        if resume and not path.exists():
             raise ScenarioError(f"--resume: {folder} holds no sweep to go on with")
-        if folder.is_dir() and any(folder.iterdir()):
+        if folder.is_dir() and any(item.name != STORE for item in folder.iterdir()):
             raise ScenarioError(f"{folder}: holds other files; give an empty folder or a new one")
         return
     with Store.open(path) as store:
