@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup demo test lint format bench bench-large bench-boards accuracy fidelity endurance lock clean
+.PHONY: help setup demo test lint format bench bench-large bench-workbench bench-boards accuracy fidelity endurance lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -43,6 +43,9 @@ bench: setup ## measure speed and memory; prints the table of the README
 
 bench-large: setup ## measure a calibration of 3.8 million exchanges (a minute, 3 GB)
 	$(BIN)/python -m benchmarks.large
+
+bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
+	$(BIN)/python -m benchmarks.workbench
 
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy

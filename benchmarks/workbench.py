@@ -1,0 +1,170 @@
+"""Measure the protocol workbench: engines side by side, workers, the overhead of Dask, memory of a sweep."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.__main__ import row, timed
+
+ROOT = Path(__file__).parents[1]
+TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
+SWEEP = """[sweep]
+scenario = "{scenario}"
+protocols = ["ss-cfo", "ds"]
+ranges = 200_000
+seeds = {seeds}
+[vary]
+"ranging.response_delay_uus" = [300, 1500]
+"""
+
+
+def main() -> None:
+    """Print one row a figure."""
+    if len(sys.argv) > 1:
+        print(MEASURES[sys.argv[1]](*sys.argv[2:]))
+        return
+    print("| what | goal | measured |\n|---|---|---|")
+    row("DS-TWR with noise and skew, vectorised, one core", "5 M/s", f"{alone('plain')} M/s", at_least=True)
+    row("the same with all effects of the icra2023 flights", "1 M/s", f"{alone('full')} M/s", at_least=True)
+    row("a million ranges, integer stamps beside floats: means apart, in standard errors", "4", alone("means"))
+    row("their variances apart", "2 %", alone("variances"))
+    one, two = float(alone("sweep", "1")), float(alone("sweep", "2"))
+    row("a sweep with two workers, over one", "1.8", f"{one / two:.2f} ({one:.1f} s, {two:.1f} s)", at_least=True)
+    row("Dask's overhead at the default chunk, over processes", "5 %", alone("dask"))
+    few, many = float(alone("memory", "4")), float(alone("memory", "400"))
+    row("peak memory of a sweep of 400 runs, over one of 4", "", f"{many:.0f} MB, {few:.0f} MB")
+
+
+def alone(name: str, *arguments: str) -> str:
+    """Measure in a process of its own, with one thread for linear algebra."""
+    environment = dict(os.environ) | {"OPENBLAS_NUM_THREADS": "1"}
+    words = [sys.executable, "-m", "benchmarks.workbench", name, *arguments]
+    return subprocess.run(words, capture_output=True, text=True, check=True, env=environment).stdout.strip()
+
+
+def plain() -> str:
+    """Millions of ranges a second with six noisy stamps and skewed clocks."""
+    from uwblink.ticks import SPEED_OF_LIGHT
+    from uwbsim.conditions import STATES, Conditions
+
+    start = {"flight": 5 / SPEED_OF_LIGHT, "rate_initiator": 5e-6, "rate_target": -5e-6, "at_once": 305e-6}
+    one = Conditions.single(**start, scheduled=1538.7e-6, rx_std=1e-10, tx_std=1e-10)
+    return _rate(one[np.zeros(STATES, dtype=np.int64)])
+
+
+def full() -> str:
+    """The same with motion, power-dependent bias and noise, reflections, whole ticks and the transmission grid."""
+    from uwbsim.conditions import conditions_of
+    from uwbsim.reading import load
+
+    return _rate(conditions_of(load(TEST1, ["radio.tx_noise_ps=40"])))
+
+
+def _rate(conditions: object, count: int = 4_000_000) -> str:
+    from uwblink.twr import PROTOCOLS
+    from uwbsim.montecarlo import error_pieces
+
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    seconds = timed(lambda: [None for _ in error_pieces(PROTOCOLS["ds"], conditions, 1, count)])  # type: ignore[arg-type]
+    return f"{count / seconds / 1e6:.1f}"
+
+
+def engines() -> tuple[np.ndarray, np.ndarray, float]:
+    """A million ranges by integer stamps and by floats, over the same states; the standard error of a difference."""
+    from uwblink.twr import PROTOCOLS, raw_range
+    from uwbsim.conditions import conditions_of
+    from uwbsim.montecarlo import range_errors_m
+    from uwbsim.predict import predict
+    from uwbsim.reading import load
+    from uwbsim.simulate import simulate
+
+    settings = ["ranging.rate_hz=250", "scenario.duration_s=4000", "radio.tx_noise_ps=40"]
+    scenario = load(TEST1, settings)
+    flight = simulate(scenario, contention=False)
+    exact = raw_range(flight.exchanges) - flight.truth_m
+    conditions = conditions_of(scenario, 1_000_000)
+    fast = range_errors_m(PROTOCOLS["ds"], conditions, 99, len(conditions))
+    noise = float(predict(PROTOCOLS["ds"], conditions).variance_m2.mean())
+    return exact, fast, float(np.sqrt(noise * (1 / len(exact) + 1 / len(fast))))
+
+
+def means() -> str:
+    exact, fast, error = engines()
+    return f"{abs(exact.mean() - fast.mean()) / error:.1f} (n = {len(exact):,})"
+
+
+def variances() -> str:
+    exact, fast, _ = engines()
+    return f"{100 * abs(exact.var() / fast.var() - 1):.2f} %"
+
+
+def sweep(workers: str, seeds: str = "60") -> str:
+    """Seconds of a sweep."""
+    from uwbsim.sweep import run_sweep
+    from uwbsim.sweep_plan import load_plan
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan.toml"
+        path.write_text(SWEEP.format(scenario=TEST1, seeds=seeds))
+        plan = load_plan(path)
+        start = time.perf_counter()
+        run_sweep(plan, Path(folder) / "out", workers=int(workers))
+        return f"{time.perf_counter() - start:.2f}"
+
+
+def dask() -> str:
+    """How much longer a chunk of a second takes when Dask hands it out, measured on chunks alone."""
+    from distributed import Client, LocalCluster
+
+    from uwbsim.sweep import _task
+    from uwbsim.sweep_plan import load_plan
+    from uwbsim.sweep_run import run_chunk
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan.toml"
+        path.write_text(SWEEP.format(scenario=TEST1, seeds=40))
+        plan = load_plan(path)
+        _, once = run_chunk([_task(plan, 0)])
+        _, once = run_chunk([_task(plan, 1)])
+        size = max(int(1 / once), 1)
+        chunk = [_task(plan, k % plan.total) for k in range(size)]
+        with (
+            LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+            Client(cluster) as client,
+        ):
+            client.submit(run_chunk, chunk, pure=False).result()
+            start = time.perf_counter()
+            futures = [client.submit(run_chunk, chunk, pure=False) for _ in range(8)]
+            inside = sum(future.result()[1] for future in futures)
+            whole = time.perf_counter() - start
+    return f"{100 * (whole / inside - 1):.1f} % (chunks of {inside / 8:.2f} s)"
+
+
+def memory(seeds: str) -> str:
+    """Peak memory of a sweep in this process, in MB."""
+    from uwbsim.sweep import run_sweep
+    from uwbsim.sweep_plan import load_plan
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan.toml"
+        path.write_text(SWEEP.format(scenario=TEST1, seeds=int(seeds) // 2).replace("200_000", "20_000"))
+        run_sweep(load_plan(path), Path(folder) / "out", workers=1)
+    return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}"
+
+
+MEASURES = {
+    "plain": plain, "full": full, "means": means, "variances": variances, "sweep": sweep, "dask": dask,
+    "memory": memory,
+}  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
