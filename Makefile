@@ -26,8 +26,8 @@ demo: setup ## simulate three flights, fit, evaluate; writes demo/report.html
 	$(BIN)/calib fit demo/train.uwb -o demo/calibration.json --force
 	$(BIN)/calib evaluate demo/test1.uwb demo/test2.uwb -c demo/calibration.json --report demo/report.html --force
 
-test: setup ## run the whole test suite
-	$(BIN)/python -m pytest
+test: setup ## run the whole test suite, on two cores
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: setup ## check style (ruff) and types (mypy)
 	$(BIN)/ruff check .

@@ -12,7 +12,7 @@ from calib.dataset import Ranges
 
 MANY_MISSING: Final = 0.05
 MANY_OUTLIERS: Final = 0.3
-SHORT_S: Final = 20.0
+SHORT_S: Final = 10.0
 
 
 def warnings_of(ranges: Ranges, applied: Applied, inliers: float, free: list[list[int]]) -> list[str]:

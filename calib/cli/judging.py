@@ -96,8 +96,9 @@ def localize(
         f"{'ICRA 2023, its own flights':34s}{paper['raw']:8.3f}{paper['calibrated']:13.3f}{paper['variance']:14.3f}"
     )
     typer.echo(
-        f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected), NEES {summary.nees:.2f} (3 expected), "
-        f"{100 * summary.accepted:.1f} % of the ranges pass the gate"
+        f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
+        f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
+        f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate"
     )
 
 

@@ -1,4 +1,4 @@
-"""Twenty seeds of the training flight, an eighth as long: errors and intervals. `make accuracy` runs two hundred."""
+"""Twenty seeds of the training flight, a twelfth as long: errors and intervals. `make accuracy` runs two hundred."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,13 @@ SEEDS = range(1, 21)
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return {share: [one(share, seed, duration_s=30.0) for seed in SEEDS] for share in (0.1, 0.3)}
+    return {share: [one(share, seed, duration_s=20.0) for seed in SEEDS] for share in (0.1, 0.3)}
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_delays_are_found_at_ten_and_thirty_per_cent_of_reflections(outcomes, loss):
-    # An eighth of the data allows 2.8 times as much as the whole flight: 10 ps at 10 %, 20 ps at 30 %.
-    for share, bound_ps in ((0.1, 28), (0.3, 57)):
+    # A twelfth of the data allows 3.5 times as much as the whole flight: 10 ps at 10 %, 20 ps at 30 %.
+    for share, bound_ps in ((0.1, 35), (0.3, 70)):
         assert np.median([run[loss].delays_ps for run in outcomes[share]]) < bound_ps
 
 
@@ -28,8 +28,8 @@ def test_intervals_hold(outcomes, loss):
     assert 0.90 < np.mean(scores < 1.959964) < 0.995
 
 
-@pytest.mark.parametrize(("loss", "bound_mm"), [("cauchy", 14), ("mixture", 7)])
+@pytest.mark.parametrize(("loss", "bound_mm"), [("cauchy", 17), ("mixture", 9)])
 def test_the_curve_is_found(outcomes, loss, bound_mm):
-    # 2.8 times the bounds of the whole flight (5 and 2.5 mm), for an eighth of it.
+    # 3.5 times the bounds of the whole flight (5 and 2.5 mm), for a twelfth of it.
     for runs in outcomes.values():
         assert np.median([run[loss].curve_mm for run in runs]) < bound_mm

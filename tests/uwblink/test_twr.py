@@ -11,14 +11,17 @@ from hypothesis import strategies as st
 from uwblink.ticks import METRES_PER_TICK, TICK_S, elapsed
 from uwblink.twr import PROTOCOLS, Exchanges, delay_weights, time_of_flight, truncate4
 
-INITIATOR_STAMPS = {"ds-alt": ("tx1", "rx2", "tx3"), "ds": ("tx1", "rx2", "rx3"), "ss": ("tx1", "rx2")}
+INITIATOR_STAMPS = {
+    "ss": ("tx1", "rx2"), "ss-cfo": ("tx1", "rx2"), "ds": ("tx1", "rx2", "rx3"), "ds-alt": ("tx1", "rx2", "tx3"),
+    "ds-sym": ("tx1", "rx2", "tx3"),
+}  # fmt: skip
 
 
 def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32):
     """An exchange in exact rationals, rounded to whole ticks only at the end."""
     sender = PROTOCOLS[protocol].messages[-1].sender
     true = {"tx1": 0, "rx1": flight, "tx2": flight + reply, "rx2": 2 * flight + reply}
-    if protocol != "ss":
+    if len(PROTOCOLS[protocol].messages) == 3:
         left = true["tx2" if sender == "target" else "rx2"] + third
         true |= {"tx3": left, "rx3": left + flight}
     own = INITIATOR_STAMPS[protocol]
@@ -42,7 +45,9 @@ def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32)
         fpp1_dbm=none,
         fpp2_dbm=none,
         skew1_ppm=none,
-        skew2_ppm=none,
+        skew2_ppm=np.array(
+            [float((Fraction(1) + Fraction(gamma_i, 10**6)) / (1 + Fraction(gamma_j, 10**6)) - 1) * 1e6]
+        ),
         truth_m=none,
         bits=bits,
         **stamps,
@@ -56,7 +61,7 @@ def test_elapsed_undoes_addition_whatever_the_wrap(start, duration, bits):
 
 
 @given(
-    st.sampled_from(["ds", "ds-alt"]),
+    st.sampled_from(["ds", "ds-alt", "ds-sym"]),
     st.integers(100, 10_000),
     st.integers(15_000_000, 60_000_000),
     st.integers(20_000_000, 300_000_000),
@@ -73,6 +78,14 @@ def test_double_sided_finds_the_flight_time_whatever_the_skews(protocol, flight,
 def test_single_sided_carries_half_the_relative_skew_times_the_reply():
     found = time_of_flight(exchange("ss", 1000, 98_320_384, 0, 5, -5))[0] / TICK_S
     assert found - 1000 == pytest.approx(0.5 * 10e-6 * 98_320_384, abs=1)
+
+
+def test_the_carrier_takes_the_skew_out():
+    found = time_of_flight(exchange("ss-cfo", 1000, 98_320_384, 0, 5, -5))[0] / TICK_S
+    # The reply is half a tick wrong at each end, the flight by its own skew.
+    assert found - 1000 == pytest.approx(0, abs=1)
+    blind = replace(exchange("ss-cfo", 1000, 98_320_384, 0, 5, -5), skew2_ppm=np.array([0.0]))
+    assert time_of_flight(blind)[0] == pytest.approx(time_of_flight(exchange("ss", 1000, 98_320_384, 0, 5, -5))[0])
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
