@@ -25,7 +25,7 @@ SHORTEST_TAIL: Final = 2.0
 """A mean detour below this many sigmas cannot be told from noise."""
 
 ITERATIONS: Final = 400
-SETTLED: Final = 1e-5
+SETTLED: Final = 1e-4
 LOG_ROOT_2PI: Final = 0.5 * np.log(2 * np.pi)
 
 
@@ -128,7 +128,7 @@ def _maximise(
             max(tau, SHORTEST_TAIL * float(np.sort(width)[len(width) // 2])),
             max((float(np.sum(counts * x.stray)) + beyond) / total, 1e-6),
         )
-        still = abs(float(moved)) < SETTLED * spread and np.all(np.abs(width - makeup.sigma_m) < 10 * SETTLED * spread)
+        still = abs(float(moved)) < SETTLED * spread and np.all(np.abs(width - makeup.sigma_m) < 2 * SETTLED * spread)
         makeup = updated
         if still:
             break

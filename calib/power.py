@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.bsplines import combination, derivative, matrix
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -62,10 +64,8 @@ class Curve:
 
     def __call__(self, lifted: Floats) -> Floats:
         """Return the curve at lifted powers (n,), in metres."""
-        from scipy.interpolate import BSpline
-
-        spline = BSpline(np.array(self.knots), np.array(self.coefficients), self.degree)
-        return np.asarray(spline(np.clip(lifted, *self.range)))
+        knots, coefficients = np.array(self.knots), np.array(self.coefficients)
+        return combination(np.clip(lifted, *self.range), knots, coefficients, self.degree)
 
     def inside(self, lifted: Floats) -> NDArray[np.bool_]:
         """Return which lifted powers (n,) the curve was fitted at."""
@@ -96,11 +96,8 @@ def _quantiles(ordered: Floats, shares: Floats) -> Floats:
 
 
 def basis(lifted: Floats, knots: Floats) -> Floats:
-    """Return the B-splines of `knots` at lifted powers, clamped to their span, shape (n, m)."""
-    from scipy.interpolate import BSpline
-
-    clamped = np.clip(lifted, knots[0], knots[-1])
-    return np.asarray(BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)(clamped))
+    """Return the cubic B-splines of `knots` at lifted powers, clamped to their span, shape (n, m)."""
+    return matrix(np.clip(lifted, knots[0], knots[-1]), knots, DEGREE)
 
 
 def curvature(knots: Floats) -> Floats:
@@ -109,12 +106,12 @@ def curvature(knots: Floats) -> Floats:
     The second derivatives of cubics are straight between knots, so two points of Gauss a segment are exact
     (O'Sullivan's penalty). Lengths count in spans, so the matrix has the unit of coefficients only.
     """
-    from scipy.interpolate import BSpline
-
     edges = np.unique(knots)
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
     points = np.concatenate([middle - half / np.sqrt(3), middle + half / np.sqrt(3)])
-    second = BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE).derivative(2)(points)
+    once, inner = derivative(knots, DEGREE)
+    twice, innermost = derivative(inner, DEGREE - 1)
+    second = matrix(points, innermost, DEGREE - 2) @ twice @ once
     weight = np.concatenate([half, half]) * (edges[-1] - edges[0]) ** 3
     return np.asarray((second * weight[:, None]).T @ second)
 

@@ -80,8 +80,6 @@ def _by_groups(problem: Problem, centred_m: Floats) -> tuple[Floats, Floats, Int
 
 def _penalised(design: Floats, aim: Floats, weight: Floats, penalty: Floats) -> tuple[Floats, Floats]:
     """Return coefficients held above the floor, and their covariance, with the smoothness that predicts best."""
-    from scipy.optimize import lsq_linear
-
     square, pull, count = (design.T * weight) @ design, design.T @ (weight * aim), len(aim)
     tiny = 1e-9 * np.eye(len(square)) * np.trace(square) / len(square)
     best = (np.inf, SMOOTHNESSES[0], 1.0)
@@ -93,6 +91,24 @@ def _penalised(design: Floats, aim: Floats, weight: Floats, penalty: Floats) -> 
         best = min(best, (score, smoothness, left / max(count - used, 1.0)))
     _, smoothness, dispersion = best
     whole = square + smoothness * penalty + tiny
-    root = np.linalg.cholesky(whole).T
-    solution = lsq_linear(root, np.linalg.solve(root.T, pull), bounds=(SIGMA_FLOOR_M, np.inf), tol=1e-12).x
-    return np.asarray(solution), np.asarray(dispersion * np.linalg.inv(whole))
+    return _above(whole, pull, SIGMA_FLOOR_M), np.asarray(dispersion * np.linalg.inv(whole))
+
+
+def _above(square: Floats, pull: Floats, floor: float) -> Floats:
+    """Minimise x' square x / 2 - pull' x over x not below a floor (Lawson and Hanson's active set)."""
+    held = np.zeros(len(pull), dtype=bool)
+    for _ in range(4 * len(pull)):
+        x = np.full(len(pull), floor)
+        free = ~held
+        if free.any():
+            x[free] = np.linalg.solve(square[np.ix_(free, free)], (pull - square[:, held].sum(axis=1) * floor)[free])
+        below = free & (x < floor)
+        slope = square @ x - pull
+        wrong = held & (slope < -1e-12 * np.abs(pull).max())
+        if below.any():
+            held |= below
+        elif wrong.any():
+            held[np.argmin(np.where(wrong, slope, np.inf))] = False
+        else:
+            break
+    return np.asarray(np.maximum(x, floor))
