@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib.confounding import explained_by_distance
 from calib.mixture import take_apart
 from calib.patient import Finding, Patient, pair_ids, spread_m
+from calib.power import ALPHA_DBM, lifted_power
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import intervals
 
@@ -102,8 +103,8 @@ def reflections(patient: Patient) -> Iterator[Finding]:
 def confounded(patient: Patient) -> Iterator[Finding]:
     """Power that is a function of distance and nothing else lets the curve learn distance."""
     e = patient.exchanges
-    power = np.nanmean(np.stack([e.fpp1_dbm, e.fpp2_dbm]), axis=0) if np.isfinite(e.fpp1_dbm).any() else e.fpp2_dbm
-    share = explained_by_distance(power, patient.truth_m)
+    lifted = lifted_power(e.fpp1_dbm, e.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
+    share = explained_by_distance(lifted, patient.truth_m)
     if share is not None:
         yield Finding(
             CONFOUNDED,

@@ -170,3 +170,14 @@ def test_the_offset_is_estimated(flight, tmp_path):
     write(late_poses(flight), tmp_path / "f.uwb", force=True)
     (finding,) = examine(tmp_path / "f.uwb")
     assert float(finding.remedy.split()[-1]) == pytest.approx(-0.4, abs=0.02)
+
+
+def test_power_and_distance_are_confounded_outdoors(tmp_path):
+    """Two boards on tripods, 2 to 60 m apart: within one distance, power says nothing of the bias."""
+    from tests.shared_data import ROOT, shared
+    from uwblink.importers.csv_table import import_csv
+    from uwblink.importers.mapping import load_map
+
+    table = shared("hanyang_sstwr.csv.gz")
+    import_csv(table, tmp_path / "h.uwb", load_map(ROOT / "docs" / "maps" / "hanyang.toml"))
+    assert {f.fault for f in examine(tmp_path / "h.uwb")} == {"too few pairs", "power confounded with distance"}
