@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.calibration import Applied
 from calib.confounding import explained_by_distance
-from calib.dataset import Ranges
+from calib.dataset import STATIC, Ranges
 
 MANY_MISSING: Final = 0.05
 MANY_OUTLIERS: Final = 0.3
@@ -36,7 +36,7 @@ def warnings_of(ranges: Ranges, applied: Applied, inliers: float, free: list[lis
         )
     everything = len(ranges) + sum(ranges.excluded.values())
     for reason, count in ranges.excluded.items():
-        if count > MANY_MISSING * everything:
+        if reason != STATIC and count > MANY_MISSING * everything:
             found.append(f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}")
     if 1 - inliers > MANY_OUTLIERS:
         found.append(f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.calibration import Calibration
 from calib.errors import UnanswerableError
@@ -62,10 +63,13 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
             f"{len(common)} tags have determined delays in both calibrations, at least two are needed to compare"
         )
     delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common])
-    std = np.array([np.hypot(first.delays_std_ns.get(t, 0.0), second.delays_std_ns.get(t, 0.0)) for t in common])
-    weight = 1 / np.maximum(std, 1e-6) ** 2
-    shift = float(np.sum(delta * weight) / np.sum(weight))
-    score = float(np.sum((delta - shift) ** 2 * weight))
+    # The shift is the most likely one; what is left has a covariance of one rank less.
+    covariance = sum(_covariance_ns2(c, common) for c in (first, second)) + 1e-12 * np.eye(len(common))
+    precision = np.linalg.inv(covariance)
+    weight = precision.sum(axis=0)
+    shift = float(weight @ delta / weight.sum())
+    score = float((delta - shift) @ precision @ (delta - shift))
+    std = np.sqrt(np.maximum(np.diag(covariance - 1 / weight.sum()), 0))
     low = max(first.bias_curve.range[0], second.bias_curve.range[0])
     high = min(first.bias_curve.range[1], second.bias_curve.range[1])
     grid = np.linspace(low, max(high, low + 1e-9), 400)
@@ -80,3 +84,16 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         tuple(sorted(set(first.delays_ns) - set(common))),
         tuple(sorted(set(second.delays_ns) - set(common))),
     )
+
+
+def _covariance_ns2(calibration: Calibration, tags: list[int]) -> NDArray[np.float64]:
+    """Covariance of some tags' delays: as fitted where it is known, else from the standard errors alone."""
+    found = np.diag([calibration.delays_std_ns.get(tag, 0.0) ** 2 for tag in tags])
+    known = calibration.uncertainty
+    if known is None:
+        return found
+    place = {tag: k for k, tag in enumerate(known.tags)}
+    rows = [k for k, tag in enumerate(tags) if tag in place]
+    inside = [place[tags[k]] for k in rows]
+    found[np.ix_(rows, rows)] = np.array(known.delays_ns2)[np.ix_(inside, inside)]
+    return found

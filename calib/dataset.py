@@ -128,6 +128,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
     )
 
 
+STATIC = "static"
 STATIC_S = 2.0
 STATIC_M = 0.02
 
@@ -150,7 +151,7 @@ def without_static(ranges: Ranges) -> Ranges:
     if not moves.any():
         raise UnanswerableError(f"{ranges.source}: nothing moves, so --trim-static leaves nothing")
     count = int(np.count_nonzero(~moves))
-    return replace(ranges[moves], excluded=ranges.excluded | ({"static": count} if count else {}))
+    return replace(ranges[moves], excluded=ranges.excluded | ({STATIC: count} if count else {}))
 
 
 def _truth(recording: Recording, exchanges: Exchanges) -> Floats:

@@ -9,8 +9,9 @@ centre of the core of the calibrated errors at zero: the core is told from the t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -37,7 +38,7 @@ INLIER_SIGMAS: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class FitResult:
-    """A calibration and how it came about; residuals are full-corrected errors (n,), metres, in order of time."""
+    """A calibration and how it came about; residuals are full-corrected errors (n,), metres."""
 
     calibration: Calibration
     residuals_m: Floats
@@ -71,19 +72,45 @@ def fit(
     fixed = dict(fixed_ns or {})
     problem = state(ranges, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups or {}, minimum_norm=minimum_norm)
     found = solve(problem, loss, None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT, sequential=sequential)
+    calibration = _calibration(problem, found, loss, lift, alpha_dbm, fixed, groups or {})
+    applied = calibration.apply(ranges)
+    residuals = applied.full_m - ranges.truth_m
+    inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
+    warnings = warnings_of(ranges, applied, float(np.mean(inliers)), problem.free)
+    provenance = _provenance(ranges, inliers, fixed, sequential, problem, warnings)
+    return FitResult(
+        replace(calibration, provenance=provenance),
+        residuals,
+        inliers,
+        found.success,
+        f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
+        warnings,
+    )
+
+
+def _calibration(
+    problem: Problem,
+    found: Solved,
+    loss: str,
+    lift: str,
+    alpha_dbm: float,
+    fixed: dict[int, float],
+    groups: Mapping[str, tuple[int, ...]],
+) -> Calibration:
+    """Turn parameters into a calibration: find the core of the errors, centre it, and draw sigma."""
     core = problem.error + problem.design @ found.parameters
     makeup = take_apart(core, problem.bins.number, len(problem.bins.count))
     sigma = fit_sigma(problem, core - makeup.location_m, makeup)
-    delays = problem.directions @ found.parameters[: problem.rank]
     # The centre of the core goes into a constant of the curve if delays are pinned, else into the delays.
     constant = makeup.location_m if fixed else 0.0
     shift_ns = 0.0 if fixed else -makeup.location_m / SPEED_OF_LIGHT * 1e9
-    biases = _bias_curves(problem, found, constant)
-    std = _standard_errors(problem, found)
+    delays = problem.directions @ found.parameters[: problem.rank] + shift_ns
     covariance = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
-    calibration = Calibration(
-        delays_ns=dict(zip(problem.tags, (delays + shift_ns).tolist(), strict=True)) | fixed,
-        delays_std_ns=dict(zip(problem.tags, std.tolist(), strict=True)) | dict.fromkeys(fixed, 0.0),
+    biases = _bias_curves(problem, found, constant)
+    return Calibration(
+        delays_ns=dict(zip(problem.tags, delays.tolist(), strict=True)) | fixed,
+        delays_std_ns=dict(zip(problem.tags, _standard_errors(problem, covariance), strict=True))
+        | dict.fromkeys(fixed, 0.0),
         loss=loss,
         scale_ns=found.scale / SPEED_OF_LIGHT * 1e9,
         lift=lift,
@@ -94,22 +121,7 @@ def fit(
         uncertainty=Uncertainty(
             tuple(problem.tags), _rows(covariance), _rows(_bias_covariance(problem, found)), _rows(sigma.covariance)
         ),
-        groups={
-            name: TagGroup(tuple(groups[name]), biases[name], sigma.curves[name]) for name in problem.groups
-        } if groups else {},
-    )  # fmt: skip
-    applied = calibration.apply(ranges)
-    residuals = applied.full_m - ranges.truth_m
-    inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
-    warnings = warnings_of(ranges, applied, float(np.mean(inliers)), problem.free)
-    provenance = _provenance(ranges, inliers, fixed, sequential, problem, warnings)
-    return FitResult(
-        _with_provenance(calibration, provenance),
-        residuals,
-        inliers,
-        found.success,
-        f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
-        warnings,
+        groups={name: TagGroup(tuple(tags), biases[name], sigma.curves[name]) for name, tags in groups.items()},
     )
 
 
@@ -122,12 +134,11 @@ def _bias_curves(problem: Problem, found: Solved, constant: float) -> dict[str, 
     return curves
 
 
-def _standard_errors(problem: Problem, found: Solved) -> Floats:
+def _standard_errors(problem: Problem, covariance: Floats) -> list[float]:
     """Standard errors of the delays (tags,) in ns, infinite where the data leave one free."""
-    part = found.covariance[: problem.rank, : problem.rank]
-    std = np.sqrt(np.maximum(np.diag(problem.directions @ part @ problem.directions.T), 0))
     free = {tag for group in problem.free for tag in group}
-    return np.where([tag in free for tag in problem.tags], np.inf, std)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0)).tolist()
+    return [math.inf if tag in free else value for tag, value in zip(problem.tags, std, strict=True)]
 
 
 def _bias_covariance(problem: Problem, found: Solved) -> Floats:
@@ -148,11 +159,6 @@ def _average(curves: list[Curve]) -> Curve:
 
 def _rows(matrix: Floats) -> Matrix:
     return tuple(tuple(row) for row in matrix.tolist())
-
-
-def _with_provenance(calibration: Calibration, provenance: dict[str, Any]) -> Calibration:
-    calibration.provenance.update(provenance)
-    return calibration
 
 
 def _provenance(

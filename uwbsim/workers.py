@@ -156,8 +156,14 @@ def workers_for(count: int | None, scheduler: str | None) -> Workers:
     """Return the workers that were asked for: a cluster by address, or processes, or this one if one is enough."""
     if scheduler:
         return Cluster(scheduler)
-    size = count or len(os.sched_getaffinity(0))
+    size = count or _cores()
     return Here() if size == 1 else Processes(size)
+
+
+def _cores() -> int:
+    """Return the cores that this process may use; not every system says, then all that there are."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 @contextmanager

@@ -133,7 +133,9 @@ def optimum(
     scenario: ScenarioFile,
     protocols: Protocols = ALL,
     overhead_us: Annotated[float, typer.Option(min=0.0, help="What an exchange takes besides.")] = 0.0,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture of the curves' folder.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for pictures of the curves (.png).")
+    ] = None,
     settings: Settings = None,
     as_json: AsJson = False,
     force: Force = False,
