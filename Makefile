@@ -18,13 +18,14 @@ $(STAMP): pyproject.toml requirements-dev.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
-demo: setup ## simulate three flights, fit, evaluate; writes demo/report.html
+demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/report.html
 	@mkdir -p demo
 	$(BIN)/uwbsim run scenarios/icra2023/train.toml -o demo/train.uwb --force
 	$(BIN)/uwbsim run scenarios/icra2023/test1.toml -o demo/test1.uwb --force
 	$(BIN)/uwbsim run scenarios/icra2023/test2.toml -o demo/test2.uwb --force
 	$(BIN)/calib fit demo/train.uwb -o demo/calibration.json --force
-	$(BIN)/calib evaluate demo/test1.uwb demo/test2.uwb -c demo/calibration.json --report demo/report.html --force
+	$(BIN)/calib evaluate demo/test1.uwb demo/test2.uwb -c demo/calibration.json
+	$(BIN)/calib report demo/train.uwb --tests demo/test1.uwb demo/test2.uwb -o demo/report.html --force
 
 test: setup ## run the whole test suite, on two cores
 	$(BIN)/python -m pytest -n 2 --dist loadfile

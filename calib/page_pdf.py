@@ -94,7 +94,10 @@ def _table(page: FPDF, table: Table) -> None:
     page.set_font(FAMILY, "", size)
     # Columns as wide as their widest cell, the whole never wider than the page.
     cells = [table.header, *table.rows]
-    widths = [max(page.get_string_width(row[k]) for row in cells) + 3 for k in range(columns)]
+    page.set_font(FAMILY, "B", size)
+    heads = [page.get_string_width(name) for name in table.header]
+    page.set_font(FAMILY, "", size)
+    widths = [max(heads[k], *(page.get_string_width(row[k]) for row in cells)) + 3 for k in range(columns)]
     scale = min(1.0, page.epw / sum(widths))
     with page.table(
         col_widths=tuple(w * scale for w in widths),

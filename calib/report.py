@@ -127,7 +127,7 @@ def _campaign(campaign: Campaign) -> Document:
     ranges = concatenate(judged)
     evaluation, applied = campaign.evaluation(), calibration.apply(ranges)
     trained = calibration.apply(training)
-    on_what = "tests" if campaign.tests else "the recordings it was fitted from"
+    on_what = "the tests" if campaign.tests else "the recordings it was fitted from"
     warnings = [*campaign.fit.warnings]
     if not campaign.tests:
         warnings.append("no tests were given: the figures below are of the recordings that the fit has seen")

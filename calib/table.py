@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -30,6 +32,27 @@ def print_table(evaluation: Evaluation, console: Console) -> None:
     table.add_section()
     table.add_row("all", *_cells(evaluation.overall), style="bold")
     console.print(table)
+    for line in remarks(evaluation):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def remarks(evaluation: Evaluation) -> Iterator[str]:
+    """Yield what the table has no room for: quantiles, the test before and after, coverage, what was planted."""
+    group = evaluation.overall
+    yield (
+        f"95 % of the calibrated errors lie between {100 * group.full.low_m:+.1f} and {100 * group.full.high_m:+.1f} cm"
+        f"; chi-square at 95 % rejects {100 * group.rejected:.1f} % (raw ranges with their own variance: "
+        f"{100 * group.rejected_raw:.1f} %)"
+    )
+    covered = ", ".join(f"{100 * share:.1f} % for {name} %" for name, share in group.coverage.items())
+    yield f"sigma covers {covered}"
+    planted = evaluation.planted
+    if planted:
+        rms = (sum(d**2 for d in planted.delays_ns.values()) / len(planted.delays_ns)) ** 0.5
+        yield (
+            f"from what was planted: delays {1e3 * rms:.1f} ps rms, bias curve {1e3 * planted.curve_rms_m:.1f} mm, "
+            f"whole correction {1e3 * planted.correction_rms_m:.1f} mm rms"
+        )
 
 
 def _cells(group: Group) -> list[str]:

@@ -36,6 +36,22 @@ def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
     np.testing.assert_array_equal(loop.truth_m, columns.truth_m)
 
 
+def test_the_command_can_do_without_contention(tmp_path):
+    import subprocess
+    import sys
+
+    from uwblink.recording import Recording
+
+    found = []
+    for option in ("--contention", "--no-contention"):
+        words = [Path(sys.executable).parent / "uwbsim", "run", SCENARIOS / "noiseless.toml", option]
+        words += ["-o", tmp_path / f"{option}.uwb", "--set", "scenario.duration_s=3", "--set", "ranging.rate_hz=100"]
+        subprocess.run(words, check=True, capture_output=True)
+        with Recording.open(tmp_path / f"{option}.uwb") as recording:
+            found.append(recording.exchanges())
+    np.testing.assert_array_equal(found[0].rx3, found[1].rx3)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_means_and_variances_are_those_of_integer_stamps(name):
     settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "scenario.duration_s=300", "radio.tx_noise_ps=40"]

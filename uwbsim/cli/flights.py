@@ -28,6 +28,10 @@ def run(
     wire: Annotated[
         bool, typer.Option("--through-wire", help="Encode and decode every report, and record the bytes.")
     ] = False,
+    contention: Annotated[
+        bool,
+        typer.Option(help="Let exchanges meet in the event loop; without, none disturbs another, and it is faster."),
+    ] = True,
     force: Force = False,
 ) -> None:
     """Simulate a scenario and write what its boards and motion capture record."""
@@ -39,7 +43,7 @@ def run(
     check_output(output, force=force)
     loaded = load(scenario, settings or (), seed)
     with progress(loaded.scenario.name) as report:
-        simulated = simulate(loaded, report)
+        simulated = simulate(loaded, report, contention=contention)
     frames: list[tuple[int, str, str, bytes]] = []
     if wire:
         simulated, frames = through_wire(simulated)
