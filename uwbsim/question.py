@@ -35,7 +35,7 @@ class Question:
 
 
 def answer(q: Question) -> dict[str, Any]:
-    """Return bias and standard deviation of a range in metres, and the parts of the latter by source."""
+    """Return bias and standard deviation of a range, in metres and as time of flight, and the latter's parts by source."""
     (protocol,) = chosen([q.protocol])
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
@@ -73,5 +73,8 @@ def answer(q: Question) -> dict[str, Any]:
         "title": protocol.title,
         "bias_m": bias,
         "std_m": variance**0.5,
+        "variance_m2": variance,
+        "bias_ps": bias / SPEED_OF_LIGHT * 1e12,
+        "std_ps": variance**0.5 / SPEED_OF_LIGHT * 1e12,
         "parts_m": {name: float(part[0]) ** 0.5 for name, part in parts.items()},
     }
