@@ -35,7 +35,7 @@ class Question:
 
 
 def answer(q: Question) -> dict[str, Any]:
-    """Return bias and standard deviation of a range, in metres and as time of flight, and the latter's parts by source."""
+    """Return bias and standard deviation of a range, in metres and as time of flight, and the parts of the latter."""
     (protocol,) = chosen([q.protocol])
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
