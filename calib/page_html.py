@@ -83,4 +83,6 @@ def _table(table: Table) -> str:
     for k, row in enumerate(table.rows):
         last = " class='all'" if table.total and k == len(table.rows) - 1 else ""
         rows.append(f"<tr{last}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
-    return f"<div class='wide'><table><thead>{above}<tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    many = " class='many'" if len(table.header) > MANY else ""
+    body = f"<thead>{above}<tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
+    return f"<div class='wide'><table{many}>{body}</table></div>"

@@ -92,6 +92,7 @@ def test_the_campaign_has_every_section_in_order(campaign):
     ]  # fmt: skip
     assert "heard by others" in page
     assert "ICRA 2023, Table II" in page
+    assert page.count("class='many'") == 2, "the tables by pair are set smaller"
     assert not re.findall(r"(?:src|href)=['\"](?!data:)", page)
 
 
