@@ -7,6 +7,7 @@ for exchanges that disturb no other. Noise comes from the same named streams, so
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -71,20 +72,15 @@ class _Ticks:
         self.moving = bool(np.any(c.flight_rate))
 
 
+@dataclass(frozen=True, slots=True)
 class _Draws:
     """Standard draws for one piece; None where the conditions need none."""
 
-    __slots__ = ("carrier", "detour", "phase", "receive", "transmit")
-
-    def __init__(
-        self,
-        transmit: list[Floats] | None,
-        receive: list[Floats] | None,
-        carrier: Floats | None,
-        phase: dict[str, Floats] | None,
-        detour: Floats | None,
-    ) -> None:
-        self.transmit, self.receive, self.carrier, self.phase, self.detour = transmit, receive, carrier, phase, detour
+    transmit: list[Floats] | None
+    receive: list[Floats] | None
+    carrier: Floats | None
+    phase: dict[str, Floats] | None
+    detour: Floats | None
 
 
 class _Noise:
