@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
+from dataclasses import dataclass, fields
+from typing import Any, Final
 
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.compare import chosen
 from uwbsim.conditions import Conditions
+from uwbsim.errors import ScenarioError
 from uwbsim.predict import predict
+
+LARGEST: Final = 1e9
+SHORTEST_US: Final = 1.0
+"""A third message that follows at once leaves nothing to tell the clocks' rates from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +41,17 @@ class Question:
 
 
 def answer(q: Question) -> dict[str, Any]:
-    """Return bias and standard deviation of a range, in metres and as time of flight, and the parts of the latter."""
+    """Return bias and standard deviation of a range, in metres and as time of flight, and the parts of the latter.
+
+    Raises `ScenarioError` for a number that cannot be, and for an unknown protocol.
+    """
     (protocol,) = chosen([q.protocol])
+    for field in fields(q):
+        value = getattr(q, field.name)
+        if isinstance(value, float) and not (math.isfinite(value) and abs(value) < LARGEST):
+            raise ScenarioError(f"--{field.name.replace('_', '-')}: found {value}, expected a number below {LARGEST:g}")
+    if q.final_delay_us < SHORTEST_US:
+        raise ScenarioError(f"--final-delay-us: found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}")
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
     target_waits = timings[1] == "scheduled"

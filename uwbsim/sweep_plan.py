@@ -85,9 +85,9 @@ def load_plan(path: Path) -> Plan:
     design = _word(path, head, "design", DESIGNS, "grid")
     kind = _word(path, head, "kind", KINDS, "compare")
     protocols = head.get("protocols", list(PROTOCOLS) if kind == "compare" else ["ds"])
-    if not isinstance(protocols, list) or not protocols or not all(p in PROTOCOLS for p in protocols):
-        wrong = [p for p in protocols if p not in PROTOCOLS] if isinstance(protocols, list) else [protocols]
-        raise ScenarioError(f"{path}: sweep.protocols: found {wrong}, allowed: {', '.join(PROTOCOLS)}")
+    named = isinstance(protocols, list) and all(isinstance(p, str) and p in PROTOCOLS for p in protocols)
+    if not named or not protocols:
+        raise ScenarioError(f"{path}: sweep.protocols: found {protocols!r}, allowed: {', '.join(PROTOCOLS)}")
     vary, listed = table.get("vary", {}), table.get("list", [])
     axes, rows = _points(path, head, design, vary, listed)
     plan = Plan(
@@ -162,7 +162,7 @@ def _whole(path: Path, head: Mapping[str, Any], key: str, default: int, low: int
 
 def _seeds(path: Path, head: Mapping[str, Any]) -> tuple[int, ...]:
     value = head.get("seeds", 1)
-    seeds = list(range(1, value + 1)) if type(value) is int else value
+    seeds = list(range(1, value + 1)) if type(value) is int and value <= MOST_RUNS else value
     if not isinstance(seeds, list) or not seeds or not all(type(s) is int and s >= 0 for s in seeds):
         raise ScenarioError(f"{path}: sweep.seeds: found {value!r}, expected a number of seeds or a list of them")
     return tuple(seeds)

@@ -128,6 +128,8 @@ def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
         (["compare", TEST1, "-o", "out", "-n", "0"], ["-n", "expected 1 to"]),
         (["compare", TEST1, "-o", "no/out"], ["does not exist"]),
         (["predict", "--protocol", "aloha"], ["aloha", "allowed"]),
+        (["predict", "--skew-ppm", "nan"], ["--skew-ppm", "nan"]),
+        (["predict", "--final-delay-us", "0"], ["--final-delay-us", "at least"]),
         (["optimum", "no.toml"], ["no such"]),
         (["sweep", "no.toml", "-o", "out"], ["no such"]),
         (["run", TEST1, "-o", "o.uwb", "--through-wire", "--set", "ranging.protocol=ds-sym"], ["ds-sym", "boards"]),

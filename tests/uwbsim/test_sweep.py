@@ -230,6 +230,8 @@ def test_a_scheduler_that_does_not_answer_is_named(alone, tmp_path, monkeypatch)
         (HEAD + 'kind = "guess"\n', "compare, calibrate"),
         (HEAD + "ranges = 0\n", "whole number"),
         (HEAD + "seeds = -1\n", "seeds"),
+        (HEAD + "seeds = 10000000000000000000\n", "seeds"),
+        (HEAD.replace('["ss-cfo", "ds"]', "[[1]]"), "sweep.protocols"),
         (HEAD.replace('"ds"', '"tdoa"'), "tdoa"),
         (HEAD + '[vary]\n"ranging.rate_hz" = 5\n', "list of values"),
         (HEAD + '[vary]\n"ranging.rate_hertz" = [5]\n', "did you mean rate_hz"),
