@@ -63,7 +63,8 @@ def moved_delay(patient: Patient) -> Iterator[Finding]:
             step = _step(centred, mine, time, cut) - (_step(centred, rest, time, cut) if rest.any() else 0.0)
             if abs(step) > abs(best):
                 best, at = step, float(cut)
-        if abs(best) > 0.12 and abs(best) > 12 * spread / np.sqrt(np.count_nonzero(mine) / 4):
+        large = abs(best) > 0.12 and abs(best) > 12 * spread / np.sqrt(np.count_nonzero(mine) / 4)
+        if large and _in_all_pairs(centred, mine, pair, time, at, best):
             moved.append((abs(best), tag, best, at))
     # Partners of the tag that moved shift with it, by less.
     for _, tag, best, at in sorted(moved)[-1:]:
@@ -73,6 +74,12 @@ def moved_delay(patient: Patient) -> Iterator[Finding]:
             f"look for a loose antenna or another voltage on tag {tag}; calibrate the two parts apart",
             0.8,
         )
+
+
+def _in_all_pairs(values: Floats, mine: NDArray[np.bool_], pair: Ints, time: Floats, cut: float, step: float) -> bool:
+    """Return whether every pair of a tag shifts alike: an antenna does that to all, a wall only to some."""
+    steps = [_step(values, mine & (pair == p), time, cut) for p in np.unique(pair[mine])]
+    return all(0.4 < one / step < 1.6 for one in steps if one)
 
 
 def _step(values: Floats, rows: NDArray[np.bool_], time: Floats, cut: float) -> float:

@@ -43,7 +43,16 @@ def _csv(calibration: Calibration) -> str:
     return "\n".join(["tag,delay_ns,delay_std_ns", *rows]) + "\n"
 
 
+def _one_curve(calibration: Calibration, form: str) -> None:
+    if calibration.groups:
+        raise BadInputError(
+            f"--to {form}: has one curve for all tags, this calibration one for each of the groups "
+            f"{', '.join(calibration.groups)}; export it as json"
+        )
+
+
 def _miluv(calibration: Calibration) -> str:
+    _one_curve(calibration, "miluv")
     original = calibration.provenance.get("miluv")
     document = dict(original) if isinstance(original, dict) else {}
     document["delays_ns"] = {str(t): d for t, d in sorted(calibration.delays_ns.items())}
@@ -55,6 +64,7 @@ def _miluv(calibration: Calibration) -> str:
 
 
 def _ros_yaml(calibration: Calibration) -> str:
+    _one_curve(calibration, "ros-yaml")
     lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}", "  tags:"]
     for tag, (tx, rx) in registers(calibration).items():
         lines += [

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.calibration import Calibration
 from calib.errors import BadInputError
 from calib.exchange_formats import FORMATS, read_miluv, registers
 from calib.fit import fit
@@ -56,3 +57,11 @@ def test_what_is_no_miluv_calibration(tmp_path, text):
     (tmp_path / "m.json").write_text(text)
     with pytest.raises(BadInputError, match=r"m\.json: not a MILUV calibration"):
         read_miluv(tmp_path / "m.json")
+
+
+@pytest.mark.parametrize("form", ["miluv", "ros-yaml"])
+def test_a_form_with_one_curve_does_not_take_groups(form):
+    grouped = fit(ranges(2000), groups={"a": (1, 2), "b": (3, 7)}).calibration
+    with pytest.raises(BadInputError, match="export it as json"):
+        FORMATS[form](grouped)
+    assert Calibration.from_json(FORMATS["json"](grouped)) == grouped
