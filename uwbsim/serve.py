@@ -110,14 +110,17 @@ class Server:
         self._selector.close()
 
     def unplug(self, tag: int) -> None:
-        """Pull a board's cable."""
+        """Pull a board's cable, from any thread: `step` does it, so that nothing closes what it waits on."""
+        self._at(self._now_ns(), partial(self._unplug, tag))
+
+    def _unplug(self, tag: int) -> None:
         terminal = self._terminals[tag]
         if terminal.fileno is not None:
             self._selector.unregister(terminal.fileno)
         terminal.unplug()
         self.bench.boards[tag].power_off()
 
-    def plug(self, tag: int) -> None:
+    def _plug(self, tag: int) -> None:
         """Plug a board in again: it boots."""
         if self._terminals[tag].fileno is None:
             self._terminals[tag].plug()
@@ -141,8 +144,8 @@ class Server:
             board = self.bench.boards[fault.tag]
             self._at(int(fault.at_s * NS_PER_S), board.hang)
         if isinstance(fault, Unplug):
-            self._at(int(fault.at_s * NS_PER_S), partial(self.unplug, fault.tag))
-            self._at(int((fault.at_s + fault.for_s) * NS_PER_S), partial(self.plug, fault.tag))
+            self._at(int(fault.at_s * NS_PER_S), partial(self._unplug, fault.tag))
+            self._at(int((fault.at_s + fault.for_s) * NS_PER_S), partial(self._plug, fault.tag))
 
     def _printed(self, time_ns: int, tag: int, data: bytes) -> None:
         """Send what a board prints, in one write, unless a fault says otherwise."""
