@@ -50,6 +50,8 @@ def scale_sensitivity(scales_ns: list[float], fits: list[Calibration], chosen_ns
         chosen_ns, 0.98, " chosen", transform=axes.get_xaxis_transform(), va="top", fontsize="small", color="0.35"
     )
     axes.set_xscale("log")
+    axes.set_xticks(scales_ns, [f"{scale:.3g}" for scale in scales_ns])
+    axes.set_xticks([], minor=True)
     label(axes, "scale of the loss (ns of flight)", "change of the delay (ps)")
     axes.legend(frameon=False, fontsize="small", ncols=2)
     return figure

@@ -62,5 +62,6 @@ def trajectories(one: Localization) -> Figure:
     above.set_aspect("equal", adjustable="datalim")
     label(above, "east (m)", "north (m)")
     label(height, "time (s)", "up (m)")
-    above.legend(frameon=False, fontsize="x-small", loc="upper right")
+    # Below the panels: a path may run anywhere inside them.
+    figure.legend(*above.get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=3)
     return figure

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from calib.localization import PAPER_RMSE_M, Localization, summarize
+from calib.localization import PAPER_RMSE_M, Localization, Summary, summarize
 from calib.localization import STAGES as FILTERS
 from calib.pages import Block, Heading, Picture, Table, Text
 
@@ -38,8 +38,7 @@ def localization(found: list[Localization]) -> list[Block]:
             f"{total.nis:.2f} (1 expected, 95 % bounds {total.nis_bounds[0]:.2f} to {total.nis_bounds[1]:.2f}, "
             f"{100 * total.nis_inside:.0f} % of the values within their own), the mean NEES {total.nees:.2f} (3 "
             f"expected, {total.nees_bounds[0]:.2f} to {total.nees_bounds[1]:.2f}, {100 * total.nees_inside:.0f} %); "
-            f"{100 * total.accepted:.1f} % of the ranges pass the gate. Reflections, which sigma does not hold, lift "
-            "both above their bounds.",
+            f"{100 * total.accepted:.1f} % of the ranges pass the gate. {_verdict(total)}",
             "note",
         ),
         Picture("rmse", partial(figures_of_tracks.rmse_bars, found), "RMSE of the position in every scenario."),
@@ -59,6 +58,17 @@ def localization(found: list[Localization]) -> list[Block]:
             ),
         ]
     return blocks
+
+
+def _verdict(total: Summary) -> str:
+    """Say what it means where NIS or NEES lie."""
+    above = total.nis > total.nis_bounds[1] or total.nees > total.nees_bounds[1]
+    below = total.nis < total.nis_bounds[0] or total.nees < total.nees_bounds[0]
+    if above:
+        return "Above their bounds: the filter is surer than it should be, as with reflections, which sigma leaves out."
+    if below:
+        return "Below their bounds: the filter is less sure than it could be, as where a gate refuses the tail."
+    return "Both lie within: the filter knows how good it is."
 
 
 def _reductions(one: Localization) -> list[str]:

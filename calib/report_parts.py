@@ -145,8 +145,8 @@ def curves(ranges: Ranges, applied: Applied, calibration: Calibration) -> list[B
         Picture(
             "bias",
             partial(figures.bias_over_power, ranges, applied, calibration),
-            "Bias over lifted first-path power: medians of the delay-corrected errors, and the curve with its band. A "
-            "tail of reflections lifts the medians above the curve, which follows the core.",
+            "Bias over lifted first-path power: medians of the delay-corrected errors, and the curve with its band. "
+            "Where there are reflections their tail lifts the medians above the curve, which follows the core.",
         ),
         Picture(
             "sigma",

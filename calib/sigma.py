@@ -8,12 +8,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.errors import UnanswerableError
 from calib.mixture import Makeup, take_apart
 from calib.power import DEGREE, SIGMA_FLOOR_M, SIGMA_SEGMENTS, Curve, basis, curvature, equal_bins, knots_for
 from calib.problem import Problem
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+FEWEST: Final = 20
+"""Ranges of a combination of groups from which a standard deviation is estimated."""
 
 SMOOTHNESSES: Final = np.logspace(-6, 2, 17)
 """Weights of the penalty that are tried; generalised cross-validation chooses."""
@@ -63,17 +67,26 @@ def fit_sigma(problem: Problem, centred_m: Floats, makeup: Makeup) -> SigmaFit:
 
 
 def _by_groups(problem: Problem, centred_m: Floats) -> tuple[Floats, Floats, Ints, Floats]:
-    """Take the errors of every combination of groups apart on their own, in bins of power."""
+    """Take the errors of every combination of groups apart on their own, in bins of power.
+
+    Raises `UnanswerableError` for a group that is in no combination with enough ranges for a bin.
+    """
     shares = np.column_stack([problem.share(k) for k in range(len(problem.groups))])
     kinds, kind = np.unique(shares, axis=0, return_inverse=True)
     parts = []
     for k in range(len(kinds)):
         rows = np.flatnonzero(kind == k)
-        if len(rows) < 60:
+        if len(rows) < FEWEST:
             continue
         own = equal_bins(problem.lifted[rows], 12)
         sigma = take_apart(centred_m[rows], own.number, len(own.count)).sigma_m
         parts.append((own.middle, sigma, own.count, np.tile(kinds[k], (len(sigma), 1))))
+    covered = np.any([share.any(axis=0) for *_, share in parts], axis=0) if parts else np.zeros(len(problem.groups))
+    for name, enough in zip(problem.groups, covered, strict=True):
+        if not enough:
+            raise UnanswerableError(
+                f"--group: group {name!r} has too few ranges for a curve, at least {FEWEST} are needed"
+            )
     where, sigma, counts, share = (np.concatenate(column) for column in zip(*parts, strict=True))
     return where, sigma, counts, share
 

@@ -17,6 +17,9 @@ from calib.delays import Local
 
 Floats = NDArray[np.float64]
 
+FIRST: Final = 1e-6
+"""Where the iteration begins: the penalty's trace over the data's."""
+
 ITERATIONS: Final = 100
 SETTLED: Final = 1e-3
 RANGE: Final = (1e-9, 1e9)
@@ -34,8 +37,7 @@ def ridge_for(near: Local, x: Floats, penalties: list[Floats]) -> tuple[Floats, 
     hold = HOLD * float(np.trace(near.curvature)) / len(x) * np.any(np.sum(penalties, axis=0) != 0, axis=1)
     aim = near.curvature @ x + near.pull
     ranks = [int(np.linalg.matrix_rank(penalty)) for penalty in penalties]
-    weights = [near.dispersion * float(np.trace(near.curvature)) / max(float(np.trace(p)), 1e-300) for p in penalties]
-    weights = [1e-6 * w / near.dispersion for w in weights]
+    weights = [FIRST * float(np.trace(near.curvature)) / max(float(np.trace(p)), 1e-300) for p in penalties]
     for _ in range(ITERATIONS):
         ridge = _sum(weights, penalties) + np.diag(hold)
         inverse = np.linalg.pinv(near.curvature + ridge, rcond=1e-13)

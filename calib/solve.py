@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.delays import Solution, local, robust_fit, scale_of
+from calib.delays import local, robust_fit, scale_of
 from calib.mixture_fit import refine
 from calib.problem import Problem
 from calib.smoothing import ridge_for
@@ -23,7 +23,7 @@ PILOT: Final = 6000
 """Rows of the sample on which a start is found; from there, a few Newton steps over all rows suffice."""
 
 FIRST_SMOOTHNESS: Final = 1e-6
-"""Of the pilot's curve, before the data are asked: per row, over the largest curvature."""
+"""Of the pilot's curve, before the data are asked: a row's share of the penalty's trace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def solve(problem: Problem, loss: str, scale_m: float | None, *, sequential: boo
     joint = robust_fit(problem.design, -problem.error, robust, width, ridge, start, problem.blocks, near=True)
     steps += joint.steps
     if loss != MIXTURE:
-        return _solved(joint, steps)
+        return Solved(joint.parameters, joint.covariance, joint.scale, steps, joint.success)
     likely = refine(
         problem.design,
         problem.error,
@@ -107,7 +107,3 @@ def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None) -> 
     parameters = np.concatenate([alone.parameters, curves.parameters[1:]])
     steps = alone.steps + first.steps + curves.steps
     return Solved(parameters, covariance, alone.scale, steps, alone.success and curves.success)
-
-
-def _solved(found: Solution, steps: int) -> Solved:
-    return Solved(found.parameters, found.covariance, found.scale, steps, found.success)

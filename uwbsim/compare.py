@@ -15,7 +15,7 @@ from uwbsim.air import RECEIVER_ON_S, TURNAROUND_S
 from uwbsim.conditions import Conditions, conditions_of
 from uwbsim.errors import ScenarioError
 from uwbsim.frame_times import after_marker_s, before_marker_s, exchange_air_s, frame_s, message_bytes
-from uwbsim.montecarlo import error_pieces, range_errors_m
+from uwbsim.montecarlo import range_errors_m
 from uwbsim.predict import predict
 from uwbsim.scenario import Scenario
 
@@ -23,6 +23,9 @@ Floats = NDArray[np.float64]
 
 MOST: Final = 50_000_000
 """Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""
+
+MEDIAN_REPLY_S: Final = 305e-6
+"""Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
 
 WINNER_DELAYS_US: Final = (300, 600, 1000, 1500, 2000, 3000, 5000)
 
@@ -80,13 +83,12 @@ def compare(
     conditions = conditions_of(scenario)
     outcomes, samples = [], {}
     for number, protocol in enumerate(protocols):
-        errors = np.empty(count)
-        begin = 0
-        for piece in error_pieces(protocol, conditions, scenario.scenario.seed, count):
-            errors[begin : begin + len(piece)] = piece
-            begin += len(piece)
+
+        def report(share: float, number: int = number) -> None:
             if progress:
-                progress((number + begin / count) / len(protocols))
+                progress((number + share) / len(protocols))
+
+        errors = range_errors_m(protocol, conditions, scenario.scenario.seed, count, report)
         outcomes.append(_outcome(scenario, protocol, conditions, errors))
         samples[protocol.name] = errors[:200_000].copy()
     return outcomes, samples
@@ -124,7 +126,7 @@ def costs(scenario: Scenario, protocol: Protocol, scheduled_s: float | None = No
     symbols = scenario.radio.preamble_symbols
     scheduled = scheduled_s or scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S
     reply = scenario.ranging.reply
-    at_once = reply.delay_us * 1e-6 if reply.model == "fixed" else 305e-6
+    at_once = reply.delay_us * 1e-6 if reply.model == "fixed" else MEDIAN_REPLY_S
     lengths = message_bytes(protocol)
     marker, end = 0.0, after_marker_s(lengths[0])
     radio = 2 * frame_s(lengths[0], symbols)

@@ -6,7 +6,7 @@ for exchanges that disturb no other. Noise comes from the same named streams, so
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,17 +24,25 @@ METRES: Final = TICK_S * SPEED_OF_LIGHT
 SIDES: Final = ("initiator", "target")
 
 
-def range_errors_m(protocol: Protocol, conditions: Conditions, seed: int, count: int) -> Floats:
+def range_errors_m(
+    protocol: Protocol,
+    conditions: Conditions,
+    seed: int,
+    count: int,
+    progress: Callable[[float], None] | None = None,
+) -> Floats:
     """Return the errors of `count` ranges in metres, (count,); range k meets the state k modulo their number.
 
     An error is the range by the protocol's formula less the mean distance at its first two messages, before any
-    calibration.
+    calibration. `progress` is called with the done fraction.
     """
     errors = np.empty(count)
     begin = 0
     for part in error_pieces(protocol, conditions, seed, count):
         errors[begin : begin + len(part)] = part
         begin += len(part)
+        if progress:
+            progress(begin / count)
     return errors
 
 
