@@ -99,8 +99,8 @@ def timed(work: Callable[[], object]) -> float:
 
 def simulating(*, passive: bool = False) -> float:
     """Return how many exchanges of the training flight are simulated in a second."""
-    from uwbsim.reading import load
-    from uwbsim.simulate import simulate
+    from uwbsim.scenario.loading import load
+    from uwbsim.simulation.run import simulate
 
     scenario = load(TRAIN, [f"tags.{k}.passive=true" for k in range(6)] if passive else [])
     count = len(simulate(scenario).exchanges)
@@ -109,8 +109,8 @@ def simulating(*, passive: bool = False) -> float:
 
 def fitting(recording: Path) -> float:
     """Return the time to fit what is already in memory, in seconds."""
-    from calib.dataset import load
-    from calib.fit import fit
+    from calib.estimation.fitting import fit
+    from calib.ranges import load
 
     ranges = load(recording)
     return timed(lambda: fit(ranges))
@@ -118,7 +118,7 @@ def fitting(recording: Path) -> float:
 
 def loading(folder: Path) -> float:
     """Return the time to read a million random exchanges into columns, in seconds."""
-    from uwblink.recording import Recording
+    from uwblink.recording.file import Recording
     from uwblink.twr import COLUMNS, Exchanges
 
     rng = np.random.default_rng(1)

@@ -36,14 +36,14 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
     """Simulate, fit with each loss, and compare with what was planted."""
     import tempfile
 
-    from calib.dataset import load
-    from calib.evaluation import evaluate
-    from calib.fit import fit
-    from uwbsim.reading import load as load_scenario
-    from uwbsim.simulate import simulate, write
+    from calib.estimation.fitting import fit
+    from calib.evaluation.statistics import evaluate
+    from calib.ranges import load
+    from uwbsim.scenario.loading import load as load_scenario
+    from uwbsim.simulation.run import simulate, write
 
-    settings = [f"scenario.seed={seed}", f"radio.multipath.probability={share}"]
-    settings += [f"scenario.duration_s={duration_s}"] if duration_s else []
+    settings = [f"run.seed={seed}", f"radio.multipath.probability={share}"]
+    settings += [f"run.duration_s={duration_s}"] if duration_s else []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "flight.uwb"
         write(simulate(load_scenario(TRAIN, settings)), path)
@@ -54,7 +54,7 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
         judged = evaluate(ranges, calibration)
         if judged.planted is None or calibration.uncertainty is None:
             sys.exit("the scenario planted nothing")
-        error = np.array([judged.planted.delays_ns[tag] for tag in calibration.uncertainty.tags])
+        error = np.array([judged.planted.delay_error_ns[tag] for tag in calibration.uncertainty.tags])
         count = len(error)
         centre = np.eye(count) - 1 / count
         std = np.sqrt(np.diag(centre @ np.array(calibration.uncertainty.delays_ns2) @ centre))

@@ -56,7 +56,7 @@ def ten_boards(folder: Path) -> None:
         for k in range(10)
     )
     scenario = folder / "ten.toml"
-    scenario.write_text(f"[scenario]\nduration_s = 60\n[ranging]\nrate_hz = 100\n{bodies}\n{tags}")
+    scenario.write_text(f"[run]\nduration_s = 60\n[ranging]\nrate_hz = 100\n{bodies}\n{tags}")
     server = subprocess.Popen(
         [str(BIN / "uwbsim"), "serve", str(scenario), "--link-dir", str(folder / "ports")], stdout=subprocess.PIPE
     )
@@ -79,7 +79,7 @@ def ten_boards(folder: Path) -> None:
 
 def ten_sources(folder: Path, burst: int) -> None:
     """Each source sends numbered reports; every number must be in the recording."""
-    from uwblink.recording import Recording
+    from uwblink.recording.file import Recording
 
     words = [sys.executable, "-m", "benchmarks.sources", "10", "200", str(SECONDS), str(burst)]
     source = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT)
@@ -101,7 +101,7 @@ def ten_sources(folder: Path, burst: int) -> None:
 
 
 def round_trip() -> None:
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
 
     with tempfile.TemporaryDirectory() as folder:
         server = subprocess.Popen(
@@ -125,8 +125,8 @@ def round_trip() -> None:
 def driver_share() -> None:
     """A round trip to an answerer in another process that does nothing else: driver, kernel, and its wake-up."""
     from benchmarks.sources import report
-    from uwblink.board import Board
-    from uwblink.terminals import Terminal
+    from uwblink.boards.board import Board
+    from uwblink.boards.pseudo_terminals import Terminal
 
     terminal = Terminal()
     pid = os.fork()
@@ -165,7 +165,7 @@ def timed(work: Callable[[], object], count: int) -> np.ndarray:
 
 def decoder() -> None:
     from benchmarks.sources import report
-    from uwblink.columns import ColumnDecoder
+    from uwblink.wire.bulk import ColumnDecoder
 
     data = b"".join(report(k) for k in range(200_000))
     rates = []

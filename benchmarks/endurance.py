@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwblink.recording import Recording
+from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import raw_range
 

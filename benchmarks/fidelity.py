@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.dataset import concatenate, load
-from calib.evaluation import evaluate
-from calib.fit import fit
+from calib.estimation.fitting import fit
+from calib.evaluation.statistics import evaluate
+from calib.ranges import concatenate, load
 from uwblink.ticks import TICK_S, elapsed
 from uwblink.twr import intervals, truncate4
-from uwbsim.reading import load as load_scenario
-from uwbsim.simulate import Simulated, simulate, write
+from uwbsim.scenario.loading import load as load_scenario
+from uwbsim.simulation.run import Simulated, simulate, write
 
 ROOT = Path(__file__).parents[1]
 ICRA = ROOT / "scenarios" / "icra2023"

@@ -33,8 +33,8 @@ def main() -> None:
 
 def one_size(size: int) -> list[str]:
     """Return the cells of a row."""
-    from calib.fit import fit
-    from uwblink.geometry import distances_m
+    from calib.estimation.fitting import fit
+    from uwblink.recording.distances import distances_m
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     poses, tags, ranges = flight(size)
@@ -57,9 +57,9 @@ def one_size(size: int) -> list[str]:
 
 def flight(size: int):  # type: ignore[no-untyped-def]
     """Return poses, tags and ranges of three bodies with two tags each, with planted delays, curve and tail."""
-    from calib.dataset import Ranges
-    from uwblink.geometry import distances_m
-    from uwblink.schema import Poses, Tag
+    from calib.ranges import Ranges
+    from uwblink.recording.distances import distances_m
+    from uwblink.recording.schema import Poses, Tag
     from uwblink.ticks import SPEED_OF_LIGHT
 
     rng = np.random.default_rng(1)

@@ -9,15 +9,15 @@ from __future__ import annotations
 import sys
 import time
 
-from uwblink.frames import encode
-from uwblink.messages import IdIs, Ranged
-from uwblink.terminals import Terminal
+from uwblink.boards.pseudo_terminals import Terminal
+from uwblink.wire.codec import encode
+from uwblink.wire.messages import IdReport, RangeReport
 
 PIECE = 64
 
 
 def report(number: int) -> bytes:
-    return encode(Ranged(99, 3.055, number, 1, 2, 3, 4, 5, -87.4977, -87.5239, -3.4971, 3.5222))
+    return encode(RangeReport(99, 3.055, number, 1, 2, 3, 4, 5, -87.4977, -87.5239, -3.4971, 3.5222))
 
 
 def answer(terminals: list[Terminal], seconds: float) -> set[int]:
@@ -26,7 +26,7 @@ def answer(terminals: list[Terminal], seconds: float) -> set[int]:
     while time.monotonic() < until:
         for k, terminal in enumerate(terminals):
             if b"C01\r" in terminal.read():
-                terminal.write(encode(IdIs(k)))
+                terminal.write(encode(IdReport(k)))
                 asked.add(k)
         time.sleep(0.001)
     return asked

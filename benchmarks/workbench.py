@@ -53,7 +53,7 @@ def alone(name: str, *arguments: str) -> str:
 def plain() -> str:
     """Millions of ranges a second with six noisy stamps and skewed clocks."""
     from uwblink.ticks import SPEED_OF_LIGHT
-    from uwbsim.conditions import STATES, Conditions
+    from uwbsim.protocols.conditions import STATES, Conditions
 
     start = {"flight": 5 / SPEED_OF_LIGHT, "rate_initiator": 5e-6, "rate_target": -5e-6, "at_once": 305e-6}
     one = Conditions.single(**start, scheduled=1538.7e-6, rx_std=1e-10, tx_std=1e-10)
@@ -62,15 +62,15 @@ def plain() -> str:
 
 def full() -> str:
     """The same with motion, power-dependent bias and noise, reflections, whole ticks and the transmission grid."""
-    from uwbsim.conditions import conditions_of
-    from uwbsim.reading import load
+    from uwbsim.protocols.conditions import conditions_of
+    from uwbsim.scenario.loading import load
 
     return _rate(conditions_of(load(TEST1, ["radio.tx_noise_ps=40"])))
 
 
 def _rate(conditions: object, count: int = 4_000_000) -> str:
     from uwblink.twr import PROTOCOLS
-    from uwbsim.montecarlo import error_pieces
+    from uwbsim.protocols.monte_carlo import error_pieces
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     seconds = timed(lambda: [None for _ in error_pieces(PROTOCOLS["ds"], conditions, 1, count)])  # type: ignore[arg-type]
@@ -80,13 +80,13 @@ def _rate(conditions: object, count: int = 4_000_000) -> str:
 def engines() -> tuple[np.ndarray, np.ndarray, float]:
     """A million ranges by integer stamps and by floats, over the same states; the standard error of a difference."""
     from uwblink.twr import PROTOCOLS, raw_range
-    from uwbsim.conditions import conditions_of
-    from uwbsim.montecarlo import range_errors_m
-    from uwbsim.predict import predict
-    from uwbsim.reading import load
-    from uwbsim.simulate import simulate
+    from uwbsim.protocols.conditions import conditions_of
+    from uwbsim.protocols.monte_carlo import range_errors_m
+    from uwbsim.protocols.prediction import predict
+    from uwbsim.scenario.loading import load
+    from uwbsim.simulation.run import simulate
 
-    settings = ["ranging.rate_hz=250", "scenario.duration_s=4000", "radio.tx_noise_ps=40"]
+    settings = ["ranging.rate_hz=250", "run.duration_s=4000", "radio.tx_noise_ps=40"]
     scenario = load(TEST1, settings)
     flight = simulate(scenario, contention=False)
     exact = raw_range(flight.exchanges) - flight.truth_m
@@ -108,8 +108,8 @@ def variances() -> str:
 
 def sweep(workers: str, seeds: str = "60") -> str:
     """Seconds of a sweep."""
-    from uwbsim.sweep import run_sweep
-    from uwbsim.sweep_plan import load_plan
+    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.runner import run_sweep
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
@@ -124,9 +124,9 @@ def dask() -> str:
     """How much longer a chunk of a second takes when Dask hands it out, measured on chunks alone."""
     from distributed import Client, LocalCluster
 
-    from uwbsim.sweep import _task
-    from uwbsim.sweep_plan import load_plan
-    from uwbsim.sweep_run import run_chunk
+    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.runner import _task
+    from uwbsim.sweep.task import run_chunk
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
@@ -150,8 +150,8 @@ def dask() -> str:
 
 def memory(seeds: str) -> str:
     """Peak memory of a sweep in this process, in MB."""
-    from uwbsim.sweep import run_sweep
-    from uwbsim.sweep_plan import load_plan
+    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.runner import run_sweep
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"

@@ -3,9 +3,9 @@
 import threading
 from contextlib import contextmanager
 
-from uwbsim.faults import Faults
-from uwbsim.scenario import Scenario
-from uwbsim.serve import Server
+from uwbsim.boards.server import Server
+from uwbsim.scenario.faults import Faults
+from uwbsim.scenario.model import Scenario
 
 
 def bench_scenario(seed=1, **radio):
@@ -14,7 +14,7 @@ def bench_scenario(seed=1, **radio):
     skews = {1: 1.5, 2: -2.0, 3: 0.5}
     return Scenario.model_validate(
         {
-            "scenario": {"seed": seed, "duration_s": 60.0},
+            "run": {"seed": seed, "duration_s": 60.0},
             "ranging": {"rate_hz": 100.0},
             "radio": {"first_path_at_1m_dbm": -78.0, **radio},
             "bodies": [{"name": f"b{k}", "motion": {"model": "static", "position_m": p}} for k, p in places.items()],

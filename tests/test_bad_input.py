@@ -31,7 +31,7 @@ def refused(done, status, *fragments):
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flight")
-    done = run("uwbsim", "run", NOISELESS, "-o", folder / "f.uwb", "--set", "scenario.duration_s=5")
+    done = run("uwbsim", "run", NOISELESS, "-o", folder / "f.uwb", "--set", "run.duration_s=5")
     assert done.returncode == 0, done.stderr
     done = run("calib", "fit", folder / "f.uwb", "-o", folder / "c.json")
     assert done.returncode == 0, done.stderr
@@ -45,12 +45,12 @@ def flight(tmp_path_factory):
         ("rate_hz = 160.0", "rate_hz = 9000.0", ["ranging.rate_hz", "at most"]),
         ("rate_hz = 160.0", "rate_hertz = 1.0", ["ranging.rate_hertz", "unknown key", "rate_hz"]),
         ("rate_hz = 160.0", "rate_hz = inf", ["ranging.rate_hz", "inf"]),
-        ("duration_s = 60.0", "duration_s = 0", ["scenario.duration_s", "greater than 0"]),
+        ("duration_s = 60.0", "duration_s = 0", ["run.duration_s", "greater than 0"]),
         ("id = 2\n", "id = 1\n", ["tags[1].id", "second 1"]),
         ('id = 2\nbody = "ifo001"', 'id = 2\nbody = "ifo9"', ["tags[1].body", "ifo9", "ifo001"]),
         ('protocol = "ds"', 'protocol = "tdoa"', ["ranging.protocol", "tdoa", "ds-alt"]),
         ('antenna = "dipole"', 'antenna = "yagi"', ["radio.antenna", "yagi", "isotropic"]),
-        ("[scenario]", "[scenario", ["not valid TOML", "line"]),
+        ("[run]", "[scenario", ["not valid TOML", "line"]),
     ],
 )
 def test_scenarios_that_cannot_be(tmp_path, old, new, fragments):
@@ -146,7 +146,7 @@ def test_options_that_are_not(tmp_path, flight):
 
 def test_pairs_that_cannot_determine_delays_are_status_1(tmp_path):
     done = run(
-        "uwbsim", "run", NOISELESS, "-o", tmp_path / "f.uwb", "--set", "scenario.duration_s=5",
+        "uwbsim", "run", NOISELESS, "-o", tmp_path / "f.uwb", "--set", "run.duration_s=5",
         "--set", "ranging.pairs=[[1, 3], [1, 5]]",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -162,7 +162,7 @@ def test_a_table_without_truth_is_status_1(tmp_path):
 
 def altered(source, target, change):
     """Copy a recording with its exchanges or poses changed."""
-    from uwblink.recording import Recording
+    from uwblink.recording.file import Recording
 
     with Recording.open(source) as opened:
         exchanges, poses, tags, meta = opened.exchanges(), opened.poses(), opened.tags(), opened.meta()

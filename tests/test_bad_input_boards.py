@@ -65,7 +65,7 @@ def test_what_a_board_cannot_do(ports, tmp_path):
 
 
 def test_a_port_that_is_not_a_board(ports, tmp_path):
-    from uwblink.terminals import Terminal
+    from uwblink.boards.pseudo_terminals import Terminal
 
     silent = Terminal()
     refused(run("uwblink", "info", silent.name), "b'C07\\r'", "heard nothing", "is this a ranging board")
@@ -91,7 +91,7 @@ def test_recordings_that_cannot_begin(ports, tmp_path):
 
 def test_replays_of_what_has_no_bytes(tmp_path):
     flight = tmp_path / "f.uwb"
-    assert run("uwbsim", "run", BENCH, "-o", flight, "--set", "scenario.duration_s=1").returncode == 0
+    assert run("uwbsim", "run", BENCH, "-o", flight, "--set", "run.duration_s=1").returncode == 0
     refused(run("uwblink", "replay", flight), "no bytes from boards")
     refused(run("uwblink", "replay", flight, "--serve"), "no bytes from boards")
     refused(run("uwblink", "replay", tmp_path / "no.uwb"), "no such")
@@ -120,8 +120,8 @@ def test_links_that_cannot_be(tmp_path):
 
 
 def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
+    from uwblink.boards.pseudo_terminals import Terminal
     from uwblink.errors import PortError
-    from uwblink.terminals import Terminal
 
     first = Terminal(tmp_path / "tag1")
     with pytest.raises(PortError, match="somebody serves"):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from uwblink.recording import Recording
+from uwblink.recording.file import Recording
 
 ROOT = Path(__file__).parents[1]
 SCENARIOS = sorted((ROOT / "scenarios").rglob("*.toml"))
@@ -28,7 +28,7 @@ def test_scenario_runs(scenario, tmp_path):
     # Thirty hours of an exchange every twenty seconds have none in the first three seconds.
     seconds = 300 if scenario.parent.name == "wrap" else 3
     done = subprocess.run(
-        [uwbsim, "run", scenario, "-o", output, "--set", f"scenario.duration_s={seconds}"],
+        [uwbsim, "run", scenario, "-o", output, "--set", f"run.duration_s={seconds}"],
         capture_output=True,
         text=True,
     )

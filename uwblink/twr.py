@@ -152,7 +152,7 @@ def _alternative_delays(t: Intervals) -> tuple[Floats, Floats]:
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class ProtocolMessage:
     """One message of a protocol: who sends it, after which stamp, and on whose timing.
 
     `timing` is `"at once"` (as soon as the software gets there) or `"scheduled"` (a delayed
@@ -165,7 +165,7 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class Protocol:
+class RangingProtocol:
     """A ranging protocol: its messages and its formulas, from which everything else follows.
 
     `flight_ticks` maps intervals to the time of flight in ticks of the initiator's clock;
@@ -175,48 +175,48 @@ class Protocol:
 
     name: str
     title: str
-    messages: tuple[Message, ...]
+    messages: tuple[ProtocolMessage, ...]
     flight_ticks: Callable[[Intervals], Floats]
     delay_weights: Callable[[Intervals], tuple[Floats, Floats]]
 
 
-_POLL = Message("initiator", "", "at once")
+_POLL = ProtocolMessage("initiator", "", "at once")
 
-PROTOCOLS: Final[dict[str, Protocol]] = {
+PROTOCOLS: Final[dict[str, RangingProtocol]] = {
     row.name: row
     for row in (
-        Protocol(
+        RangingProtocol(
             "ss",
             "SS-TWR",
-            (_POLL, Message("target", "rx1", "scheduled")),
+            (_POLL, ProtocolMessage("target", "rx1", "scheduled")),
             _single_sided,
             _ones,
         ),
-        Protocol(
+        RangingProtocol(
             "ss-cfo",
             "SS-TWR, corrected with the carrier integrator",
-            (_POLL, Message("target", "rx1", "scheduled")),
+            (_POLL, ProtocolMessage("target", "rx1", "scheduled")),
             _carrier_corrected,
             _carrier_delays,
         ),
-        Protocol(
+        RangingProtocol(
             "ds",
             "DS-TWR, third message from the target",
-            (_POLL, Message("target", "rx1", "at once"), Message("target", "tx2", "scheduled")),
+            (_POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("target", "tx2", "scheduled")),
             _double_sided,
             _double_sided_delays,
         ),
-        Protocol(
+        RangingProtocol(
             "ds-alt",
             "DS-TWR, third message from the initiator",
-            (_POLL, Message("target", "rx1", "at once"), Message("initiator", "rx2", "scheduled")),
+            (_POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("initiator", "rx2", "scheduled")),
             _alternative,
             _alternative_delays,
         ),
-        Protocol(
+        RangingProtocol(
             "ds-sym",
             "DS-TWR, third message from the initiator, equal replies",
-            (_POLL, Message("target", "rx1", "scheduled"), Message("initiator", "rx2", "scheduled")),
+            (_POLL, ProtocolMessage("target", "rx1", "scheduled"), ProtocolMessage("initiator", "rx2", "scheduled")),
             _alternative,
             _alternative_delays,
         ),

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import uwblink
-from calib.cli import files, fitting, judging, reporting
+from calib.cli import evaluating, files, fitting, reporting
 from calib.errors import CalibError, UnanswerableError
 from uwblink.errors import UwblinkError
 
@@ -30,7 +30,7 @@ def _top(
 
 
 fitting.add_to(app)
-judging.add_to(app)
+evaluating.add_to(app)
 reporting.add_to(app)
 files.add_to(app)
 

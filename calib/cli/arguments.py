@@ -16,7 +16,7 @@ Loss = Annotated[str, typer.Option(help="cauchy, huber, soft_l1, l2 or mixture."
 Scale = Annotated[str, typer.Option(help="Scale of the loss in ns, or auto.")]
 Lift = Annotated[str, typer.Option(help="mean-of-lifted or lift-of-mean.")]
 Fix = Annotated[list[str] | None, typer.Option(metavar="TAG=NS", help="Pin a tag's known delay.")]
-Group = Annotated[Path | None, typer.Option(help="Groups of tags that share a curve (.toml).")]
+GroupFile = Annotated[Path | None, typer.Option(help="Groups of tags that share a curve (.toml).")]
 Sequential = Annotated[bool, typer.Option("--sequential", help="Delays first, then the curve (the paper's recipe).")]
 TrimStatic = Annotated[bool, typer.Option("--trim-static", help="Leave out seconds in which a pair stands still.")]
 MinimumNorm = Annotated[

@@ -26,8 +26,8 @@ def apply(
     force: Force = False,
 ) -> None:
     """Write a recording whose ranges are corrected."""
-    from calib.calibration import load
-    from calib.correction import correct
+    from calib.calibration.correction import correct
+    from calib.calibration.model import load
 
     count, clamped = correct(recording, load(calibration), output, force=force)
     typer.echo(f"{output}: {count} ranges corrected, {clamped} beyond the fitted power")
@@ -40,9 +40,9 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a calibration in another form."""
-    from calib.calibration import load, write_text
-    from calib.exchange_formats import FORMATS
-    from calib.options import one_of
+    from calib.calibration.formats import FORMATS
+    from calib.calibration.model import load, write_text
+    from calib.cli.options import one_of
 
     text = FORMATS[one_of("--to", to, FORMATS)](load(calibration))
     if output is None:
@@ -59,9 +59,9 @@ def import_miluv(
     force: Force = False,
 ) -> None:
     """Read the calibration published with the MILUV dataset."""
-    from calib.calibration import save
-    from calib.exchange_formats import read_miluv
-    from uwblink.recording import check_output
+    from calib.calibration.formats import read_miluv
+    from calib.calibration.model import save
+    from uwblink.recording.file import check_output
 
     check_output(output, force=force)
     found = read_miluv(source)

@@ -15,7 +15,7 @@ from calib.cli.arguments import (
     CalibrationFile,
     Fix,
     Force,
-    Group,
+    GroupFile,
     Lift,
     Loss,
     MinimumNorm,
@@ -27,7 +27,7 @@ from calib.cli.arguments import (
 )
 
 if TYPE_CHECKING:
-    from calib.calibration import Calibration
+    from calib.calibration.model import Calibration
 
 
 def add_to(app: typer.Typer) -> None:
@@ -43,7 +43,7 @@ def fit(
     scale: Scale = "auto",
     lift: Lift = "mean-of-lifted",
     fix: Fix = None,
-    group: Group = None,
+    group: GroupFile = None,
     sequential: Sequential = False,
     trim_static: TrimStatic = False,
     minimum_norm: MinimumNorm = False,
@@ -51,11 +51,11 @@ def fit(
     force: Force = False,
 ) -> None:
     """Fit antenna delays and power curves."""
-    from calib.calibration import save
+    from calib.calibration.model import save
+    from calib.cli.options import fit_options, load_all
     from calib.errors import UnanswerableError
-    from calib.fit import fit as run
-    from calib.options import fit_options, load_all
-    from uwblink.recording import check_output
+    from calib.estimation.fitting import fit as run
+    from uwblink.recording.file import check_output
 
     options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
     check_output(output, force=force)
@@ -99,11 +99,11 @@ def add_tag(
     force: Force = False,
 ) -> None:
     """Add a new tag to a calibration."""
-    from calib.calibration import load as load_calibration
-    from calib.calibration import save
-    from calib.dataset import load
-    from calib.new_tag import add_tag as run
-    from uwblink.recording import check_output
+    from calib.calibration.model import load as load_calibration
+    from calib.calibration.model import save
+    from calib.estimation.new_tag import add_tag as run
+    from calib.ranges import load
+    from uwblink.recording.file import check_output
 
     check_output(output, force=force)
     found = run(load(recording), load_calibration(calibration), tag)

@@ -14,7 +14,7 @@ from calib.cli.arguments import (
     AsJson,
     Fix,
     Force,
-    Group,
+    GroupFile,
     Lift,
     Loss,
     MinimumNorm,
@@ -25,10 +25,10 @@ from calib.cli.arguments import (
 )
 
 if TYPE_CHECKING:
-    from calib.calibration import Calibration
-    from calib.dataset import Ranges
-    from calib.localization import Localization
-    from calib.options import FitOptions
+    from calib.calibration.model import Calibration
+    from calib.cli.options import FitOptions
+    from calib.evaluation.localization import Localization
+    from calib.ranges import Ranges
 
 MANY: Final = "--tests"
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
@@ -63,7 +63,7 @@ def report(
     scale: Scale = "auto",
     lift: Lift = "mean-of-lifted",
     fix: Fix = None,
-    group: Group = None,
+    group: GroupFile = None,
     sequential: Sequential = False,
     trim_static: TrimStatic = False,
     minimum_norm: MinimumNorm = False,
@@ -73,12 +73,12 @@ def report(
     """Fit, judge and localize, and write it all as one page."""
     from rich.console import Console
 
-    from calib.dataset import concatenate
-    from calib.doctor import examine
-    from calib.fit import fit
-    from calib.options import check_folder, fit_options, load_each
-    from calib.report import Campaign, to_dict, write_campaign
-    from uwblink.recording import check_output
+    from calib.cli.options import check_folder, fit_options, load_each
+    from calib.doctor.examine import examine
+    from calib.estimation.fitting import fit
+    from calib.ranges import concatenate
+    from calib.report.report import Campaign, to_dict, write_campaign
+    from uwblink.recording.file import check_output
 
     options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
     for path in filter(None, (output, pdf)):
@@ -114,7 +114,7 @@ def report(
 
 def _refits(ranges: Ranges, calibration: Calibration, options: FitOptions) -> dict[float, Calibration]:
     """Fit again with other scales of the loss; the mixture and least squares have none."""
-    from calib.fit import MIXTURE, fit
+    from calib.estimation.fitting import MIXTURE, fit
 
     if calibration.loss in (MIXTURE, "l2"):
         return {}
@@ -128,16 +128,16 @@ def _refits(ranges: Ranges, calibration: Calibration, options: FitOptions) -> di
 
 def _heard(recordings: list[Path], calibration: Calibration) -> dict[int, Any]:
     """Delays by passive listeners, from the first recording that has them."""
-    from calib.listeners import heard_delays
+    from calib.estimation.passive_listeners import heard_delays
 
     return next(filter(None, (heard_delays(path, calibration) for path in recordings)), {})
 
 
 def _tracks(recordings: list[Path], calibration: Calibration) -> list[Localization]:
     """Localize in every recording that has a body to localize; a report does without those that have none."""
-    from calib.dataset import load_flight
     from calib.errors import UnanswerableError
-    from calib.localization import localize
+    from calib.evaluation.localization import localize
+    from calib.ranges import load_flight
 
     found: list[Localization] = []
     for path in recordings:

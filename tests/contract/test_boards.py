@@ -8,12 +8,12 @@ import os
 import pytest
 
 from tests.boards import bench_scenario, served
-from uwblink import messages as m
-from uwblink.board import Board
+from uwblink.boards.board import Board
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.ticks import elapsed
 from uwblink.twr import truncate4
-from uwbsim.virtual_port import VirtualPorts
+from uwblink.wire import messages as m
+from uwbsim.boards.virtual_port import VirtualPorts
 
 ABSENT = 9
 
@@ -40,11 +40,11 @@ def test_every_plain_command_is_answered(pair):
     for command, reply in (
         (m.SetIdle(), m.IdleSet()),
         (m.Reset(), m.ResetDone()),
-        (m.GetMaxFrame(), m.MaxFrameIs(100)),
+        (m.GetMaxFrame(), m.MaxFrameReport(100)),
         (m.SetPassive(False), m.PassiveSet()),
     ):
         assert one.request(command) == reply
-    assert one.request(m.GetId()) == m.IdIs(one.id)
+    assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
 def test_every_kind_of_field_survives_the_way_there_and_back(pair):
@@ -88,10 +88,10 @@ def test_the_target_reports_the_same_numbers_when_asked_to(pair, protocol):
     one, two = pair
     list(two.reports(0.05))
     report = one.range(two.id, protocol=protocol, target_reports=True)
-    said = [e for e in two.reports(0.1) if isinstance(e, m.TargetRanged)]
+    said = [e for e in two.reports(0.1) if isinstance(e, m.TargetRangeReport)]
     assert len(said) == 1
     assert said[0].neighbour == one.id
-    for name in m.Ranged.FIELDS:
+    for name in m.RangeReport.FIELDS:
         if name != "neighbour":
             assert getattr(said[0], name) == getattr(report, name)
 
@@ -100,7 +100,7 @@ def test_an_absent_target_fails_with_the_board_s_own_line(pair):
     one, _ = pair
     with pytest.raises(RangingFailedError, match="COMMANDED TASK FAILED AFTER 5 ATTEMPTS"):
         one.range(ABSENT)
-    assert one.request(m.GetId()) == m.IdIs(one.id)
+    assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
 def test_the_own_id_is_refused_by_the_driver_and_by_the_board(pair):
@@ -142,7 +142,7 @@ def test_what_would_harm_a_board_is_never_sent(pair):
         one.range(2, protocol="tdoa")
     with pytest.raises(RefusedError):
         one.request(m.IdleSet())
-    assert one.request(m.GetId()) == m.IdIs(one.id)
+    assert one.request(m.GetId()) == m.IdReport(one.id)
 
 
 def test_many_exchanges_in_a_row_are_all_good(pair):

@@ -9,9 +9,9 @@ import sys
 import atheris
 
 with atheris.instrument_imports(include=["uwblink"]):
-    from uwblink.columns import ColumnDecoder
-    from uwblink.frames import Decoder, encode
-    from uwblink.messages import REPORTS, Ranged, Skipped, TextLine
+    from uwblink.wire.bulk import ColumnDecoder
+    from uwblink.wire.codec import Decoder, encode
+    from uwblink.wire.messages import REPORTS, RangeReport, Skipped, TextLine
 
 
 def as_bytes(event):
@@ -35,7 +35,7 @@ def check(data: bytes) -> None:
     columns.finish(len(stream))
     understood = [e for e in events if not isinstance(e, Skipped)]
     assert [e for e in found if not isinstance(e, Skipped)] == understood
-    assert len(columns.exchanges()) == sum(isinstance(e, Ranged) for e in understood)
+    assert len(columns.exchanges()) == sum(isinstance(e, RangeReport) for e in understood)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from calib.calibration import Calibration
-from calib.calibration import load as load_calibration
-from calib.dataset import concatenate, load
-from uwblink.recording import Recording
+from calib.calibration.model import Calibration
+from calib.calibration.model import load as load_calibration
+from calib.ranges import concatenate, load
+from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 
 ROOT = Path(__file__).parents[2]

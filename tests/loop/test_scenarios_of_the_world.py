@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.dataset import load as load_ranges
 from calib.errors import UnanswerableError
-from calib.evaluation import evaluate, pair_rows
-from calib.fit import fit
+from calib.estimation.fitting import fit
+from calib.evaluation.statistics import evaluate, pair_rows
+from calib.ranges import load as load_ranges
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.reading import load
-from uwbsim.simulate import simulate, write
+from uwbsim.scenario.loading import load
+from uwbsim.simulation.run import simulate, write
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -60,7 +60,7 @@ def test_obstacles_and_echoes_lengthen_ranges(tmp_path):
         ("icra2023/test2.toml", []),
         ("noiseless.toml", []),
         ("anchors_and_tag/anchors_and_tag.toml", []),
-        ("day30/train.toml", ["scenario.duration_s=60"]),
+        ("day30/train.toml", ["run.duration_s=60"]),
         ("nlos_office/office.toml", []),
         ("wrap/wrap.toml", []),
     ],

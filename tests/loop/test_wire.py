@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tests.boards import served
-from uwblink.importers.truth import add_poses
-from uwblink.plan import Plan, load_tags
-from uwblink.recorder import record
-from uwbsim.reading import load
-from uwbsim.serve import extended, write_poses
+from uwblink.boards.ranging_plan import RangingPlan, load_tags
+from uwblink.boards.recorder import record
+from uwblink.importers.motion_capture import add_poses
+from uwbsim.boards.server import extended, write_poses
+from uwbsim.scenario.loading import load
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
@@ -29,24 +29,26 @@ def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_pat
     for name, more in (("direct", []), ("wire", ["--through-wire"])):
         (tmp_path / name).mkdir()
         flight = tmp_path / name / "flight.uwb"
-        run("uwbsim", "run", TRAIN, "-o", flight, "--set", "scenario.duration_s=60", *more)
+        run("uwbsim", "run", TRAIN, "-o", flight, "--set", "run.duration_s=60", *more)
         run("calib", "fit", flight, "-o", tmp_path / name / "c.json")
     assert (tmp_path / "direct" / "c.json").read_bytes() == (tmp_path / "wire" / "c.json").read_bytes()
     run("uwblink", "replay", tmp_path / "wire" / "flight.uwb", "-o", tmp_path / "wire" / "again.uwb")
 
 
 def test_served_boards_calibrate_like_simulated_ones(tmp_path):
-    from calib.dataset import load as load_ranges
-    from calib.fit import fit
+    from calib.estimation.fitting import fit
+    from calib.ranges import load as load_ranges
 
-    scenario = load(TRAIN, ["scenario.duration_s=25"])
+    scenario = load(TRAIN, ["run.duration_s=25"])
     tags = load_tags(TRAIN)
     with served(extended(scenario, 60.0)) as server:
         write_poses(scenario, server.epoch_ns, tmp_path / "poses.csv")
-        record(list(server.names.values()), tmp_path / "boards.uwb", Plan(tags=tags, rate_hz=160.0), duration_s=22)
+        record(
+            list(server.names.values()), tmp_path / "boards.uwb", RangingPlan(tags=tags, rate_hz=160.0), duration_s=22
+        )
     added = add_poses(tmp_path / "boards.uwb", tmp_path / "poses.csv")
     assert added.covered > 0.98 * added.exchanges > 2000
-    run("uwbsim", "run", TRAIN, "-o", tmp_path / "simulated.uwb", "--set", "scenario.duration_s=22")
+    run("uwbsim", "run", TRAIN, "-o", tmp_path / "simulated.uwb", "--set", "run.duration_s=22")
     fits = [fit(load_ranges(tmp_path / f"{name}.uwb")).calibration for name in ("boards", "simulated")]
     delays = [np.array([c.delays_ns[t.tag] for t in tags]) for c in fits]
     stds = [np.array([c.delays_std_ns[t.tag] for t in tags]) for c in fits]

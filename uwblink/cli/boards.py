@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from uwblink.messages import Ranged
+    from uwblink.wire.messages import RangeReport
 
 Port = Annotated[str, typer.Argument(help="Serial port, link to one, or pyserial URL.")]
 Target = Annotated[int, typer.Argument(min=0, max=254, help="Id of the other board.")]
-Protocol = Annotated[str, typer.Option(help="ss or ds.")]
+ProtocolName = Annotated[str, typer.Option(help="ss or ds.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -36,9 +36,9 @@ def ports(
     as_json: AsJson = False,
 ) -> None:
     """List the serial devices with the boards' USB identity (0483:5740); nothing is written to any, unless probed."""
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
+    from uwblink.boards.ports import boards_ports
     from uwblink.errors import UwblinkError
-    from uwblink.ports import boards_ports
 
     found = boards_ports()
     rows = [asdict(port) for port in found]
@@ -64,16 +64,16 @@ def ports(
 
 def info(port: Port, as_json: AsJson = False) -> None:
     """Print a board's id and longest frame."""
-    from uwblink.board import Board
-    from uwblink.messages import GetMaxFrame, MaxFrameIs
-    from uwblink.ports import serial_number
+    from uwblink.boards.board import Board
+    from uwblink.boards.ports import serial_number
+    from uwblink.wire.messages import GetMaxFrame, MaxFrameReport
 
     with Board.open(port) as board:
         longest = board.request(GetMaxFrame())
         facts = {
             "port": port,
             "board": board.id,
-            "longest_frame_bytes": longest.length if isinstance(longest, MaxFrameIs) else None,
+            "longest_frame_bytes": longest.length if isinstance(longest, MaxFrameReport) else None,
             "usb_serial_number": serial_number(port),
         }
     if as_json:
@@ -89,15 +89,15 @@ def info(port: Port, as_json: AsJson = False) -> None:
 def twr(
     port: Port,
     target: Target,
-    protocol: Protocol = "ds",
+    protocol: ProtocolName = "ds",
     count: Annotated[int, typer.Option("-n", min=1, help="How many exchanges.")] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Range with another board."""
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
     from uwblink.errors import RangingFailedError
 
-    reports: list[Ranged] = []
+    reports: list[RangeReport] = []
     failures: list[RangingFailedError] = []
     with Board.open(port) as board:
         initiator = board.id
@@ -125,20 +125,20 @@ def twr(
         typer.echo(f"{len(reports)} of {count} exchanges, mean {statistics.fmean(ranges):.4f}{spread} m")
 
 
-def _line(initiator: int, report: Ranged) -> str:
+def _line(initiator: int, report: RangeReport) -> str:
     return (
         f"{initiator} -> {report.neighbour}  {report.range_m:8.4f} m  "
         f"FPP {report.fpp1_dbm:.1f} / {report.fpp2_dbm:.1f} dBm  skew {report.skew1_ppm:+.2f} ppm"
     )
 
 
-def _fields(report: Ranged) -> dict[str, float]:
+def _fields(report: RangeReport) -> dict[str, float]:
     return {name: getattr(report, name) for name in type(report).FIELDS if name != "neighbour"}
 
 
 def test(port: Port) -> None:
     """Have a board echo one field of each kind."""
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
 
     with Board.open(port) as board:
         board.test()
@@ -150,7 +150,7 @@ def set_delay(
     delay_uus: Annotated[int, typer.Argument(metavar="N", help="280 to 6500, in units of 512/499.2 us.")],
 ) -> None:
     """Set the response delay of double-sided exchanges for which this board is the target (C08)."""
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
 
     with Board.open(port) as board:
         board.set_response_delay(delay_uus)
@@ -159,7 +159,7 @@ def set_delay(
 
 def passive(port: Port, state: Annotated[str, typer.Argument(metavar="on|off")]) -> None:
     """Have a board listen to the exchanges of others, or stop to."""
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
     from uwblink.errors import RefusedError
 
     if state not in ("on", "off"):
@@ -171,7 +171,7 @@ def passive(port: Port, state: Annotated[str, typer.Argument(metavar="on|off")])
 
 def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 92 bytes in UTF-8.")]) -> None:
     """Broadcast a text to every board in range."""
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
 
     data = text.encode()
     with Board.open(port) as board:
@@ -182,15 +182,15 @@ def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 92 bytes in
 def cir(
     port: Port,
     target: Target,
-    protocol: Protocol = "ds",
+    protocol: ProtocolName = "ds",
     plot: Annotated[Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")] = None,
     force: Annotated[bool, typer.Option(help="Replace the picture if it exists.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Range with another board and print the channel impulse response."""
-    from uwblink.board import Board
+    from uwblink.boards.board import Board
     from uwblink.errors import RecordingError
-    from uwblink.recording import check_output
+    from uwblink.recording.file import check_output
 
     if plot:
         check_output(plot, force=force)
@@ -200,7 +200,7 @@ def cir(
         report, response = board.cir(target, protocol=protocol)
         initiator = board.id
     if plot:
-        from uwblink.figures import plot_cir
+        from uwblink.boards.figures import plot_cir
 
         plot_cir(response, plot)
     index = response.first_path_milli / 1000

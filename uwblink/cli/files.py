@@ -26,8 +26,8 @@ def show(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print what a recording holds."""
-    from uwblink.listing import print_summary, summarize
-    from uwblink.recording import Recording
+    from uwblink.recording.file import Recording
+    from uwblink.recording.summary import print_summary, summarize
 
     with Recording.open(recording) as opened:
         summary = summarize(opened)
@@ -47,8 +47,8 @@ def import_csv(
     force: Force = False,
 ) -> None:
     """Import ranging exchanges from a table."""
-    from uwblink.importers.csv_table import import_csv as run
-    from uwblink.importers.mapping import ColumnMap, load_map
+    from uwblink.importers.column_map import ColumnMap, load_map
+    from uwblink.importers.exchanges_csv import import_csv as run
 
     count = run(table, output, load_map(column_map) if column_map else ColumnMap(), force=force)
     typer.echo(f"{output}: {count} exchanges")
@@ -62,7 +62,7 @@ def poses(
     body: Annotated[str | None, typer.Option(help="The body of a TUM file.")] = None,
 ) -> None:
     """Add motion-capture truth to a recording of boards."""
-    from uwblink.importers.truth import add_poses
+    from uwblink.importers.motion_capture import add_poses
 
     found = add_poses(recording, source, offset=offset, tags_from=tags, body=body)
     typer.echo(
@@ -81,8 +81,8 @@ def replay(
     force: Force = False,
 ) -> None:
     """Decode the stored bytes again, or play them back as boards would have sent them."""
-    from uwblink.recording import Recording, check_output
-    from uwblink.replay import decode_again, play, rewrite, summarize
+    from uwblink.boards.replay import decode_again, play, rewrite, summarize
+    from uwblink.recording.file import Recording, check_output
 
     if output:
         check_output(output, force=force)

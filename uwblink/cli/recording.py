@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from uwblink.recorder import Progress
+    from uwblink.boards.recorder import Progress
 
 LINE_EVERY_S = 2.0
 
@@ -36,17 +36,17 @@ def record(
     """Play a ranging plan on boards and record everything they say."""
     from dataclasses import replace
 
+    from uwblink.boards.ranging_plan import RangingPlan, load_plan
+    from uwblink.boards.recorder import record as run
     from uwblink.errors import PlanError
-    from uwblink.plan import Plan, load_plan
-    from uwblink.recorder import record as run
-    from uwblink.recording import check_output
+    from uwblink.recording.file import check_output
 
     check_output(output, force=force)
     if (plan is None) == (pairs is None):
         raise PlanError("give either --plan plan.toml or --pairs all")
     if pairs not in (None, "all", "none"):
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
-    chosen = load_plan(plan) if plan else Plan("all" if pairs == "all" else ())
+    chosen = load_plan(plan) if plan else RangingPlan("all" if pairs == "all" else ())
     if rate:
         chosen = replace(chosen, rate_hz=rate)
     if cir:
@@ -92,7 +92,7 @@ def _watcher() -> Iterator[Callable[[Progress], None]]:
     from rich.console import Console
     from rich.live import Live
 
-    from uwblink.listing import progress_table
+    from uwblink.recording.summary import progress_table
 
     with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
         yield lambda progress: live.update(progress_table(progress), refresh=True)

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.errors import ImportTableError
-from uwblink.schema import Poses
+from uwblink.recording.schema import Poses
 
 NUMBERS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
 LATEST_NS: Final = 2**62

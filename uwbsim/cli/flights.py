@@ -35,14 +35,14 @@ def run(
     force: Force = False,
 ) -> None:
     """Simulate a scenario and write what its boards and motion capture record."""
-    from uwblink.recording import check_output
-    from uwbsim.reading import load
-    from uwbsim.simulate import simulate, write
-    from uwbsim.wire import through_wire
+    from uwblink.recording.file import check_output
+    from uwbsim.scenario.loading import load
+    from uwbsim.simulation.run import simulate, write
+    from uwbsim.simulation.through_wire import through_wire
 
     check_output(output, force=force)
     loaded = load(scenario, settings or (), seed)
-    with progress(loaded.scenario.name) as report:
+    with progress(loaded.run.name) as report:
         simulated = simulate(loaded, report, contention=contention)
     frames: list[tuple[int, str, str, bytes]] = []
     if wire:
@@ -50,7 +50,7 @@ def run(
     write(simulated, output, frames=frames, force=force)
     typer.echo(
         f"{output}: {len(simulated.exchanges)} exchanges of {len(loaded.tags)} tags in "
-        f"{len(loaded.pairs())} pairs, {loaded.scenario.duration_s:g} s, "
+        f"{len(loaded.pairs())} pairs, {loaded.run.duration_s:g} s, "
         f"{len(simulated.faults)} failed"
     )
 
@@ -65,10 +65,10 @@ def serve(
     force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
-    from uwblink.recording import check_output
-    from uwbsim import faults as fault_files
-    from uwbsim.reading import load
-    from uwbsim.serve import Server, extended, write_poses
+    from uwblink.recording.file import check_output
+    from uwbsim.boards.server import Server, extended, write_poses
+    from uwbsim.scenario import faults as fault_files
+    from uwbsim.scenario.loading import load
 
     if poses:
         check_output(poses, force=force)
@@ -93,9 +93,9 @@ def show(
     force: Force = False,
 ) -> None:
     """Draw the room, the flights, and one exchange of each protocol."""
-    from uwblink.recording import check_output
-    from uwbsim.reading import load
-    from uwbsim.show import show as draw
+    from uwblink.recording.file import check_output
+    from uwbsim.pages.scenario_page import show as draw
+    from uwbsim.scenario.loading import load
 
     check_output(output, force=force)
     draw(load(scenario, settings or ()), output, force=force)
@@ -110,8 +110,8 @@ def validate(
     """Say what a scenario will do, without running it."""
     from dataclasses import asdict
 
-    from uwbsim.preview import preview, sentences
-    from uwbsim.reading import load
+    from uwbsim.pages.scenario_summary import preview, sentences
+    from uwbsim.scenario.loading import load
 
     loaded = load(scenario, settings or ())
     found = preview(loaded)
@@ -137,6 +137,6 @@ def _interrupts() -> Iterator[Callable[[], bool]]:
 
 def schema() -> None:
     """Print the JSON Schema of scenario files."""
-    from uwbsim.scenario import Scenario
+    from uwbsim.scenario.model import Scenario
 
     typer.echo(json.dumps(Scenario.model_json_schema(), indent=2))

@@ -12,7 +12,7 @@ import typer
 from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
 
 if TYPE_CHECKING:
-    from uwbsim.compare import Outcome
+    from uwbsim.protocols.comparison import ProtocolErrors
 
 Protocols = Annotated[str, typer.Option(help="Names, separated by commas.")]
 ALL = "ss,ss-cfo,ds,ds-alt,ds-sym"
@@ -34,13 +34,13 @@ def compare(
     force: Force = False,
 ) -> None:
     """Range with every protocol in the same random world, and say what each knows and costs."""
-    from uwblink.recording import check_output
-    from uwblink.tables import write_csv, write_parquet
-    from uwbsim.compare import chosen, winners
-    from uwbsim.compare import compare as run
-    from uwbsim.comparison_page import page
-    from uwbsim.folders import check_folder
-    from uwbsim.reading import load
+    from uwblink.recording.file import check_output
+    from uwbsim.output import check_folder
+    from uwbsim.pages.comparison_page import page
+    from uwbsim.protocols.comparison import chosen, winners
+    from uwbsim.protocols.comparison import compare as run
+    from uwbsim.scenario.loading import load
+    from uwbsim.sweep.results import write_csv, write_parquet
 
     rows = chosen([name.strip() for name in protocols.split(",") if name.strip()])
     loaded = load(scenario, settings or ())
@@ -48,7 +48,7 @@ def compare(
     files = {kind: output / f"compare.{kind}" for kind in ("html", "csv", "parquet")}
     for path in files.values() if output.is_dir() else ():
         check_output(path, force=force)
-    with progress(loaded.scenario.name) as report:
+    with progress(loaded.run.name) as report:
         outcomes, samples = run(loaded, rows, count, report)
     won = winners(loaded, rows)
     text = page(loaded, outcomes, samples, won)
@@ -65,12 +65,12 @@ def compare(
     typer.echo(f"{files['html']}, {files['csv'].name}, {files['parquet'].name}")
 
 
-def _print_outcomes(outcomes: list[Outcome]) -> None:
+def _print_outcomes(outcomes: list[ProtocolErrors]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    from uwbsim.comparison_page import COLUMNS
+    from uwbsim.pages.comparison_page import COLUMNS
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for k, name in enumerate(COLUMNS):
@@ -99,10 +99,10 @@ def predict(
     as_json: AsJson = False,
 ) -> None:
     """Say mean and standard deviation of a range without simulating any."""
-    from uwbsim.question import Question, answer
+    from uwbsim.protocols.single_state import State, predict_state
 
-    found = answer(
-        Question(
+    found = predict_state(
+        State(
             protocol,
             skew_ppm,
             reply_delay_us,
@@ -143,11 +143,11 @@ def optimum(
     """Find the delay of the scheduled message that gives the least variance per second of air time."""
     import math
 
-    from uwblink.recording import check_output
-    from uwbsim.compare import chosen
-    from uwbsim.folders import check_folder
-    from uwbsim.optimum import optimum as run
-    from uwbsim.reading import load
+    from uwblink.recording.file import check_output
+    from uwbsim.output import check_folder
+    from uwbsim.protocols.comparison import chosen
+    from uwbsim.protocols.reply_delay import optimum as run
+    from uwbsim.scenario.loading import load
 
     rows = chosen([name.strip() for name in protocols.split(",") if name.strip()])
     loaded = load(scenario, settings or ())
@@ -157,8 +157,8 @@ def optimum(
             check_output(output / f"optimum-{row.name}.png", force=force)
     found = [run(loaded, row, overhead_us * 1e-6) for row in rows]
     if output:
-        from uwbsim.figures import png
-        from uwbsim.figures_of_protocols import optimum_curve
+        from uwbsim.pages.protocol_figures import optimum_curve
+        from uwbsim.pages.scenario_figures import png
 
         output.mkdir(exist_ok=True)
         for one in found:
@@ -182,8 +182,8 @@ def sweep(
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a killed sweep ended.")] = False,
 ) -> None:
     """Run a scenario many times with other settings and seeds; killed and resumed it repeats nothing."""
-    from uwbsim.sweep import run_sweep
-    from uwbsim.sweep_plan import load_plan
+    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.runner import run_sweep
 
     loaded = load_plan(plan)
     with progress(loaded.name, eta=True) as report:

@@ -1,0 +1,1 @@
+"""Calibrations: the model, its file, other formats, corrections, comparison."""

@@ -1,0 +1,132 @@
+"""Calibrations in other forms: register values, tables, MILUV's JSON, YAML for ROS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import ALPHA_DBM, Curve
+from calib.errors import BadInputError
+from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
+
+TX_SHARE: Final = 0.44
+RX_SHARE: Final = 0.56
+"""How an aggregate delay is split between transmitter and receiver (APS014, section 2; the authors' code)."""
+
+
+def registers(calibration: Calibration) -> dict[int, tuple[int, int]]:
+    """Return the values of the DW1000's TX and RX antenna-delay registers by tag, on top of the boards' 16436.
+
+    The chip adds the one to transmit stamps and takes the other from receive stamps. A recorded stamp is the true one
+    plus d_t = 0.44 d or d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md).
+    """
+    found = {}
+    for tag, delay in sorted(calibration.delays_ns.items()):
+        ticks = -delay * 1e-9 / TICK_S
+        found[tag] = (round(ANTENNA_DELAY_TICKS + TX_SHARE * ticks), round(ANTENNA_DELAY_TICKS + RX_SHARE * ticks))
+    return found
+
+
+def _registers(calibration: Calibration) -> str:
+    rows = [f"{tag},{tx},{rx}" for tag, (tx, rx) in registers(calibration).items()]
+    return "\n".join(["tag,tx_antenna_delay,rx_antenna_delay", *rows]) + "\n"
+
+
+def _csv(calibration: Calibration) -> str:
+    rows = [
+        f"{tag},{delay!r},{calibration.delays_std_ns.get(tag, 0.0)!r}"
+        for tag, delay in sorted(calibration.delays_ns.items())
+    ]
+    return "\n".join(["tag,delay_ns,delay_std_ns", *rows]) + "\n"
+
+
+def _one_curve(calibration: Calibration, form: str) -> None:
+    if calibration.groups:
+        raise BadInputError(
+            f"--to {form}: has one curve for all tags, this calibration one for each of the groups "
+            f"{', '.join(calibration.groups)}; export it as json"
+        )
+
+
+def _miluv(calibration: Calibration) -> str:
+    _one_curve(calibration, "miluv")
+    original = calibration.provenance.get("miluv")
+    document = dict(original) if isinstance(original, dict) else {}
+    document["delays_ns"] = {str(t): d for t, d in sorted(calibration.delays_ns.items())}
+    for key, curve in (("bias_spline_m", calibration.bias_curve), ("std_spline_m", calibration.sigma_curve)):
+        document[key] = {"knots": list(curve.knots), "coeffs": list(curve.coefficients), "degree": curve.degree}
+    document.setdefault("tx_rx_split", {"tx": TX_SHARE, "rx": RX_SHARE})
+    document.setdefault("c_mps", SPEED_OF_LIGHT)
+    return json.dumps(document, indent=1) + "\n"
+
+
+def _ros_yaml(calibration: Calibration) -> str:
+    _one_curve(calibration, "ros-yaml")
+    lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}", "  tags:"]
+    for tag, (tx, rx) in registers(calibration).items():
+        lines += [
+            f"    '{tag}':",
+            f"      delay_ns: {calibration.delays_ns[tag]!r}",
+            f"      tx_antenna_delay: {tx}",
+            f"      rx_antenna_delay: {rx}",
+        ]
+    for name, curve in (("bias_curve", calibration.bias_curve), ("sigma_curve", calibration.sigma_curve)):
+        lines += [
+            f"  {name}:",
+            f"    degree: {curve.degree}",
+            f"    knots: {json.dumps(list(curve.knots))}",
+            f"    coefficients: {json.dumps(list(curve.coefficients))}",
+            f"    range: {json.dumps(list(curve.range))}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+FORMATS: Final[dict[str, Callable[[Calibration], str]]] = {
+    "registers": _registers,
+    "json": Calibration.to_json,
+    "csv": _csv,
+    "miluv": _miluv,
+    "ros-yaml": _ros_yaml,
+}
+
+
+def read_miluv(path: Path) -> Calibration:
+    """Read the JSON form of MILUV's published calibration; raises `BadInputError`.
+
+    Its bias curve is meant for each reception, ours for the mean of an exchange's lifted powers: where the two powers
+    of an exchange are equal they are the same thing. What has no place here is kept, so that exporting gives it back.
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        delays = {int(tag): float(delay) for tag, delay in table["delays_ns"].items()}
+        bias, sigma = (_curve(table[key]) for key in ("bias_spline_m", "std_spline_m"))
+        speed = float(table.get("c_mps", SPEED_OF_LIGHT))
+    except FileNotFoundError as error:
+        raise BadInputError(f"{path}: no such file") from error
+    except (OSError, UnicodeDecodeError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise BadInputError(f"{path}: not a MILUV calibration ({type(error).__name__}: {error})") from error
+    rest = {key: value for key, value in table.items() if key not in ("delays_ns", "bias_spline_m", "std_spline_m")}
+    order = list(table)
+    return Calibration(
+        delays_ns=delays,
+        delays_std_ns=dict.fromkeys(delays, 0.0),
+        loss="cauchy",
+        scale_ns=0.1,
+        lift="mean-of-lifted",
+        alpha_dbm=ALPHA_DBM,
+        speed_of_light=speed,
+        bias_curve=bias,
+        sigma_curve=sigma,
+        provenance={"imported_from": path.name, "miluv": {key: rest.get(key) for key in order}},
+    )
+
+
+def _curve(table: dict[str, Any]) -> Curve:
+    knots = tuple(float(k) for k in table["knots"])
+    coefficients, degree = tuple(float(c) for c in table["coeffs"]), int(table["degree"])
+    if len(knots) != len(coefficients) + degree + 1 or list(knots) != sorted(knots) or knots[0] == knots[-1]:
+        raise ValueError("knots, coeffs and degree do not fit")
+    return Curve(knots, coefficients, degree, (knots[0], knots[-1]))

@@ -1,0 +1,97 @@
+"""Takes typed values out of a table read from JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from calib.calibration.power_curves import Curve
+from calib.errors import BadInputError
+
+Matrix = tuple[tuple[float, ...], ...]
+
+
+class Reader:
+    """Takes typed values out of a table; every mistake names the key."""
+
+    def __init__(self, table: dict[str, Any], where: str) -> None:
+        """Read from a table, which errors say is at `where`."""
+        self._table, self._where = table, where
+
+    def has(self, key: str) -> bool:
+        """Return whether the key is there."""
+        return key in self._table
+
+    def inside(self, key: str) -> Reader:
+        """Return a reader of the table at a key."""
+        return Reader(self.table(key), f"{self._where}: {key}")
+
+    def _value(self, key: str) -> Any:
+        if key not in self._table:
+            raise BadInputError(f"{self._where}: {key}: missing")
+        return self._table[key]
+
+    def _wrong(self, key: str, expected: str) -> BadInputError:
+        found = repr(self._table[key])
+        return BadInputError(f"{self._where}: {key}: found {found[:60]}, expected {expected}")
+
+    def number(self, key: str) -> float:
+        """Return a finite number."""
+        value = self._value(key)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise self._wrong(key, "a finite number")
+        return float(value)
+
+    def word(self, key: str) -> str:
+        """Return a text."""
+        value = self._value(key)
+        if not isinstance(value, str):
+            raise self._wrong(key, "text")
+        return value
+
+    def table(self, key: str) -> dict[str, Any]:
+        """Return a table."""
+        value = self._value(key)
+        if not isinstance(value, dict):
+            raise self._wrong(key, "a table")
+        return value
+
+    def delays(self, key: str, missing: float | None = None) -> dict[int, float]:
+        """Return numbers by tag; `missing` stands for null, which is wrong by default."""
+        table = self.table(key)
+        inner = Reader(table, f"{self._where}: {key}")
+        if not all(tag.isdecimal() and tag.isascii() for tag in table):
+            raise self._wrong(key, "tag ids as keys")
+        return {
+            int(tag): missing if value is None and missing is not None else inner.number(tag)
+            for tag, value in table.items()
+        }
+
+    def matrix(self, key: str, size: int) -> Matrix:
+        """Return rows of numbers, as many as there are in each."""
+        value = self._value(key)
+        if not isinstance(value, list) or len(value) != size:
+            raise self._wrong(key, f"{size} rows")
+        inner = Reader({str(k): row for k, row in enumerate(value)}, f"{self._where}: {key}")
+        rows = tuple(inner.numbers(str(k)) for k in range(size))
+        if any(len(row) != size for row in rows):
+            raise self._wrong(key, f"{size} numbers a row")
+        return rows
+
+    def numbers(self, key: str) -> tuple[float, ...]:
+        """Return a list of finite numbers."""
+        value = self._value(key)
+        if not isinstance(value, list) or not value:
+            raise self._wrong(key, "a list of numbers")
+        inner = Reader({str(k): v for k, v in enumerate(value)}, f"{self._where}: {key}")
+        return tuple(inner.number(str(k)) for k in range(len(value)))
+
+    def curve(self, key: str) -> Curve:
+        """Return a curve whose parts fit each other."""
+        inner = Reader(self.table(key), f"{self._where}: {key}")
+        knots, coefficients = inner.numbers("knots"), inner.numbers("coefficients")
+        span, degree = inner.numbers("range"), int(inner.number("degree"))
+        fits = len(knots) == len(coefficients) + degree + 1 and 0 <= degree <= 5
+        if not fits or list(knots) != sorted(knots) or len(span) != 2 or span[0] >= span[1]:
+            raise BadInputError(f"{self._where}: {key}: knots, coefficients, degree, range do not fit")
+        return Curve(knots, coefficients, degree, (span[0], span[1]))

@@ -1,0 +1,278 @@
+"""The result of a fit: a frozen value, JSON both ways, and how to apply it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.calibration.json_format import Matrix, Reader
+from calib.calibration.power_curves import LIFTS, Curve, basis, lifted_power
+from calib.errors import BadInputError
+from calib.ranges import Ranges
+from uwblink.recording.file import check_output
+
+Floats = NDArray[np.float64]
+
+SCHEMA_VERSION: Final = 1
+GROUPED_VERSION: Final = 2
+"""A calibration with groups of tags says so by its version: whoever knows only one curve must not read it."""
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedRanges:
+    """Ranges in three stages, metres, and what is known of them, shape (n,).
+
+    `clamped` marks lifted powers at which the curves had no data and are held constant.
+    """
+
+    raw_m: Floats
+    delay_corrected_m: Floats
+    corrected_m: Floats
+    sigma_m: Floats
+    lifted: Floats
+    clamped: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class TagGroup:
+    """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""
+
+    tags: tuple[int, ...]
+    bias_curve: Curve
+    sigma_curve: Curve
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """What is known of a fit's errors: covariance matrices as tuples of rows.
+
+    `delays_ns2` (tags, tags) goes with `tags`; `bias_m2` and `sigma_m2` (m, m) go with the coefficients of the curves.
+    """
+
+    tags: tuple[int, ...]
+    delays_ns2: Matrix
+    bias_m2: Matrix
+    sigma_m2: Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation.
+
+    A standard error is infinite where the data did not determine the delay. With `groups`, each has its own curves, and
+    the plain ones are the groups' average, for a look only.
+    """
+
+    delays_ns: dict[int, float]
+    delays_std_ns: dict[int, float]
+    loss: str
+    scale_ns: float
+    lift: str
+    alpha_dbm: float
+    speed_of_light: float
+    bias_curve: Curve
+    sigma_curve: Curve
+    provenance: dict[str, Any] = field(default_factory=dict)
+    uncertainty: Uncertainty | None = None
+    groups: dict[str, TagGroup] = field(default_factory=dict)
+
+    def lifted(self, ranges: Ranges) -> Floats:
+        """Return the lifted power of each range, as this calibration defines it."""
+        return lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
+
+    def apply(self, ranges: Ranges) -> CorrectedRanges:
+        """Correct ranges: c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section IV), then the curve.
+
+        Raises `BadInputError` naming the tags that have no delay in this calibration.
+        """
+        missing = [t for t in ranges.tags() if t not in self.delays_ns]
+        if missing:
+            known = ", ".join(map(str, sorted(self.delays_ns)))
+            raise BadInputError(
+                f"{ranges.source}: no delay for tag {', '.join(map(str, missing))} in the calibration, "
+                f"which knows {known}; fit one from a recording with all tags"
+            )
+        size = max(ranges.tags()) + 1
+        delay_s = np.array([self.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
+        flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
+        delays = ranges.raw_m + self.speed_of_light * flight
+        lifted = self.lifted(ranges)
+        return CorrectedRanges(
+            raw_m=ranges.raw_m,
+            delay_corrected_m=delays,
+            corrected_m=delays - self._curve_of(ranges, lifted, "bias_curve"),
+            sigma_m=self._curve_of(ranges, lifted, "sigma_curve"),
+            lifted=lifted,
+            clamped=~self.bias_curve.inside(lifted),
+        )
+
+    def _curve_of(self, ranges: Ranges, lifted: Floats, name: str) -> Floats:
+        if not self.groups:
+            return np.asarray(getattr(self, name)(lifted))
+        member = {tag: group for group, known in self.groups.items() for tag in known.tags}
+        lonely = [tag for tag in ranges.tags() if tag not in member]
+        if lonely:
+            raise BadInputError(f"{ranges.source}: tag {lonely[0]} is in none of the calibration's groups of tags")
+        values = np.zeros(len(ranges))
+        for known in self.groups.values():
+            share = 0.5 * np.isin(ranges.initiator, known.tags) + 0.5 * np.isin(ranges.target, known.tags)
+            rows = np.flatnonzero(share)
+            values[rows] += share[rows] * getattr(known, name)(lifted[rows])
+        return values
+
+    def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
+        """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""
+        if self.uncertainty is None:
+            return None
+        curve = self.bias_curve if which == "bias" else self.sigma_curve
+        covariance = np.array(self.uncertainty.bias_m2 if which == "bias" else self.uncertainty.sigma_m2)
+        splines = basis(np.clip(lifted, *curve.range), np.array(curve.knots))
+        return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", splines, covariance, splines), 0)))
+
+    def to_json(self) -> str:
+        """Return the calibration as JSON text."""
+        document: dict[str, Any] = {
+            "schema_version": GROUPED_VERSION if self.groups else SCHEMA_VERSION,
+            "delays_ns": {str(t): d for t, d in sorted(self.delays_ns.items())},
+            "delays_std_ns": {str(t): d if math.isfinite(d) else None for t, d in sorted(self.delays_std_ns.items())},
+            "loss": self.loss,
+            "scale_ns": self.scale_ns,
+            "lift": self.lift,
+            "alpha_dbm": self.alpha_dbm,
+            "speed_of_light": self.speed_of_light,
+            "bias_curve": _curve_table(self.bias_curve),
+            "sigma_curve": _curve_table(self.sigma_curve),
+            "provenance": self.provenance,
+        }
+        if self.groups:
+            document["groups"] = {
+                name: {
+                    "tags": list(group.tags),
+                    "bias_curve": _curve_table(group.bias_curve),
+                    "sigma_curve": _curve_table(group.sigma_curve),
+                }
+                for name, group in self.groups.items()
+            }
+        if self.uncertainty:
+            document["uncertainty"] = asdict(self.uncertainty)
+        return _rows_on_lines(json.dumps(document, indent=1, allow_nan=False)) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str, where: str = "calibration") -> Self:
+        """Read a calibration; raises `BadInputError` that says `where`, and which key is wrong."""
+        try:
+            table = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise BadInputError(f"{where}: not JSON ({error})") from error
+        if not isinstance(table, dict) or "schema_version" not in table:
+            raise BadInputError(f"{where}: not a calibration (no schema_version)")
+        if table["schema_version"] not in (SCHEMA_VERSION, GROUPED_VERSION):
+            raise BadInputError(
+                f"{where}: schema version {table['schema_version']!r}, this uwbcal reads {SCHEMA_VERSION} and "
+                f"{GROUPED_VERSION}"
+            )
+        read = Reader(table, where)
+        lift = read.word("lift")
+        if lift not in LIFTS:
+            raise BadInputError(f"{where}: lift: found {lift!r}, allowed: {', '.join(LIFTS)}")
+        return cls(
+            delays_ns=read.delays("delays_ns"),
+            delays_std_ns=read.delays("delays_std_ns", missing=math.inf),
+            loss=read.word("loss"),
+            scale_ns=read.number("scale_ns"),
+            lift=lift,
+            alpha_dbm=read.number("alpha_dbm"),
+            speed_of_light=read.number("speed_of_light"),
+            bias_curve=read.curve("bias_curve"),
+            sigma_curve=read.curve("sigma_curve"),
+            provenance=read.table("provenance"),
+            uncertainty=_uncertainty(read),
+            groups=_groups(read),
+        )
+
+
+def load(path: str | os.PathLike[str]) -> Calibration:
+    """Read a calibration file; raises `BadInputError`."""
+    source = Path(path)
+    try:
+        return Calibration.from_json(source.read_text(encoding="utf-8"), str(path))
+    except FileNotFoundError as error:
+        raise BadInputError(f"{path}: no such calibration file") from error
+    except IsADirectoryError as error:
+        raise BadInputError(f"{path}: is a directory, expected a calibration (.json)") from error
+    except UnicodeDecodeError as error:
+        raise BadInputError(f"{path}: not JSON (not UTF-8 text)") from error
+    except OSError as error:
+        raise BadInputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def save(calibration: Calibration, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write a calibration file, whole or not at all; refuses to replace one unless `force`."""
+    write_text(Path(path), calibration.to_json(), force=force)
+
+
+def write_text(path: Path, text: str, *, force: bool) -> None:
+    """Write a text file by way of a neighbour that takes its name when complete."""
+    write_bytes(path, text.encode(), force=force)
+
+
+def write_bytes(path: Path, data: bytes, *, force: bool) -> None:
+    """Write a file by way of a neighbour that takes its name when complete."""
+    check_output(path, force=force)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        raise BadInputError(f"{path}: cannot be written ({error.strerror})") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _rows_on_lines(text: str) -> str:
+    """Put lists of numbers on one line each: a matrix reads as rows."""
+    return re.sub(
+        r"\[[-+.e\d,\s]+\]", lambda found: " ".join(found[0].split()).replace("[ ", "[").replace(" ]", "]"), text
+    )
+
+
+def _curve_table(curve: Curve) -> dict[str, Any]:
+    return {
+        "knots": list(curve.knots),
+        "coefficients": list(curve.coefficients),
+        "degree": curve.degree,
+        "range": list(curve.range),
+    }
+
+
+def _uncertainty(read: Reader) -> Uncertainty | None:
+    if not read.has("uncertainty"):
+        return None
+    inner = read.inside("uncertainty")
+    tags = tuple(int(tag) for tag in inner.numbers("tags"))
+    bias, sigma = (len(read.curve(name).coefficients) for name in ("bias_curve", "sigma_curve"))
+    return Uncertainty(
+        tags,
+        inner.matrix("delays_ns2", len(tags)),
+        inner.matrix("bias_m2", bias),
+        inner.matrix("sigma_m2", sigma),
+    )
+
+
+def _groups(read: Reader) -> dict[str, TagGroup]:
+    if not read.has("groups"):
+        return {}
+    every, found = read.inside("groups"), {}
+    for name in read.table("groups"):
+        inner = every.inside(name)
+        tags = tuple(int(tag) for tag in inner.numbers("tags"))
+        found[name] = TagGroup(tags, inner.curve("bias_curve"), inner.curve("sigma_curve"))
+    return found

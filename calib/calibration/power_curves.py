@@ -1,0 +1,135 @@
+"""First-path power: lifting, and curves over lifted power."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.calibration.bsplines import combination, derivative, matrix
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+ALPHA_DBM: Final = -82.0
+DEGREE: Final = 3
+BIAS_SEGMENTS: Final = 14
+SIGMA_SEGMENTS: Final = 4
+SIGMA_BINS: Final = 30
+SIGMA_FLOOR_M: Final = 0.002
+"""A tick is 4.7 mm long; no range is better than half of one."""
+
+POPULATED: Final = (0.005, 0.995)
+"""Quantiles of lifted power between which a curve is fitted; beyond them it is held constant."""
+
+
+def lift(power_dbm: Floats, alpha_dbm: float) -> Floats:
+    """Return 10^((p - alpha)/10) (ICRA 2023, section V)."""
+    # exp takes a third of the time of a power of ten.
+    return np.asarray(np.exp((power_dbm - alpha_dbm) * (np.log(10) / 10)))
+
+
+def _mean_of_lifted(fpp1: Floats, fpp2: Floats, alpha: float) -> Floats:
+    return (lift(fpp1, alpha) + lift(fpp2, alpha)) / 2
+
+
+def _lift_of_mean(fpp1: Floats, fpp2: Floats, alpha: float) -> Floats:
+    return lift((fpp1 + fpp2) / 2, alpha)
+
+
+LIFTS: Final[dict[str, Callable[[Floats, Floats, float], Floats]]] = {
+    "mean-of-lifted": _mean_of_lifted,
+    "lift-of-mean": _lift_of_mean,
+}
+
+
+def lifted_power(fpp1_dbm: Floats, fpp2_dbm: Floats, how: str, alpha_dbm: float) -> Floats:
+    """Lifted power of exchanges (n,); where one end's power is missing, the other's serves."""
+    first = np.where(np.isfinite(fpp1_dbm), fpp1_dbm, fpp2_dbm)
+    second = np.where(np.isfinite(fpp2_dbm), fpp2_dbm, fpp1_dbm)
+    return LIFTS[how](first, second, alpha_dbm)
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A B-spline over lifted power, held constant outside `range`, where nothing was measured."""
+
+    knots: tuple[float, ...]
+    coefficients: tuple[float, ...]
+    degree: int
+    range: tuple[float, float]
+
+    def __call__(self, lifted: Floats) -> Floats:
+        """Return the curve at lifted powers (n,), in metres."""
+        knots, coefficients = np.array(self.knots), np.array(self.coefficients)
+        return combination(np.clip(lifted, *self.range), knots, coefficients, self.degree)
+
+    def inside(self, lifted: Floats) -> NDArray[np.bool_]:
+        """Return which lifted powers (n,) the curve was fitted at."""
+        return (lifted >= self.range[0]) & (lifted <= self.range[1])
+
+
+def populated(ordered: Floats) -> tuple[float, float]:
+    """Return the range of lifted power, sorted (n,), in which there are data to fit a curve to."""
+    low, high = _quantiles(ordered, np.array(POPULATED))
+    return float(low), float(high)
+
+
+def knots_for(ordered: Floats, segments: int) -> Floats:
+    """Return clamped knots with `segments` intervals, halfway between equal counts and equal lengths, of sorted powers.
+
+    Equal counts alone leave the sparse high powers to one long segment, equal lengths the sparse ones without data.
+    """
+    low, high = populated(ordered)
+    quantiles = np.clip(_quantiles(ordered, np.linspace(0, 1, segments + 1)), low, high)
+    inner = (quantiles + np.linspace(low, high, segments + 1)) / 2
+    inner[[0, -1]] = low, high
+    return np.concatenate([[low] * DEGREE, inner, [high] * DEGREE])
+
+
+def _quantiles(ordered: Floats, shares: Floats) -> Floats:
+    """Interpolate linearly between sorted values, as `numpy.quantile` does with unsorted ones."""
+    return np.asarray(np.interp(shares * (len(ordered) - 1), np.arange(len(ordered)), ordered))
+
+
+def basis(lifted: Floats, knots: Floats) -> Floats:
+    """Return the cubic B-splines of `knots` at lifted powers, clamped to their span, shape (n, m)."""
+    return matrix(np.clip(lifted, knots[0], knots[-1]), knots, DEGREE)
+
+
+def curvature(knots: Floats) -> Floats:
+    """Return the integral of products of the splines' second derivatives over their span, shape (m, m).
+
+    The second derivatives of cubics are straight between knots, so two points of Gauss a segment are exact
+    (O'Sullivan's penalty). Lengths count in spans, so the matrix has the unit of coefficients only.
+    """
+    edges = np.unique(knots)
+    middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+    points = np.concatenate([middle - half / np.sqrt(3), middle + half / np.sqrt(3)])
+    once, inner = derivative(knots, DEGREE)
+    twice, innermost = derivative(inner, DEGREE - 1)
+    second = matrix(points, innermost, DEGREE - 2) @ twice @ once
+    weight = np.concatenate([half, half]) * (edges[-1] - edges[0]) ** 3
+    return np.asarray((second * weight[:, None]).T @ second)
+
+
+@dataclass(frozen=True, slots=True)
+class Bins:
+    """Ranges in bins of power of equal count: the bin of each (n,), the middle power of each bin, and its count."""
+
+    number: Ints
+    middle: Floats
+    count: Ints
+
+
+def equal_bins(lifted: Floats, most: int = SIGMA_BINS, order: Ints | None = None) -> Bins:
+    """Return bins of lifted powers (n,), at least 20 each, in order of power; `order` sorts them, if that is known."""
+    count, size = min(most, max(1, len(lifted) // 20)), len(lifted)
+    order = np.argsort(lifted) if order is None else order
+    number = np.empty(size, dtype=np.int64)
+    number[order] = np.arange(size) * count // size
+    edges = -(-np.arange(count + 1) * size // count)
+    return Bins(number, lifted[order[(edges[1:] + edges[:-1]) // 2]], np.diff(edges))

@@ -1,0 +1,151 @@
+"""Commands that judge: evaluate, localize, doctor, compare."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.arguments import CalibrationFile, Force, Recordings
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    for command in (evaluate, localize, doctor, compare):
+        app.command()(command)
+
+
+def evaluate(
+    recordings: Recordings,
+    calibration: CalibrationFile,
+    report: Annotated[Path | None, typer.Option(help="Report to write (.html).")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    force: Force = False,
+) -> None:
+    """Compare raw, delay-corrected and fully corrected ranges with the truth."""
+    from calib.calibration.model import load as load_calibration
+    from calib.evaluation.statistics import evaluate as run
+    from calib.ranges import concatenate, load
+    from uwblink.recording.file import check_output
+
+    if report:
+        check_output(report, force=force)
+    known = load_calibration(calibration)
+    parts = [load(path) for path in recordings]
+    evaluation = run(concatenate(parts), known)
+    if report:
+        from calib.report.report import write_report
+
+        write_report(report, parts, known, force=force)
+    if as_json:
+        typer.echo(json.dumps(evaluation.to_dict(), indent=1))
+        return
+    from rich.console import Console
+
+    from calib.cli.table import WIDE, print_table
+
+    print_table(evaluation, Console(width=None if sys.stdout.isatty() else WIDE))
+    if report:
+        typer.echo(f"report: {report}")
+
+
+def localize(
+    recordings: Recordings,
+    calibration: CalibrationFile,
+    tum: Annotated[Path | None, typer.Option(help="Folder for trajectories (.tum).")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    force: Force = False,
+) -> None:
+    """Track each body with an EKF: raw, calibrated, and calibrated with its variance."""
+    from dataclasses import asdict
+
+    from calib.calibration.model import load as load_calibration
+    from calib.calibration.model import write_text
+    from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, as_tum, summarize
+    from calib.evaluation.localization import localize as run
+    from calib.ranges import load_flight
+
+    known = load_calibration(calibration)
+    found = [one for path in recordings for one in run(load_flight(path), known)]
+    if tum:
+        tum.mkdir(parents=True, exist_ok=True)
+        for one in found:
+            for stage, track in one.tracks.items():
+                name = "".join(c if c.isalnum() or c in "-_" else "_" for c in f"{one.source}-{one.body}-{stage}")
+                write_text(tum / f"{name}.tum", as_tum(track), force=force)
+    summary = summarize(found)
+    if as_json:
+        rows = [
+            {"recording": one.source, "body": one.body, "rmse_m": {s: one.tracks[s].rmse_m for s in FILTERS}}
+            for one in found
+        ]
+        typer.echo(json.dumps({"scenarios": rows, "summary": asdict(summary)}, indent=1))
+        return
+    typer.echo(f"{'RMSE of the position (m)':34s}{'raw':>8s}{'calibrated':>13s}{'and variance':>14s}")
+    for one in found:
+        figures = [one.tracks[stage].rmse_m for stage in FILTERS]
+        typer.echo(f"{one.source + ' ' + one.body:34s}{figures[0]:8.3f}{figures[1]:13.3f}{figures[2]:14.3f}")
+    mean, less = summary.rmse_m, summary.reduction
+    typer.echo(f"{'mean':34s}{mean['raw']:8.3f}{mean['calibrated']:13.3f}{mean['variance']:14.3f}")
+    typer.echo(f"{'':42s}{-100 * less['calibrated']:+12.0f} %{-100 * less['variance']:+12.0f} %")
+    paper = PAPER_RMSE_M
+    typer.echo(
+        f"{'ICRA 2023, its own flights':34s}{paper['raw']:8.3f}{paper['calibrated']:13.3f}{paper['variance']:14.3f}"
+    )
+    typer.echo(
+        f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
+        f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
+        f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate"
+    )
+
+
+def doctor(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Name what is wrong with a recording, with the evidence and the remedy."""
+    from dataclasses import asdict
+
+    from calib.doctor.examine import examine
+
+    findings = examine(recording)
+    if as_json:
+        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
+        return
+    if not findings:
+        typer.echo(f"{recording}: nothing found")
+    for finding in findings:
+        typer.echo(f"{finding.fault} (confidence {finding.confidence:.2f})")
+        typer.echo(f"  evidence: {finding.evidence}")
+        typer.echo(f"  remedy:   {finding.remedy}")
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(help="Calibration (.json).")],
+    second: Annotated[Path, typer.Argument(help="Calibration (.json).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say whether two calibrations differ by more than they do not know."""
+    from calib.calibration.comparison import compare as run
+    from calib.calibration.model import load
+
+    found = run(load(first), load(second))
+    if as_json:
+        typer.echo(json.dumps(found.to_dict(), indent=1))
+        return
+    for tag, difference in found.difference_ns.items():
+        typer.echo(f"  tag {tag:3d}  {1e3 * difference:+8.1f} ps  ± {1e3 * found.std_ns[tag]:.1f}")
+    typer.echo(
+        f"offset of all ranges {100 * found.offset_m:+.1f} cm, "
+        f"shape of the bias curves {100 * found.curve_rms_m:.1f} cm rms"
+    )
+    for name, tags in ((first, found.only_first), (second, found.only_second)):
+        if tags:
+            typer.echo(f"only in {name}: tags {', '.join(map(str, tags))}")
+    typer.echo(
+        f"the delays are {'the same' if found.same else 'different'}: chi-square {found.chi_square:.1f} with "
+        f"{len(found.difference_ns) - 1} degrees of freedom, probability {found.probability:.3f}"
+    )

@@ -1,0 +1,143 @@
+"""What the words, numbers and files of the command line mean; mistakes are found before anything is written."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TypedDict
+
+from calib.calibration.power_curves import LIFTS
+from calib.errors import BadInputError
+from calib.estimation.fitting import MIXTURE
+from calib.estimation.robust import LOSSES
+from calib.ranges import Ranges, concatenate, load, without_static
+
+
+class FitOptions(TypedDict):
+    """Keyword arguments of `calib.estimation.fitting.fit`."""
+
+    loss: str
+    scale_ns: float | None
+    lift: str
+    fixed_ns: dict[int, float]
+    groups: dict[str, tuple[int, ...]]
+    sequential: bool
+    minimum_norm: bool
+
+
+def fit_options(
+    loss: str,
+    scale: str,
+    lift: str,
+    fix: Iterable[str] | None,
+    group: Path | None,
+    *,
+    sequential: bool,
+    minimum_norm: bool,
+) -> FitOptions:
+    """Return what the options of a fit mean; raises `BadInputError`."""
+    if sequential and loss == MIXTURE:
+        raise BadInputError("--sequential: goes with a loss, not with the mixture; leave one of the two away")
+    return {
+        "loss": loss_name(loss),
+        "scale_ns": scale_ns(scale),
+        "lift": lift_name(lift),
+        "fixed_ns": fixed_ns(fix or ()),
+        "groups": groups_of_tags(group) if group else {},
+        "sequential": sequential,
+        "minimum_norm": minimum_norm,
+    }
+
+
+def load_each(recordings: Iterable[Path], *, trim_static: bool = False) -> list[Ranges]:
+    """Load recordings, without the seconds in which a pair stands still, if so wished."""
+    parts = [load(path) for path in recordings]
+    return [without_static(part) for part in parts] if trim_static else parts
+
+
+def load_all(recordings: Iterable[Path], *, trim_static: bool = False) -> Ranges:
+    """Load recordings as one."""
+    return concatenate(load_each(recordings, trim_static=trim_static))
+
+
+def check_folder(option: str, folder: Path | None) -> None:
+    """Raise `BadInputError` where a folder to write into cannot be one."""
+    if folder is None:
+        return
+    if folder.exists() and not folder.is_dir():
+        raise BadInputError(f"{option}: {folder} is a file, expected a folder")
+    if not folder.parent.is_dir():
+        raise BadInputError(f"{option}: {folder.parent} does not exist")
+
+
+def groups_of_tags(path: Path) -> dict[str, tuple[int, ...]]:
+    """Read a design file: a table `groups` that maps names to lists of tags; raises `BadInputError`."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise BadInputError(f"--group: {path}: no such file") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadInputError(f"--group: {path}: not valid TOML ({error})") from error
+    groups = table.get("groups")
+    if not isinstance(groups, dict) or not groups or set(table) != {"groups"}:
+        raise BadInputError(f"--group: {path}: expected one table [groups], as in: monopole = [1, 2]")
+    found: dict[str, tuple[int, ...]] = {}
+    seen: dict[int, str] = {}
+    for name, tags in groups.items():
+        if not isinstance(tags, list) or not tags or not all(type(t) is int and 0 <= t < 65_536 for t in tags):
+            raise BadInputError(f"--group: {path}: {name}: expected a list of tag ids, as in [1, 2]")
+        for tag in tags:
+            if tag in seen:
+                raise BadInputError(f"--group: {path}: tag {tag} is in {seen[tag]!r} and in {name!r}")
+            seen[tag] = name
+        found[name] = tuple(tags)
+    return found
+
+
+def loss_name(text: str) -> str:
+    """Return a key of `LOSSES`, or the mixture."""
+    return one_of("--loss", text, [*LOSSES, MIXTURE])
+
+
+def lift_name(text: str) -> str:
+    """Return a key of `LIFTS`."""
+    return one_of("--lift", text, LIFTS)
+
+
+def scale_ns(text: str) -> float | None:
+    """Return the scale in nanoseconds, None for auto."""
+    if text == "auto":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise BadInputError(f"--scale: found {text!r}, expected auto or a positive number of ns")
+    return value
+
+
+def fixed_ns(texts: Iterable[str]) -> dict[int, float]:
+    """Return pinned delays by tag from texts TAG=NS."""
+    fixed: dict[int, float] = {}
+    for text in texts:
+        tag, equals, value = text.partition("=")
+        try:
+            delay = float(value)
+        except ValueError:
+            delay = math.nan
+        if not (equals and tag.strip().isdecimal() and math.isfinite(delay)):
+            raise BadInputError(f"--fix: found {text!r}, expected TAG=NS, as in 1=-0.36")
+        if int(tag) in fixed:
+            raise BadInputError(f"--fix: tag {int(tag)} is pinned twice")
+        fixed[int(tag)] = delay
+    return fixed
+
+
+def one_of(option: str, text: str, allowed: Iterable[str]) -> str:
+    """Return a word that is allowed; raises `BadInputError` that lists what is."""
+    if text not in allowed:
+        raise BadInputError(f"{option}: found {text!r}, allowed: {', '.join(allowed)}")
+    return text

@@ -1,0 +1,1 @@
+"""Names the fault in a recording."""

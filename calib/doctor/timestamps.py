@@ -1,0 +1,133 @@
+"""What can be wrong with stamps, ids and reported ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.doctor.base import PLAUSIBLE_M, Finding, RecordingView, pair_ids, plausible_share
+from uwblink.ticks import TICKS_PER_SECOND
+from uwblink.twr import SINGLE_SIDED, board_range, intervals, raw_range
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+VACUUM_OVER_AIR: Final = 299_792_458.0 / 299_702_547.0
+
+
+def units(view: RecordingView) -> Iterator[Finding]:
+    """Stamps in nanoseconds taken for ticks make every duration 64 times too short."""
+    spans, third = intervals(view.exchanges), view.exchanges.tx3 != 0
+    legs = [float(np.median(spans.dt41)), float(np.median(spans.dt53[third])) if third.any() else 0.0]
+    longest = max(legs) / TICKS_PER_SECOND
+    per_ns = TICKS_PER_SECOND * 1e-9
+    if longest < 60e-6 and longest * per_ns > 150e-6 and len(np.unique(view.exchanges.tx1 % 512)) > 8:
+        yield Finding(
+            "unit slip",
+            f"the longest leg of an exchange lasts {longest * 1e6:.1f} us, too short for a frame; "
+            f"read as nanoseconds it would be {longest * per_ns * 1e6:.0f} us",
+            'the stamps are nanoseconds, not ticks: import again with [units] stamps = "ns"',
+            0.95,
+        )
+
+
+def width(view: RecordingView) -> Iterator[Finding]:
+    """Stamps of a counter with another number of bits."""
+    e = view.exchanges
+    for bits in (32, 40):
+        if bits == e.bits:
+            continue
+        with np.errstate(all="ignore"):
+            other = raw_range(replace(e, bits=bits))
+        gained = plausible_share(other) - plausible_share(view.raw_m)
+        if gained > 0.01:
+            yield Finding(
+                "timestamp width",
+                f"with {e.bits}-bit stamps {100 * plausible_share(view.raw_m):.1f} % of the ranges are possible, "
+                f"with {bits}-bit stamps {100 * plausible_share(other):.1f} %",
+                f"import again with bits = {bits}",
+                0.95,
+            )
+
+
+def single_as_double(view: RecordingView) -> Iterator[Finding]:
+    """Double-sided exchanges without a third message."""
+    e = view.exchanges
+    empty = ~np.isin(e.protocol, SINGLE_SIDED) & (e.tx3 == 0) & (e.rx3 == 0)
+    if empty.mean() > 0.5:
+        yield Finding(
+            "single-sided data taken for double-sided",
+            f"{100 * empty.mean():.0f} % of the double-sided exchanges have no third message",
+            'import again with protocol = "ss"',
+            0.98,
+        )
+
+
+def corrupted(view: RecordingView) -> Iterator[Finding]:
+    """Exchanges that are impossible, or contradict their own reported range."""
+    with np.errstate(all="ignore"):
+        said = np.abs(board_range(view.exchanges) - view.exchanges.range_m)
+    bad = ~(np.abs(view.raw_m) < PLAUSIBLE_M) | (np.isfinite(said) & (said > 0.01))
+    share = float(np.mean(bad))
+    if 0.002 < share < 0.5 and not _is_scaled(view):
+        yield Finding(
+            "corrupted exchanges",
+            f"{np.count_nonzero(bad)} of {len(bad)} exchanges have impossible stamps, or stamps that contradict the "
+            "range reported with them",
+            "a robust fit leaves them out; check cables and USB load, and decode the recording again if it has bytes",
+            0.9,
+        )
+
+
+def _is_scaled(view: RecordingView) -> bool:
+    ratio = view.exchanges.range_m / view.raw_m
+    good = np.isfinite(ratio) & (np.abs(view.raw_m) > 1)
+    return bool(good.any() and abs(np.median(ratio[good]) - 1) > 1e-4)
+
+
+def speed_of_light(view: RecordingView) -> Iterator[Finding]:
+    """Reported ranges that were computed with the speed of light in vacuum."""
+    e = view.exchanges
+    good = np.isfinite(e.range_m) & (np.abs(view.raw_m) > 1)
+    if np.count_nonzero(good) < 100:
+        return
+    ratio = float(np.median(e.range_m[good] / view.raw_m[good]))
+    if abs(ratio / VACUUM_OVER_AIR - 1) < 5e-5:
+        yield Finding(
+            "speed of light in vacuum",
+            f"reported ranges are {ratio:.5f} times those from the stamps: 299 792 458 m/s instead of 299 702 547",
+            "nothing for a fit, which uses the stamps; multiply reported ranges by 0.9997 before using them",
+            0.95,
+        )
+
+
+def swapped_roles(view: RecordingView) -> Iterator[Finding]:
+    """The target's clock against the initiator's: from the third leg, and as the carriers say."""
+    e = view.exchanges
+    double = (e.protocol == "ds") & (e.tx3 != 0) & np.isfinite(e.skew1_ppm)
+    if np.count_nonzero(double) < 100:
+        return
+    spans = intervals(e[double])
+    with np.errstate(all="ignore"):
+        target_faster = (spans.dt53 / spans.dt64 - 1) * 1e6
+    told = e.skew1_ppm[double]
+    pairs = pair_ids(e[double])
+    first = e.initiator[double] < e.target[double]
+    signs = [
+        (np.median(target_faster[rows]), np.median(told[rows]))
+        for p in np.unique(pairs)
+        for way in (True, False)
+        if np.count_nonzero(rows := (pairs == p) & (first == way)) > 20
+    ]
+    clear = [(a, b) for a, b in signs if abs(a) > 1.0]
+    if clear and np.mean([np.sign(a) != np.sign(b) for a, b in clear]) > 0.8:
+        yield Finding(
+            "swapped roles",
+            "the carriers say that the targets' clocks are slower where the stamps say faster, and the other way round",
+            "initiator and target (ids, powers and skews) are exchanged: swap the columns on import",
+            0.9,
+        )

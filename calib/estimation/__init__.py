@@ -1,0 +1,1 @@
+"""From ranges to calibrations: the fit and what it doubts."""

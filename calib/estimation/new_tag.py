@@ -1,0 +1,59 @@
+"""The delay of a new tag, from ranges with tags that are calibrated already."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import equal_bins
+from calib.errors import BadInputError, UnanswerableError
+from calib.estimation.error_mixture import fit_error_mixture
+from calib.estimation.robust import robust_fit
+from calib.ranges import Ranges
+from uwblink.ticks import SPEED_OF_LIGHT
+
+FEWEST = 50
+
+
+def add_tag(ranges: Ranges, calibration: Calibration, tag: int, loss: str = "cauchy") -> Calibration:
+    """Return the calibration with the delay of one more tag; everything known stays as it was.
+
+    Start is the closed form of ICRA 2023, section IV, for one pair (the median of what is missing); result a robust
+    fit over all exchanges with calibrated tags, at the centre of the core of their errors. Raises `BadInputError`
+    where the tag is known already or not in the data, `UnanswerableError` where too few exchanges help.
+    """
+    if tag in calibration.delays_ns:
+        raise BadInputError(f"--tag: tag {tag} has a delay in the calibration already; fit anew to change it")
+    if tag not in ranges.tags():
+        raise BadInputError(
+            f"--tag: tag {tag} does not range in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}"
+        )
+    mine_first, mine_second = ranges.initiator == tag, ranges.target == tag
+    other = np.where(mine_first, ranges.target, ranges.initiator)
+    useful = (mine_first | mine_second) & np.isin(other, list(calibration.delays_ns))
+    if np.count_nonzero(useful) < FEWEST:
+        raise UnanswerableError(
+            f"{ranges.source}: {np.count_nonzero(useful)} exchanges of tag {tag} with calibrated tags are too few, "
+            f"at least {FEWEST} are needed"
+        )
+    some = ranges[useful]
+    mine = np.where(some.initiator == tag, some.weight_initiator, some.weight_target) * SPEED_OF_LIGHT * 1e-9
+    trial = replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0})
+    applied = trial.apply(some)
+    error = applied.corrected_m - some.truth_m
+    start = np.array([float(np.median(-error / mine))])
+    found = robust_fit(mine[:, None], -error, loss, start=start)
+    core = error + mine * found.parameters[0]
+    bins = equal_bins(applied.lifted)
+    delay = float(
+        found.parameters[0] - fit_error_mixture(core, bins.number, len(bins.count)).location_m / np.mean(mine)
+    )
+    added = {"tag": tag, "recording": ranges.source, "exchanges": int(np.count_nonzero(useful))}
+    return replace(
+        calibration,
+        delays_ns=calibration.delays_ns | {tag: delay},
+        delays_std_ns=calibration.delays_std_ns | {tag: float(np.sqrt(found.covariance[0, 0]))},
+        provenance=calibration.provenance | {"added": [*calibration.provenance.get("added", []), added]},
+    )

@@ -1,0 +1,192 @@
+"""A fit as linear algebra: which columns stand for which delays and which pieces of which curve."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.calibration.power_curves import (
+    BIAS_SEGMENTS,
+    DEGREE,
+    Bins,
+    basis,
+    curvature,
+    equal_bins,
+    knots_for,
+    lifted_power,
+    populated,
+)
+from calib.errors import BadInputError, UnanswerableError
+from calib.estimation.robust import design, determined, undetermined
+from calib.ranges import Ranges
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+FEWEST: Final = 100
+BLOCK_S: Final = 2.0
+"""Errors of neighbouring ranges may share a cause (a reflection, a pose) for about as long as tags take to move on."""
+
+FEWEST_BLOCKS: Final = 200
+ROWS_AT_ONCE: Final = 65_536
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Residuals `error + design @ x` (n,) metres; x = delays by way of `directions`, then the curves' coefficients.
+
+    `directions` (tags, rank) turns the first parameters into delays of `tags` in ns; it is the identity where the data
+    determine all. The splines of each of `groups` are less their average over the range, so that a constant is left to
+    the delays; `shares` say how much of each group's curve is in a range, None for all of it. What pinned tags add is
+    in `error` already. `bins` hold the rows of the whole problem, `span` is the range of power with data. `blocks` (n,)
+    number spans of time, and rows are in order of time. `free` are the groups of tags that nothing determines.
+    """
+
+    ranges: Ranges
+    tags: list[int]
+    directions: Floats
+    error: Floats
+    design: Floats
+    lifted: Floats
+    bins: Bins
+    span: tuple[float, float]
+    knots: Floats
+    averages: Floats
+    groups: tuple[str, ...]
+    blocks: Ints
+    shares: list[Floats | None]
+    free: list[list[int]]
+
+    def share(self, group: int) -> Floats:
+        """Return how much of a group's curve is in each range (n,): a half for each end."""
+        share = self.shares[group]
+        return np.ones(len(self.error)) if share is None else share
+
+    @property
+    def rank(self) -> int:
+        """Return how many parameters stand for delays."""
+        return int(self.directions.shape[1])
+
+    def sample(self, rows: Ints) -> Problem:
+        """Return the problem of some rows only."""
+        chosen = ("error", "design", "lifted", "blocks")
+        return replace(self, ranges=self.ranges[rows], **{name: getattr(self, name)[rows] for name in chosen})
+
+    def penalties(self) -> list[Floats]:
+        """Return the roughness of each group's curve as a matrix over all parameters."""
+        rough, found = curvature(self.knots), []
+        for _, columns in self.curves():
+            penalty = np.zeros((self.design.shape[1],) * 2)
+            penalty[columns, columns] = rough
+            found.append(penalty)
+        return found
+
+    def curves(self) -> Iterator[tuple[str, slice]]:
+        """Yield the groups and the columns of their splines."""
+        each = len(self.averages)
+        for k, name in enumerate(self.groups):
+            yield name, slice(self.rank + k * each, self.rank + (k + 1) * each)
+
+
+def build_problem(
+    ranges: Ranges,
+    *,
+    lift: str,
+    alpha_dbm: float,
+    fixed: Mapping[int, float],
+    groups: Mapping[str, tuple[int, ...]],
+    minimum_norm: bool,
+) -> Problem:
+    """Put a fit into columns; raises what `calib.estimation.fitting.fit` raises."""
+    if len(ranges) < FEWEST:
+        raise UnanswerableError(
+            f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST} are needed"
+        )
+    if np.any(np.diff(ranges.time_ns) < 0):
+        ranges = ranges[np.argsort(ranges.time_ns, kind="stable")]
+    lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
+    order = np.argsort(lifted)
+    ordered = lifted[order]
+    low, high = populated(ordered)
+    if not high - low > 1e-6:
+        raise UnanswerableError(
+            f"{ranges.source}: the first-path power never changes, so no curve over power can be fitted"
+        )
+    everyone = ranges.tags()
+    tags = _free_tags(everyone, fixed)
+    shares = _shares(ranges, groups, everyone)
+    matrix = design(ranges, everyone)
+    unpinned = np.array([tag not in fixed for tag in everyone])
+    directions, free = determined(matrix[:, unpinned], tags, ranges.initiator, ranges.target)
+    if free and not minimum_norm:
+        raise undetermined(free)
+    known = matrix[:, ~unpinned] @ np.array([fixed[tag] for tag in everyone if tag in fixed])
+    knots = knots_for(ordered, BIAS_SEGMENTS)
+    # The integral of a B-spline is its coefficients times a quarter of each one's span.
+    averages = (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (high - low)
+    return Problem(
+        ranges,
+        tags,
+        directions,
+        ranges.raw_m - ranges.truth_m + known,
+        _columns(matrix[:, unpinned] @ directions, lifted, knots, averages, shares),
+        lifted,
+        equal_bins(lifted, order=order),
+        (low, high),
+        knots,
+        averages,
+        tuple(groups) or ("",),
+        _blocks(ranges.time_ns),
+        shares,
+        free,
+    )
+
+
+def _free_tags(everyone: list[int], fixed: Mapping[int, float]) -> list[int]:
+    unknown = sorted(set(fixed) - set(everyone))
+    if unknown:
+        raise BadInputError(f"--fix: found tag {unknown[0]}, the tags are {', '.join(map(str, everyone))}")
+    tags = [tag for tag in everyone if tag not in fixed]
+    if not tags:
+        raise BadInputError("--fix: every tag is pinned, so no delay is left to fit")
+    return tags
+
+
+def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]], everyone: list[int]) -> list[Floats | None]:
+    """Return for each group its share in each range: a half for each end that belongs to it; None for all of it."""
+    if not groups:
+        return [None]
+    member = {tag: name for name, tags in groups.items() for tag in tags}
+    lonely = [tag for tag in everyone if tag not in member]
+    if lonely:
+        raise BadInputError(f"--group: tag {lonely[0]} is in no group; the groups are {', '.join(groups)}")
+    unused = [name for name, tags in groups.items() if not set(tags) & set(everyone)]
+    if unused:
+        raise BadInputError(f"--group: no tag of group {unused[0]!r} ranges in {ranges.source}")
+    return [0.5 * np.isin(ranges.initiator, tags) + 0.5 * np.isin(ranges.target, tags) for tags in groups.values()]
+
+
+def _columns(delays: Floats, lifted: Floats, knots: Floats, averages: Floats, shares: list[Floats | None]) -> Floats:
+    """Return delays beside the splines of every group, filled in pieces to keep memory at one copy."""
+    rank, each = delays.shape[1], len(averages)
+    columns = np.empty((len(lifted), rank + each * len(shares)))
+    columns[:, :rank] = delays
+    for begin in range(0, len(lifted), ROWS_AT_ONCE):
+        rows = slice(begin, begin + ROWS_AT_ONCE)
+        splines = averages - basis(lifted[rows], knots)
+        for k, share in enumerate(shares):
+            part = splines if share is None else splines * share[rows, None]
+            columns[rows, rank + k * each : rank + (k + 1) * each] = part
+    return columns
+
+
+def _blocks(time_ns: Ints) -> Ints:
+    """Number spans of `BLOCK_S` seconds, of less in a short recording, without gaps."""
+    since = time_ns - time_ns[0]
+    length = max(min(int(BLOCK_S * 1e9), int(since[-1]) // FEWEST_BLOCKS), 1)
+    spans = since // length
+    return np.cumsum(np.diff(spans, prepend=spans[0]) > 0)

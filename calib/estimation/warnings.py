@@ -1,0 +1,46 @@
+"""What a user should know before trusting a fit."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from calib.calibration.model import CorrectedRanges
+from calib.estimation.confounding import explained_by_distance
+from calib.ranges import STATIC, Ranges
+
+MANY_MISSING: Final = 0.05
+MANY_OUTLIERS: Final = 0.3
+SHORT_S: Final = 10.0
+
+
+def warnings_of(ranges: Ranges, applied: CorrectedRanges, inliers: float, free: list[list[int]]) -> list[str]:
+    """Return sentences, the gravest first; `inliers` is the share of ranges within three sigmas."""
+    found = []
+    if free:
+        groups = "; ".join(", ".join(map(str, group)) for group in free)
+        found.append(
+            f"the data leave the delays of tags {groups} free; those written are the smallest that agree with the data"
+        )
+    share = explained_by_distance(applied.lifted, ranges.truth_m)
+    if share is not None:
+        found.append(
+            f"power and distance are confounded: distance explains {100 * share:.0f} % of the power, so the curve may "
+            "hold what belongs to distance; turn the antennas while recording"
+        )
+    if np.any(ranges.protocol == "ss"):
+        found.append(
+            "single-sided ranges: uncorrected clock skew looks like an antenna delay; "
+            "'calib doctor' says whether it is there"
+        )
+    everything = len(ranges) + sum(ranges.excluded.values())
+    for reason, count in ranges.excluded.items():
+        if reason != STATIC and count > MANY_MISSING * everything:
+            found.append(f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}")
+    if 1 - inliers > MANY_OUTLIERS:
+        found.append(f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors")
+    seconds = float(np.ptp(ranges.time_ns)) * 1e-9
+    if seconds < SHORT_S:
+        found.append(f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow")
+    return found

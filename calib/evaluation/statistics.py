@@ -1,0 +1,192 @@
+"""How well a calibration does on ranges with known truth: tables by pair and overall."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.calibration.model import Calibration, CorrectedRanges
+from calib.ranges import Ranges
+from uwblink.ticks import SPEED_OF_LIGHT
+
+Floats = NDArray[np.float64]
+
+CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}
+CHI_SQUARE_95: Final = 3.841458820694124
+"""95 % quantile of the chi-square distribution with one degree of freedom."""
+
+
+NOMINAL: Final = {
+    "50": 0.6744897501960817,
+    "68": 1.0,
+    "90": 1.6448536269514722,
+    "95": 1.959963984540054,
+    "99": 2.5758293035489004,
+}
+"""Bounds of a standard normal distribution that hold so many per cent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stats:
+    """Statistics of range errors in metres; `robust_std_m` is 1.4826 median absolute deviations.
+
+    95 % of the errors lie between `low_m` and `high_m`, with as many below as above; 95 % are smaller than `abs95_m`.
+    """
+
+    n: int
+    mean_m: float
+    median_m: float
+    std_m: float
+    robust_std_m: float
+    low_m: float
+    high_m: float
+    abs95_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStatistics:
+    """A pair, or all pairs: statistics in the three stages, and the chi-square test.
+
+    `rejected` is the share of fully corrected errors whose square exceeds the 95 % quantile of
+    chi-square times sigma squared, `accepted` the statistics of the others. `rejected_raw` is the same share of raw
+    errors with the variance that all of them have, which is what there is without a calibration. `coverage` maps a
+    nominal share of a normal distribution to the share of corrected errors within its bounds.
+    """
+
+    raw: Stats
+    delays: Stats
+    full: Stats
+    rejected_raw: float
+    rejected: float
+    accepted: Stats
+    coverage: dict[str, float]
+    clamped: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlantedComparison:
+    """A calibration beside what a simulation planted, after the common constant has been moved to one side.
+
+    `delay_error_ns` maps tags to fitted less planted delays, `curve_rms_m` is the rms of the bias curves' difference
+    over the ranges inside the fitted power, `correction_rms_m` that of the whole correction of each range; NaN where no
+    curve was planted.
+    """
+
+    shift_ns: float
+    delay_error_ns: dict[int, float]
+    curve_rms_m: float
+    correction_rms_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """The outcome for all ranges and for each pair, named "smaller-larger"."""
+
+    overall: ErrorStatistics
+    pairs: dict[str, ErrorStatistics]
+    planted: PlantedComparison | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `calib evaluate --json` prints; `planted` only where a simulation planted something."""
+        document = {
+            "overall": _plain(asdict(self.overall)),
+            "pairs": {name: _plain(asdict(group)) for name, group in self.pairs.items()},
+        }
+        return document | ({"planted": _plain(asdict(self.planted))} if self.planted else {})
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: a figure of nothing is null."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return None if isinstance(value, float) and value != value else value
+
+
+def evaluate(ranges: Ranges, calibration: Calibration) -> Evaluation:
+    """Evaluate a calibration; raises what `Calibration.apply` raises."""
+    applied = calibration.apply(ranges)
+    everything = np.ones(len(ranges), dtype=bool)
+    return Evaluation(
+        _group(ranges, applied, everything),
+        {name: _group(ranges, applied, rows) for name, rows in pair_rows(ranges).items()},
+        beside_planted(ranges, applied, calibration),
+    )
+
+
+def beside_planted(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> PlantedComparison | None:
+    """Compare a calibration with what a simulation planted, where the ranges carry it."""
+    planted = {int(tag): float(delay) for tag, delay in (ranges.planted or {}).get("delays_ns", {}).items()}
+    difference = {tag: calibration.delays_ns[tag] - d for tag, d in planted.items() if tag in calibration.delays_ns}
+    if not difference:
+        return None
+    shift = float(np.mean(list(difference.values())))
+    delays = {tag: d - shift for tag, d in difference.items()}
+    inside = ~applied.clamped
+    truth = planted_curve(ranges, "bias_curve", applied.lifted[inside])
+    curve_rms = correction_rms = float("nan")
+    if truth is not None and inside.any():
+        fitted = (applied.delay_corrected_m - applied.corrected_m)[inside]
+        curve = fitted - truth - shift * 1e-9 * SPEED_OF_LIGHT
+        wrong = np.zeros(max(ranges.tags()) + 1)
+        wrong[list(delays)] = list(delays.values())
+        ends = ranges.weight_initiator * wrong[ranges.initiator] + ranges.weight_target * wrong[ranges.target]
+        curve_rms = float(np.sqrt(np.mean(curve**2)))
+        correction_rms = float(np.sqrt(np.mean((ends[inside] * 1e-9 * SPEED_OF_LIGHT - curve) ** 2)))
+    return PlantedComparison(shift, delays, curve_rms, correction_rms)
+
+
+def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
+    """Return a curve that the simulation planted, at lifted powers (n,), or None."""
+    from scipy.interpolate import BSpline
+
+    curve: dict[str, Any] | None = (ranges.planted or {}).get(which)
+    if not curve:
+        return None
+    knots, degree = np.array(curve["knots"], dtype=float), int(curve["degree"])
+    spline = BSpline(knots, np.array(curve["coefficients"], dtype=float), degree)
+    return np.asarray(spline(np.clip(lifted, knots[degree], knots[-1 - degree])))
+
+
+def pair_rows(ranges: Ranges) -> dict[str, NDArray[np.bool_]]:
+    """Return which ranges belong to each pair of tags, whoever initiated."""
+    low = np.minimum(ranges.initiator, ranges.target)
+    high = np.maximum(ranges.initiator, ranges.target)
+    found = sorted(set(zip(low.tolist(), high.tolist(), strict=True)))
+    return {f"{a}-{b}": (low == a) & (high == b) for a, b in found}
+
+
+def statistics(error_m: Floats) -> Stats:
+    """Return the statistics of range errors (n,); NaN where there are none."""
+    if not len(error_m):
+        return Stats(0, *[float("nan")] * 7)
+    median = float(np.median(error_m))
+    low, high = np.quantile(error_m, (0.025, 0.975))
+    return Stats(
+        len(error_m),
+        float(np.mean(error_m)),
+        median,
+        float(np.std(error_m)),
+        1.4826 * float(np.median(np.abs(error_m - median))),
+        float(low),
+        float(high),
+        float(np.quantile(np.abs(error_m), 0.95)),
+    )
+
+
+def _group(ranges: Ranges, applied: CorrectedRanges, rows: NDArray[np.bool_]) -> ErrorStatistics:
+    truth = ranges.truth_m[rows]
+    errors = {name: getattr(applied, field)[rows] - truth for name, field in CORRECTION_STAGES.items()}
+    z = np.abs(errors["full"]) / applied.sigma_m[rows]
+    outside = z**2 > CHI_SQUARE_95
+    variance = float(np.var(applied.raw_m - ranges.truth_m))
+    return ErrorStatistics(
+        **{name: statistics(error) for name, error in errors.items()},
+        rejected_raw=float(np.mean(errors["raw"] ** 2 > CHI_SQUARE_95 * variance)),
+        rejected=float(np.mean(outside)),
+        accepted=statistics(errors["full"][~outside]),
+        coverage={name: float(np.mean(z <= bound)) for name, bound in NOMINAL.items()},
+        clamped=float(np.mean(applied.clamped[rows])),
+    )

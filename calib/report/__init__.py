@@ -1,0 +1,1 @@
+"""Reports as HTML and PDF, and their figures."""

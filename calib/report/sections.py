@@ -1,0 +1,264 @@
+"""The sections of a report, as blocks."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from calib.calibration.model import Calibration, CorrectedRanges
+from calib.estimation.error_mixture import fit_error_mixture
+from calib.estimation.fitting import FitResult
+from calib.estimation.passive_listeners import OverheardDelay
+from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation, PlantedComparison, pair_rows
+from calib.ranges import Ranges
+from calib.report.blocks import Block, Heading, Picture, Table, Text
+from calib.report.figures_fit import TWO_SIDED_95
+
+OUTLIER_SIGMAS: Final = 3.0
+NOT_SPLIT: Final = (
+    "How a delay splits into transmission and reception is not determined: stamps of free-running clocks leave it "
+    "open, overheard exchanges included, because shifting a tag's clock shifts both. Where both are needed, 0.44 of a "
+    "delay goes to transmission and 0.56 to reception by convention."
+)
+
+
+def summary(evaluation: Evaluation, on_what: str = "") -> str:
+    """Return what the whole comes to, in a few sentences."""
+    group = evaluation.overall
+    cm = {stage: (100 * getattr(group, stage).mean_m, 100 * getattr(group, stage).std_m) for stage in CORRECTION_STAGES}
+    where = f" of {on_what}" if on_what else ""
+    return (
+        f"Over {group.raw.n} ranges{where} the mean error goes from {cm['raw'][0]:+.1f} cm (raw) to "
+        f"{cm['delays'][0]:+.1f} cm (delays corrected) and {cm['full'][0]:+.1f} cm (fully corrected); the standard "
+        f"deviation from {cm['raw'][1]:.1f} to {cm['full'][1]:.1f} cm, its robust estimate from "
+        f"{100 * group.raw.robust_std_m:.1f} to {100 * group.full.robust_std_m:.1f} cm. A chi-square test at 95 % "
+        f"rejects {100 * group.rejected:.1f} % of the corrected ranges; the others have a mean of "
+        f"{100 * group.accepted.mean_m:+.1f} cm and a standard deviation of {100 * group.accepted.std_m:.1f} cm."
+    )
+
+
+def recordings(training: list[Ranges], tests: list[Ranges] | None = None) -> Table:
+    """Return one row a recording."""
+    uses = [("fit", r) for r in training] + [("test", r) for r in tests or []]
+    rows = [
+        [
+            r.source,
+            *([use] if tests is not None else []),
+            str(len(r)),
+            f"{(r.time_ns.max() - r.time_ns.min()) * 1e-9:.0f}",
+            ", ".join(map(str, r.tags())),
+            str(len(pair_rows(r))),
+            ", ".join(sorted(set(np.unique(r.protocol).tolist()))),
+            ", ".join(f"{n} {why}" for why, n in r.excluded.items()) or "none",
+        ]
+        for use, r in uses
+    ]
+    header = ["recording", *(["used to"] if tests is not None else [])]
+    return Table([*header, "ranges", "seconds", "tags", "pairs", "protocol", "left out"], rows)
+
+
+def determined(ranges: Ranges, calibration: Calibration, fit: FitResult) -> list[Block]:
+    """Say whether the pairs settle the delays, and what the fit assumed."""
+    free = calibration.provenance.get("undetermined", [])
+    pairs = pair_rows(ranges)
+    if free:
+        groups = "; ".join(", ".join(map(str, group)) for group in free)
+        verdict = f"No: the delays of tags {groups} can shift against each other without a trace in any range."
+    else:
+        verdict = f"Yes: the {len(pairs)} pairs of {len(ranges.tags())} tags settle every delay."
+    counts = [len(np.flatnonzero(rows)) for rows in pairs.values()]
+    return [
+        Text(
+            f"{verdict} The rarest pair has {min(counts)} ranges, the most frequent {max(counts)}. The fit "
+            f"{fit.message}, with the {calibration.loss} loss at a scale of {calibration.scale_ns:.3f} ns; its "
+            f"standard errors are a {calibration.provenance.get('standard_errors', 'sandwich')}, so errors that "
+            "persist within a block are not counted as independent ones."
+        ),
+        Text(NOT_SPLIT),
+    ]
+
+
+def delays(
+    calibration: Calibration, planted: PlantedComparison | None, truth: dict[str, Any], heard: dict[int, OverheardDelay]
+) -> list[Block]:
+    """Return delays with intervals; beside them what was planted, and what listeners heard."""
+    from calib.report import figures_fit
+
+    known = {int(tag): float(d) for tag, d in truth.get("delays_ns", {}).items()} if planted else {}
+    header = ["tag", "delay (ns)", "95 % from", "to"]
+    header += ["planted (ns)", "difference (ps)"] if known else []
+    header += ["heard by others (ns)", "± 1 std"] if heard else []
+    rows = []
+    for tag, delay in sorted(calibration.delays_ns.items()):
+        half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, float("nan"))
+        bounds = [f"{delay - half:+.4f}", f"{delay + half:+.4f}"] if np.isfinite(half) else ["undetermined", ""]
+        row = [str(tag), f"{delay:+.4f}", *bounds]
+        if known and planted:
+            row += [f"{known[tag]:+.4f}", f"{1e3 * planted.delay_error_ns[tag]:+.1f}"] if tag in known else ["", ""]
+        if heard:
+            row += [f"{heard[tag].delay_ns:+.4f}", f"{heard[tag].std_ns:.4f}"] if tag in heard else ["", ""]
+        rows.append(row)
+    shift = planted.shift_ns if planted else 0.0
+    blocks: list[Block] = [
+        Table(header, rows),
+        Picture(
+            "delays",
+            partial(figures_fit.delays, calibration, known, shift),
+            "Antenna delays with their 95 % intervals.",
+        ),
+    ]
+    if planted:
+        blocks.append(
+            Text(
+                "A constant in the bias curve and a shift common to all delays are the same thing: the differences, "
+                f"and the planted curve below, are compared after moving the common {shift:+.4f} ns from one to the "
+                f"other. The bias curve is {1e3 * planted.curve_rms_m:.1f} mm rms from the planted one over these "
+                f"ranges, the whole correction of a range {1e3 * planted.correction_rms_m:.1f} mm.",
+                "note",
+            )
+        )
+    return blocks
+
+
+def sensitivity(calibration: Calibration, refits: dict[float, Calibration]) -> list[Block]:
+    """Show how the delays depend on the scale of the loss."""
+    from calib.report import figures_fit
+
+    if not refits:
+        return []
+    draw = partial(figures_fit.scale_sensitivity, list(refits), list(refits.values()), calibration.scale_ns)
+    return [
+        Picture(
+            "scale-sensitivity", draw, "What another scale of the loss would have done to the delays, mean removed."
+        )
+    ]
+
+
+def curves(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
+    """Return the curves over power, with bands and data."""
+    from calib.report import figures
+
+    return [
+        Heading("Bias and standard deviation over power"),
+        Picture(
+            "bias",
+            partial(figures.bias_over_power, ranges, applied, calibration),
+            "Bias over lifted first-path power: medians of the delay-corrected errors, and the curve with its band. "
+            "Where there are reflections their tail lifts the medians above the curve, which follows the core.",
+        ),
+        Picture(
+            "sigma",
+            partial(figures.sigma_over_power, ranges, applied, calibration),
+            "Standard deviation over lifted first-path power: robust estimates, and the curve of the core.",
+        ),
+    ]
+
+
+def before_after(evaluation: Evaluation) -> list[Block]:
+    """Return the table of errors by pair and stage, and how well sigma covers them."""
+    header = ["pair", "n", *["mean", "std", "robust"] * len(CORRECTION_STAGES), "95 % |e|", "raw", "full", "clamped"]
+    rows = [[name, *_cells(group)] for name, group in evaluation.pairs.items()]
+    rows.append(["all", *_cells(evaluation.overall)])
+    above = [("", 2), *[(stage, 3) for stage in CORRECTION_STAGES], ("full", 1), ("rejected", 2), ("", 1)]
+    overall = evaluation.overall
+    covered = [
+        [f"{name} %", f"{100 * share:.1f} %", *[f"{100 * g.coverage[name]:.0f} %" for g in evaluation.pairs.values()]]
+        for name, share in overall.coverage.items()
+    ]
+    low, high = 100 * overall.full.low_m, 100 * overall.full.high_m
+    return [
+        Table(header, rows, above, total=True),
+        Text(
+            "Errors in cm. Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
+            f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Rejected: share beyond the "
+            "95 % quantile of chi-square, of raw ranges with the variance that they have as a whole, of calibrated "
+            "ones with their own. Clamped: share at powers the curves were not fitted at.",
+            "note",
+        ),
+        Table(["nominal", "all", *evaluation.pairs], covered),
+        Text(
+            "Coverage: how many calibrated errors lie within the bounds that their sigma gives for a normal "
+            "distribution. Reflections take from the high levels.",
+            "note",
+        ),
+    ]
+
+
+def _cells(group: ErrorStatistics) -> list[str]:
+    cells = [str(group.raw.n)]
+    for stage in CORRECTION_STAGES:
+        stats = getattr(group, stage)
+        cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.std_m, stats.robust_std_m)]
+    shares = [f"{100 * share:.1f} %" for share in (group.rejected_raw, group.rejected, group.clamped)]
+    return [*cells, f"{100 * group.full.abs95_m:.1f}", *shares]
+
+
+def errors(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
+    """Return histograms, z-scores, and residuals over distance and power."""
+    from calib.report import figures, figures_errors
+
+    return [
+        Picture(
+            "errors",
+            partial(figures.histogram, ranges, applied),
+            "Range errors. The outermost bins hold everything beyond them.",
+        ),
+        Picture(
+            "z-scores",
+            partial(figures_errors.z_scores, ranges, applied),
+            "Calibrated errors over their sigma: density, and quantiles against those of the standard normal.",
+        ),
+        Picture(
+            "residuals",
+            partial(figures_errors.residuals, ranges, applied, calibration.alpha_dbm),
+            "What is left over distance and over power. Medians should lie on zero; recordings carry no temperature.",
+        ),
+    ]
+
+
+def outliers(ranges: Ranges, applied: CorrectedRanges) -> list[Block]:
+    """Say what the calibrated errors are made of, by pair."""
+    rows = []
+    error, z = applied.corrected_m - ranges.truth_m, (applied.corrected_m - ranges.truth_m) / applied.sigma_m
+    for name, mine in [*pair_rows(ranges).items(), ("all", np.ones(len(ranges), dtype=bool))]:
+        if np.count_nonzero(mine) < 60:
+            continue
+        mixture = fit_error_mixture(error[mine], np.zeros(np.count_nonzero(mine), dtype=np.int64), 1)
+        rows.append(
+            [
+                name,
+                f"{100 * np.mean(z[mine] > OUTLIER_SIGMAS):.1f} %",
+                f"{100 * np.mean(z[mine] < -OUTLIER_SIGMAS):.1f} %",
+                f"{100 * mixture.sigma_m[0]:.1f}",
+                f"{100 * mixture.tail_share:.1f} %",
+                f"{100 * mixture.tail_mean_m:.0f}",
+                f"{100 * mixture.outlier_share:.2f} %",
+            ]
+        )
+    header = ["pair", "too long", "too short", "core (cm)", "tail", "its mean (cm)", "outliers"]
+    return [
+        Table(header, rows, total=True),
+        Text(
+            "Too long and too short: share of ranges beyond three sigmas. Core, tail and outliers: a Gaussian, an "
+            "exponential detour on the long side, and what fits neither, by maximum likelihood.",
+            "note",
+        ),
+    ]
+
+
+def over_time(recordings: list[Ranges], calibration: Calibration) -> list[Block]:
+    """Return a figure a recording of the calibrated errors over time."""
+    from calib.report import figures
+
+    blocks: list[Block] = [Heading("Over time")]
+    for k, recording in enumerate(recordings):
+        blocks.append(
+            Picture(
+                f"over-time-{k + 1}",
+                partial(figures.over_time, recording, calibration.apply(recording)),
+                f"{recording.source}: calibrated errors, and the band in which 95 % should lie.",
+            )
+        )
+    return blocks

@@ -1,0 +1,55 @@
+"""Errors taken apart into core, tail and stray: what was mixed comes out."""
+
+import numpy as np
+import pytest
+from scipy.stats import exponnorm
+
+from calib.estimation.error_mixture import ErrorMixture, e_step, fit_error_mixture
+
+
+def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
+    rng = np.random.default_rng(seed)
+    bins = np.arange(n) % 2
+    sigma = np.array([0.06, 0.12])[bins]
+    error = 0.03 + rng.normal(size=n) * sigma
+    error += np.where(rng.random(n) < share, rng.exponential(mean_m, n), 0)
+    return np.where(rng.random(n) < outlier, rng.uniform(-40, 40, n), error), bins
+
+
+def test_the_parts_come_out():
+    m = fit_error_mixture(*mixed(), 2)
+    # 40 000 errors know the centre to 0.5 mm and a sigma to 0.5 %; four times that are allowed.
+    assert m.location_m == pytest.approx(0.03, abs=0.002)
+    np.testing.assert_allclose(m.sigma_m, [0.06, 0.12], rtol=0.02)
+    assert m.tail_share == pytest.approx(0.12, abs=0.01)
+    assert m.tail_mean_m == pytest.approx(0.35, rel=0.05)
+
+
+def test_stray_values_are_told_from_the_tail():
+    m = fit_error_mixture(*mixed(outlier=0.03), 2)
+    assert m.location_m == pytest.approx(0.03, abs=0.002)
+    assert m.outlier_share == pytest.approx(0.03, abs=0.006)
+    np.testing.assert_allclose(m.sigma_m, [0.06, 0.12], rtol=0.03)
+
+
+def test_clean_errors_are_all_core():
+    m = fit_error_mixture(*mixed(share=0.0), 2)
+    assert m.location_m == pytest.approx(0.03, abs=0.003)
+    assert m.tail_share * m.tail_mean_m < 0.003
+    np.testing.assert_allclose(m.sigma_m, [0.06, 0.12], rtol=0.02)
+
+
+def test_density_is_that_of_scipy_and_integrates_to_one():
+    mixture = ErrorMixture(0.0, np.array([0.08]), 0.25, 0.3, 0.0)
+    e = np.linspace(-1, 6, 7001)
+    found = e_step(e, mixture.sigma_m, mixture, 0.0)
+    normal = np.exp(-0.5 * (e / 0.08) ** 2) / np.sqrt(2 * np.pi) / 0.08
+    tail = exponnorm.pdf(e, 0.3 / 0.08, scale=0.08)
+    np.testing.assert_allclose(found.density, 0.75 * normal + 0.25 * tail, atol=1e-9)
+    assert np.trapezoid(found.density, e) == pytest.approx(1, abs=1e-6)
+    # The noise's posterior mean, against quadrature at one error.
+    t = np.linspace(0, 5, 200_001)
+    weight = np.exp(-t / 0.3 - 0.5 * ((0.2 - t) / 0.08) ** 2)
+    at = int(np.argmin(np.abs(e - 0.2)))
+    assert found.noise[at] == pytest.approx(np.sum(weight * (0.2 - t)) / weight.sum(), abs=1e-5)
+    assert found.noise_square[at] == pytest.approx(np.sum(weight * (0.2 - t) ** 2) / weight.sum(), abs=1e-5)

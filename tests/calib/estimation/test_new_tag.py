@@ -1,0 +1,67 @@
+"""A new tag from calibrated ones."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.errors import BadInputError, UnanswerableError
+from calib.estimation.fitting import fit
+from calib.estimation.new_tag import add_tag
+from calib.ranges import load
+from tests.calib.synthetic import DELAYS_NS, ranges
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def known():
+    r = ranges(8000)
+    three = r[(r.initiator != 7) & (r.target != 7)]
+    return fit(three).calibration
+
+
+def test_its_delay_is_found_and_nothing_else_moves(known):
+    added = add_tag(ranges(3000, seed=5), known, 7)
+    assert {t: d for t, d in added.delays_ns.items() if t != 7} == known.delays_ns
+    assert added.bias_curve == known.bias_curve
+    # The fitted delays of the others share a shift with the curve, and the new one has it, too.
+    shift = np.mean([known.delays_ns[t] - DELAYS_NS[t] for t in known.delays_ns])
+    assert added.delays_ns[7] - shift == pytest.approx(DELAYS_NS[7], abs=0.05)
+    assert 0.002 < added.delays_std_ns[7] < 0.03
+
+
+def test_one_calibrated_tag_is_enough(known):
+    r = ranges(3000, seed=6)
+    added = add_tag(r[(r.initiator == 1) & (r.target == 7)], known, 7)
+    shift = known.delays_ns[1] - DELAYS_NS[1]
+    assert added.delays_ns[7] - shift == pytest.approx(DELAYS_NS[7], abs=0.08)
+
+
+def test_what_cannot_be_added(known):
+    r = ranges(3000)
+    with pytest.raises(BadInputError, match="already"):
+        add_tag(r, known, 1)
+    with pytest.raises(BadInputError, match="does not range"):
+        add_tag(r, known, 42)
+    strangers = replace(known, delays_ns={99: 0.0})
+    with pytest.raises(UnanswerableError, match="too few"):
+        add_tag(r, strangers, 7)
+
+
+def test_the_scenario_of_a_new_tag(tmp_path, known):
+    from uwbsim.scenario.loading import load as read
+    from uwbsim.simulation.run import simulate, write
+
+    train = tmp_path / "train.uwb"
+    write(simulate(read(ROOT / "scenarios" / "icra2023" / "train.toml", ["run.duration_s=120"])), train)
+    new = tmp_path / "new.uwb"
+    write(simulate(read(ROOT / "scenarios" / "new_tag" / "new_tag.toml")), new)
+    calibration = fit(load(train)).calibration
+    added = add_tag(load(new), calibration, 7)
+    planted = load(new).planted["delays_ns"]
+    shift = calibration.delays_ns[1] - planted["1"]
+    # The common shift is the curve's constant. Tag 1 is known to 11 ps and moves the new one the other way; the curve
+    # is known to 3 mm, 20 ps.
+    assert added.delays_ns[7] - shift == pytest.approx(planted["7"], abs=0.06)

@@ -1,0 +1,86 @@
+"""Delays from overheard exchanges: one target at a time, whatever the graph of pairs, and never a split."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import Curve
+from calib.estimation.fitting import fit
+from calib.estimation.passive_listeners import heard_delays
+from calib.ranges import load as load_ranges
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
+from uwbsim.scenario.loading import load
+from uwbsim.simulation.run import simulate, write
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+PASSIVE = [f"tags.{k}.passive=true" for k in range(6)]
+
+
+def recorded(tmp_path, scenario, *settings):
+    path = tmp_path / "f.uwb"
+    write(simulate(load(SCENARIOS / scenario, settings)), path, force=True)
+    return path
+
+
+def nothing(tags):
+    flat = Curve((0.0,) * 4 + (9.0,) * 4, (0.0,) * 4, 3, (0.0, 9.0))
+    one = replace(flat, coefficients=(0.1,) * 4)
+    zero = dict.fromkeys(tags, 0.0)
+    return Calibration(zero, zero, "cauchy", 0.1, "mean-of-lifted", -82.0, 299702547.0, flat, one)
+
+
+def test_without_noise_they_are_what_was_planted(tmp_path):
+    path = recorded(tmp_path, "noiseless.toml", "run.duration_s=20", *PASSIVE)
+    planted = load_ranges(path).planted["delays_ns"]
+    heard = heard_delays(path, nothing(range(1, 7)))
+    assert len(heard) >= 3
+    for tag, found in heard.items():
+        # Stamps are whole ticks of 15.6 ps, five of them; hundreds of exchanges average them to under a picosecond, but
+        # the ratio of clocks over a third leg five times as long adds a drift of some picoseconds.
+        assert found.delay_ns == pytest.approx(planted[str(tag)], abs=0.005), tag
+
+
+def test_they_agree_with_the_fit_of_a_noisy_flight(tmp_path):
+    path = recorded(tmp_path, "icra2023/train.toml", "run.duration_s=60", *PASSIVE)
+    found = fit(load_ranges(path)).calibration
+    heard = heard_delays(path, found)
+    assert len(heard) == 4
+    # Both have the curve's constant in the same gauge. A fit of 60 s knows a delay to 17 ps, listeners to 8.
+    for tag, one in heard.items():
+        assert one.delay_ns == pytest.approx(found.delays_ns[tag], abs=0.06)
+
+
+def test_no_listeners_no_delays(tmp_path):
+    path = recorded(tmp_path, "icra2023/train.toml", "run.duration_s=5")
+    assert heard_delays(path, nothing(range(1, 7))) == {}
+
+
+def test_the_split_leaves_no_trace_in_what_anyone_computes(tmp_path):
+    """Moving delay from a tag's transmissions to its receptions moves its clock, and nothing else."""
+    scenario = load(SCENARIOS / "noiseless.toml", ["run.duration_s=5", *PASSIVE])
+
+    def flown(share, more_ns):
+        tags = [
+            tag.model_copy(
+                update={
+                    "delay_ns": None,
+                    "tx_delay_ns": share * (tag.delay_ns + more_ns),
+                    "rx_delay_ns": (share - 1) * (tag.delay_ns + more_ns),
+                }
+            )
+            for tag in scenario.tags
+        ]
+        path = tmp_path / f"{share}-{more_ns}.uwb"
+        write(simulate(scenario.model_copy(update={"tags": tuple(tags)})), path)
+        return load_ranges(path), heard_delays(path, nothing(range(1, 7)))
+
+    (first, heard), (second, heard_again), (longer, heard_longer) = flown(0.2, 1.0), flown(0.8, 1.0), flown(0.2, 1.6)
+    # A range is half of four rounded stamps.
+    assert np.abs(second.raw_m - first.raw_m).max() < 2.5 * METRES_PER_TICK
+    assert np.median(longer.raw_m - first.raw_m) == pytest.approx(-0.6e-9 * SPEED_OF_LIGHT, abs=0.002)
+    for tag, delay in heard.items():
+        assert heard_again[tag].delay_ns == pytest.approx(delay.delay_ns, abs=0.002)
+        assert heard_longer[tag].delay_ns == pytest.approx(delay.delay_ns + 0.6, abs=0.005)

@@ -1,0 +1,238 @@
+"""The joint fit against an independent optimiser, the paper's recipe, groups of tags, and what smooths the curve."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from calib.calibration.comparison import compare
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import basis, curvature, lifted_power
+from calib.errors import BadInputError, UnanswerableError
+from calib.estimation.fitting import fit
+from calib.estimation.problem import build_problem
+from calib.estimation.robust import design, quadratic_model, robust_fit, summed_squares
+from calib.estimation.smoothing import reml_penalty
+from calib.estimation.solver import solve
+from calib.ranges import without_static
+from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+from uwblink.ticks import SPEED_OF_LIGHT
+
+METRES_A_NS = SPEED_OF_LIGHT * 1e-9
+
+
+def problem_of(r, groups=None, minimum_norm=False):
+    return build_problem(
+        r, lift="mean-of-lifted", alpha_dbm=-82.0, fixed={}, groups=groups or {}, minimum_norm=minimum_norm
+    )  # fmt: skip
+
+
+def test_the_joint_optimum_is_scipys():
+    problem = problem_of(ranges(9000))
+    found = solve(problem, "cauchy", 0.1 * METRES_A_NS, sequential=False)
+    width = 0.1 * METRES_A_NS
+    residual = problem.error + problem.design @ found.parameters
+    # The penalty that the fit chose is recovered from its own optimum: the gradient of the loss is balanced by it.
+    near = quadratic_model(problem.design, -residual, "cauchy", width)
+    ridge, _ = reml_penalty(near, found.parameters, problem.penalties())
+    root = np.linalg.cholesky(ridge[problem.rank :, problem.rank :]).T
+    root = np.hstack([np.zeros((len(root), problem.rank)), root])
+
+    def cost(x):
+        u = (problem.error + problem.design @ x) / width
+        # Half of scipy's sum of squares is the loss: sign(u) sqrt(log(1 + u^2)) squared is Cauchy's.
+        return np.concatenate([np.sign(u) * np.sqrt(np.log1p(u**2)) * width, root @ x])
+
+    def slope(x):
+        u = (problem.error + problem.design @ x) / width
+        size = np.sqrt(np.log1p(u**2))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            factor = np.where(np.abs(u) < 1e-6, 1.0, np.abs(u) / ((1 + u**2) * size))
+        return np.vstack([factor[:, None] * problem.design, root])
+
+    joint = robust_fit(problem.design, -problem.error, "cauchy", width, ridge, found.parameters, near=True)
+    x = joint.parameters + 0.003
+    for _ in range(3):
+        x = least_squares(cost, x, jac=slope, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    np.testing.assert_allclose(joint.parameters[: problem.rank], x[: problem.rank], atol=1e-6)
+    np.testing.assert_allclose(joint.parameters, found.parameters, atol=2e-4)
+
+
+def test_the_sequential_recipe_has_the_delays_of_delays_alone():
+    r = ranges(6000)
+    found = fit(r, sequential=True)
+    alone = robust_fit(design(r, r.tags()), r.truth_m - r.raw_m, "cauchy")
+    delays = np.array([found.calibration.delays_ns[tag] for tag in r.tags()])
+    np.testing.assert_allclose(delays - delays.mean(), alone.parameters - alone.parameters.mean(), atol=1e-9)
+    assert found.calibration.provenance["recipe"] == "sequential"
+
+
+def test_the_joint_fit_is_better_where_power_goes_with_the_pair():
+    # Delays alone take for a delay what a pair's own power does to its ranges.
+    slope = 0.2
+    r = ranges(12_000, bias=lambda lifted: slope * lifted)
+    low = (r.initiator == 1) | (r.target == 1)
+    fpp = [np.where(low, power - 6, power) for power in (r.fpp1_dbm, r.fpp2_dbm)]
+    before, after = (lifted_power(*p, "mean-of-lifted", -82.0) for p in ((r.fpp1_dbm, r.fpp2_dbm), fpp))
+    r = replace(r, fpp1_dbm=fpp[0], fpp2_dbm=fpp[1], raw_m=r.raw_m + slope * (after - before))
+    wrong = {}
+    for sequential in (False, True):
+        c = fit(r, sequential=sequential).calibration
+        error = np.array([c.delays_ns[tag] - d for tag, d in DELAYS_NS.items()])
+        wrong[sequential] = np.std(error)
+    assert wrong[False] < 0.02 < wrong[True]
+
+
+def grouped(r, groups):
+    """Give tags of the second group a bias of the opposite sign."""
+    other = [0.5 * np.isin(ids, groups["second"]) for ids in (r.initiator, r.target)]
+    share = other[0] + other[1]
+    lifted = lifted_power(r.fpp1_dbm, r.fpp2_dbm, "mean-of-lifted", -82.0)
+    return replace(r, raw_m=r.raw_m - 2 * share * bias_m(lifted))
+
+
+def test_groups_of_tags_get_their_own_curves():
+    groups = {"first": (1, 2), "second": (3, 7)}
+    c = fit(grouped(ranges(30_000), groups), groups=groups).calibration
+    grid = np.linspace(*c.bias_curve.range, 200)
+    for name, sign in (("first", 1), ("second", -1)):
+        curve = c.groups[name].bias_curve(grid)
+        planted = sign * bias_m(grid)
+        assert np.std(curve - planted) < 0.006, name
+        assert np.mean(curve) == pytest.approx(0, abs=1e-3)
+    again = Calibration.from_json(c.to_json())
+    assert again == c
+    assert json.loads(c.to_json())["schema_version"] == 2
+    # A range between the groups has the mean of both curves, which is none at all here.
+    r = grouped(ranges(3000, seed=8), groups)
+    applied = c.apply(r)
+    assert np.median(np.abs(np.median(applied.corrected_m - r.truth_m))) < 0.02
+    mixed = np.isin(r.initiator, (1, 2)) != np.isin(r.target, (1, 2))
+    taken = (applied.delay_corrected_m - applied.corrected_m)[mixed]
+    assert np.std(taken) < 0.006
+
+
+def test_groups_that_do_not_fit_the_data_are_refused():
+    r = ranges(1000)
+    with pytest.raises(BadInputError, match="tag 7 is in no group"):
+        fit(r, groups={"a": (1, 2, 3)})
+    with pytest.raises(BadInputError, match="no tag of group 'b'"):
+        fit(r, groups={"a": (1, 2, 3, 7), "b": (9,)})
+    c = fit(grouped(ranges(3000), {"second": (3, 7)}), groups={"first": (1, 2), "second": (3, 7)}).calibration
+    lonely = replace(c, groups={"first": c.groups["first"]})
+    with pytest.raises(BadInputError, match="none of the calibration's groups"):
+        lonely.apply(r)
+
+
+def test_a_group_with_too_few_ranges_for_a_curve_is_named():
+    r = ranges(3000)
+    rare = (r.initiator != 7) & (r.target != 7)
+    rare[np.flatnonzero(~rare)[:15]] = True
+    with pytest.raises(UnanswerableError, match="group 'b' has too few ranges"):
+        fit(r[rare], groups={"a": (1, 2, 3), "b": (7,)})
+
+
+def test_the_smallest_delays_only_when_asked():
+    r = ranges(3000)
+    pair = r[(r.initiator == 1) & (r.target == 2)]
+    with pytest.raises(UnanswerableError, match="--minimum-norm"):
+        fit(pair)
+    found = fit(pair, minimum_norm=True)
+    c = found.calibration
+    assert c.provenance["undetermined"] == [[1, 2]]
+    assert "free" in found.warnings[0]
+    assert all(np.isinf(std) for std in c.delays_std_ns.values())
+    # Smallest means that both get the same share of what is missing (K is one to a part in 10^5).
+    assert c.delays_ns[1] == pytest.approx(c.delays_ns[2], abs=1e-5)
+    again = Calibration.from_json(c.to_json())
+    assert again == c
+    assert '"1": null' in c.to_json()
+    whole = fit(r).calibration
+    with pytest.raises(UnanswerableError, match="0 tags have determined delays"):
+        compare(whole, c)
+
+
+def test_the_band_holds_the_curve():
+    inside = []
+    for seed in range(12):
+        c = fit(ranges(4000, seed=seed)).calibration
+        grid = np.linspace(*c.bias_curve.range, 50)
+        wrong = c.bias_curve(grid) - bias_m(grid)
+        inside.append(np.abs(wrong - wrong.mean()) < 1.96 * c.band(grid, "bias"))
+    # 600 points, of which some eight a curve are independent: 95 % to within 2 % either side, and the tail of
+    # reflections that a Cauchy loss lets through takes a little more.
+    assert np.mean(inside) > 0.88
+
+
+def test_a_straight_curve_is_made_straighter_than_a_bent_one():
+    bends = {}
+    for name, bias in (("straight", lambda lifted: 0.1 * lifted), ("bent", bias_m)):
+        c = fit(ranges(6000, bias=bias)).calibration
+        coefficients = np.array(c.bias_curve.coefficients)
+        bends[name] = coefficients @ curvature(np.array(c.bias_curve.knots)) @ coefficients
+        grid = np.linspace(*c.bias_curve.range, 100)
+        wrong = c.bias_curve(grid) - bias(grid)
+        assert np.std(wrong) < 0.005
+    assert bends["straight"] < 0.01 * bends["bent"]
+
+
+def test_curvature_is_the_integral_of_squared_second_derivatives():
+    knots = np.concatenate([[0.0] * 4, [0.3, 0.9], [2.0] * 4])
+    # x^3 has the second derivative 6 x, whose square's integral over (0, 2) is 96; lengths count in spans of 2.
+    fine = np.linspace(0, 2, 400)
+    coefficients = np.linalg.lstsq(basis(fine, knots), fine**3, rcond=None)[0]
+    assert coefficients @ curvature(knots) @ coefficients == pytest.approx(96 * 2**3, rel=1e-9)
+
+
+def test_scores_are_summed_within_blocks():
+    rng = np.random.default_rng(2)
+    matrix, score = rng.normal(size=(1300, 3)), rng.normal(size=1300)
+    blocks = np.sort(rng.integers(0, 40, 1300))
+    expected = np.zeros((3, 3))
+    for block in range(40):
+        total = (matrix * score[:, None])[blocks == block].sum(axis=0)
+        expected += np.outer(total, total)
+    np.testing.assert_allclose(summed_squares(matrix, score, blocks), expected * 40 / 39, rtol=1e-9)
+
+
+def test_errors_that_persist_widen_the_intervals():
+    r = ranges(8000, tail=0.0)
+    r = replace(r, time_ns=r.time_ns * 10)
+    rng = np.random.default_rng(3)
+    # An error that a pair keeps for the two seconds of a block, in which it has 6.7 ranges, beside an independent one.
+    held = rng.normal(size=(6, 200))[np.arange(len(r)) % 6, r.time_ns // 2_000_000_000] * 0.05
+    both = replace(r, raw_m=r.raw_m + held)
+    plain, both = (fit(some, loss="l2").calibration for some in (r, both))
+    ratio = np.mean(list(both.delays_std_ns.values())) / np.mean(list(plain.delays_std_ns.values()))
+    # As many independent errors would widen them by the root of 2, held ones by the root of 7.7.
+    assert 2.2 < ratio < 3.3
+
+
+def test_static_spans_are_left_out():
+    r = ranges(6000)
+    still = r.time_ns < 10_000_000_000
+    r = replace(r, truth_m=np.where(still, 2.0, r.truth_m))
+    moving = without_static(r)
+    assert len(moving) == np.count_nonzero(~still)
+    assert moving.excluded == {"static": np.count_nonzero(still)}
+    with pytest.raises(UnanswerableError, match="nothing moves"):
+        without_static(replace(r, truth_m=np.full(len(r), 2.0)))
+
+
+def test_power_that_goes_with_distance_is_warned_of():
+    r = ranges(5000)
+    assert not any("confounded" in warning for warning in fit(r).warnings)
+    rng = np.random.default_rng(1)
+    power = -78 - 20 * np.log10(r.truth_m) + rng.normal(size=(2, len(r))) * 0.2
+    found = fit(replace(r, fpp1_dbm=power[0], fpp2_dbm=power[1]))
+    assert any("confounded" in warning for warning in found.warnings)
+    assert found.calibration.provenance["warnings"] == found.warnings
+
+
+def test_single_sided_ranges_and_missing_ones_are_warned_of():
+    r = ranges(3000)
+    found = fit(replace(r, protocol=np.full(len(r), "ss"), excluded={"no true distance": 1000}))
+    assert any("single-sided" in warning for warning in found.warnings)
+    assert any("25 % of the exchanges were left out: no true distance" in warning for warning in found.warnings)

@@ -1,0 +1,100 @@
+"""Statistics by pair and overall, against their definitions."""
+
+import numpy as np
+import pytest
+
+from calib.estimation.fitting import fit
+from calib.evaluation.statistics import evaluate, pair_rows, statistics
+from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+from uwblink.ticks import SPEED_OF_LIGHT
+
+
+def test_statistics_of_known_numbers():
+    s = statistics(np.array([-1.0, 0.0, 1.0, 2.0, 98.0]))
+    assert (s.n, s.mean_m, s.median_m) == (5, 20.0, 1.0)
+    assert s.std_m == pytest.approx(np.sqrt(np.mean((np.array([-21, -20, -19, -18, 78])) ** 2)))
+    assert s.robust_std_m == pytest.approx(1.4826)
+
+
+def test_pairs_do_not_depend_on_who_initiates():
+    r = ranges(12)
+    from dataclasses import replace
+
+    swapped = replace(r, initiator=r.target, target=r.initiator)
+    assert pair_rows(r).keys() == pair_rows(swapped).keys() == {"1-2", "1-3", "1-7", "2-3", "2-7", "3-7"}
+
+
+def test_five_percent_are_rejected_of_clean_data():
+    r = ranges(40_000, tail=0.0)
+    found = evaluate(r, fit(r).calibration).overall
+    # 40 000 draws: 0.11 %; the sigma curve is known to 1 %, which is another 0.3 %.
+    assert found.rejected == pytest.approx(0.05, abs=0.007)
+
+
+def test_json_has_stages_and_figures_for_all_and_each_pair():
+    r = ranges()
+    document = evaluate(r, fit(r).calibration).to_dict()
+    assert set(document) == {"overall", "pairs"}
+    for group in (document["overall"], *document["pairs"].values()):
+        for stage in ("raw", "delays", "full"):
+            assert {"n", "mean_m", "median_m", "std_m", "robust_std_m"} <= set(group[stage])
+    assert sum(g["raw"]["n"] for g in document["pairs"].values()) == document["overall"]["raw"]["n"] == len(r)
+
+
+def test_calibrated_is_better_than_raw_in_every_figure():
+    r = ranges()
+    overall = evaluate(ranges(seed=2), fit(r).calibration).overall
+    assert abs(overall.full.mean_m) < abs(overall.raw.mean_m)
+    assert overall.full.std_m < overall.raw.std_m
+    assert overall.full.robust_std_m < overall.raw.robust_std_m
+
+
+def test_quantiles_and_coverage_of_known_numbers():
+    s = statistics(np.arange(-100.0, 101.0))
+    assert (s.low_m, s.high_m, s.abs95_m) == (-95.0, 95.0, pytest.approx(95.0))
+
+
+def test_coverage_is_nominal_on_clean_data_and_raw_rejection_is_its_own():
+    r = ranges(40_000, tail=0.0)
+    found = evaluate(r, fit(r).calibration).overall
+    for name, share in found.coverage.items():
+        assert share == pytest.approx(float(name if name != "68" else "68.27") / 100, abs=0.007), name
+    error = r.raw_m - r.truth_m
+    assert found.rejected_raw == np.mean(error**2 > 3.841458820694124 * np.var(error))
+
+
+def test_the_planted_calibration_is_found_beside():
+    from dataclasses import replace
+
+    from scipy.interpolate import make_interp_spline
+
+    grid = np.linspace(-0.5, 2.5, 60)
+    curve = make_interp_spline(grid, bias_m(grid))
+    planted = {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}}
+    planted["bias_curve"] = {"knots": curve.t.tolist(), "coefficients": curve.c.tolist(), "degree": 3}
+    r = replace(ranges(20_000), planted=planted)
+    calibration = fit(r).calibration
+    found = evaluate(r, calibration).planted
+    assert sum(found.delay_error_ns.values()) == pytest.approx(0, abs=1e-12)
+    # A delay and a constant of the curve exchanged change nothing here.
+    moved = replace(
+        calibration,
+        delays_ns={t: d + 0.2 for t, d in calibration.delays_ns.items()},
+        bias_curve=replace(
+            calibration.bias_curve,
+            coefficients=tuple(c + 0.2e-9 * SPEED_OF_LIGHT for c in calibration.bias_curve.coefficients),
+        ),
+    )
+    again = evaluate(r, moved).planted
+    assert again.curve_rms_m == pytest.approx(found.curve_rms_m, abs=1e-9)
+    assert again.correction_rms_m == pytest.approx(found.correction_rms_m, abs=1e-6)
+    # The whole correction, by hand: what is left of raw minus truth when noise and tail are taken away.
+    applied = calibration.apply(r)
+    clean = r.truth_m + bias_m(applied.lifted)
+    for tag, delay in DELAYS_NS.items():
+        clean = clean - SPEED_OF_LIGHT * 1e-9 * delay * (
+            r.weight_initiator * (r.initiator == tag) + r.weight_target * (r.target == tag)
+        )
+    wrong = (applied.corrected_m - r.raw_m + clean - r.truth_m)[~applied.clamped]
+    assert found.correction_rms_m == pytest.approx(np.sqrt(np.mean(wrong**2)), rel=0.02)
+    assert found.correction_rms_m < 0.005

@@ -1,0 +1,69 @@
+"""Ranging plans: files, turns, and what is wrong with them."""
+
+import pytest
+
+from uwblink.boards.ranging_plan import RangingPlan, load_plan, load_tags
+from uwblink.errors import PlanError
+from uwblink.recording.schema import Tag
+
+
+def written(tmp_path, text):
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_whole_plan(tmp_path):
+    plan = load_plan(
+        written(
+            tmp_path,
+            "pairs = [[1, 2], [3, 1]]\nrate_hz = 50\nprotocol = 'ss'\ntarget_reports = true\nget_cir = true\n"
+            "[[tags]]\nid = 1\nbody = 'a'\nlever_arm_m = [0.1, 0, -1]\n",
+        )
+    )
+    assert plan == RangingPlan(((1, 2), (3, 1)), 50, "ss", True, True, (Tag(1, "a", (0.1, 0.0, -1.0)),))
+    assert plan.turns([1, 2, 3]) == ((1, 2), (3, 1))
+
+
+def test_all_leaves_out_pairs_on_one_body():
+    tags = (Tag(1, "a", (0, 0, 0)), Tag(2, "a", (1, 0, 0)), Tag(3, "b", (0, 0, 0)))
+    assert RangingPlan(tags=tags).turns([3, 1, 2]) == ((1, 3), (2, 3))
+    assert RangingPlan().turns([3, 1, 2]) == ((1, 2), (1, 3), (2, 3))
+
+
+@pytest.mark.parametrize(
+    ("text", "fragment"),
+    [
+        ("rate = 5", "rate: unknown key"),
+        ("rate_hz = -1", "rate_hz: found -1"),
+        ("rate_hz = 'fast'", "rate_hz"),
+        ("protocol = 'tdoa'", "allowed: ds, ss"),
+        ("pairs = [[1, 1]]", "itself"),
+        ("pairs = [[1]]", "pairs"),
+        ("pairs = []", "pairs"),
+        ("pairs = [[1, 999]]", "pairs"),
+        ("get_cir = 1", "get_cir"),
+        ("tags = 3", "tags"),
+        ("[[tags]]\nid = 1", "body"),
+        ("[[tags]]\nid = 1\nbody = 'a'\n[[tags]]\nid = 1\nbody = 'b'", "second 1"),
+        ("[[tags]]\nid = 1\nbody = 'a'\nlever_arm_m = [1, 2]", "lever_arm_m"),
+        ("pairs = [", "not valid TOML"),
+    ],
+)
+def test_plans_that_cannot_be_played(tmp_path, text, fragment):
+    with pytest.raises(PlanError, match=r"plan\.toml") as caught:
+        load_plan(written(tmp_path, text))
+    assert fragment in str(caught.value)
+
+
+def test_an_absent_tag_is_named():
+    with pytest.raises(PlanError, match="names 9, but the boards at the ports are 1, 2"):
+        RangingPlan(((1, 9),)).turns([1, 2])
+    with pytest.raises(PlanError, match="no two boards"):
+        RangingPlan().turns([1])
+
+
+def test_tags_come_from_a_scenario_too(tmp_path):
+    assert load_tags(written(tmp_path, "[run]\nseed = 1\n[[tags]]\nid = 4\nbody = 'x'\nskew_ppm = 3\n")) == (
+        Tag(4, "x", (0.0, 0.0, 0.0)),
+    )

@@ -1,0 +1,126 @@
+"""Motion-capture poses from files, and the offset of their clock."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwblink.errors import ImportTableError
+from uwblink.importers.motion_capture import add_poses
+from uwblink.importers.poses import read_poses
+from uwblink.recording.file import Recording
+from uwbsim.boards.server import write_poses
+from uwbsim.scenario.loading import load
+from uwbsim.simulation.run import simulate, write
+
+ROOT = Path(__file__).parents[3]
+TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
+HEADER = "time_s,body,x,y,z,qx,qy,qz,qw\n"
+SHIFT_NS = 1_700_000_000_123_456_789
+
+
+def test_csv_and_tum_say_the_same(tmp_path):
+    (tmp_path / "a.csv").write_text(HEADER + "1.5,b1,1,2,3,0,0,0,1\n0.5,b1,0,2,3,0,0,0.7071068,0.7071068\n")
+    (tmp_path / "a.tum").write_text("# time x y z qx qy qz qw\n0.5 0 2 3 0 0 0.7071068 0.7071068\n1.5 1 2 3 0 0 0 1\n")
+    csv, tum = read_poses(tmp_path / "a.csv"), read_poses(tmp_path / "a.tum", "b1")
+    for name in ("time_ns", "body", "position_m", "quaternion"):
+        np.testing.assert_array_equal(getattr(csv, name), getattr(tum, name))
+    assert csv.time_ns.tolist() == [500_000_000, 1_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fragment"),
+    [
+        ("a.csv", HEADER + "0,b,1,2,x,0,0,0,1\n", "row 2: column 'z': found 'x'"),
+        ("a.csv", HEADER + "0,b,1,2,nan,0,0,0,1\n", "row 2: column 'z'"),
+        ("a.csv", HEADER.replace("body,", "") + "0,1,2,3,0,0,0,1\n", "column 'body' is missing"),
+        ("a.csv", HEADER, "holds no poses"),
+        ("a.csv", HEADER + "0,b,1,2,3,0,0,0,0\n", "quaternion has length 0"),
+        ("a.tum", "0 1 2 3\n", "--body"),
+        ("a.xyz", "", "expected one of"),
+    ],
+)
+def test_files_that_hold_no_poses(tmp_path, name, text, fragment):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ImportTableError) as caught:
+        read_poses(tmp_path / name)
+    assert fragment in str(caught.value)
+    with pytest.raises(ImportTableError, match="no such file"):
+        read_poses(tmp_path / "none.csv")
+
+
+def test_bags_of_poses(tmp_path):
+    rosbags = pytest.importorskip("rosbags.rosbag2", reason="the extra uwbcal[bags] is not installed")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    make = {name: types[f"geometry_msgs/msg/{name}"] for name in ("PoseStamped", "Pose", "Point", "Quaternion")}
+    time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    with rosbags.Writer(tmp_path / "bag", version=9) as writer:
+        topic = writer.add_connection("/ifo001/mavros/local", "geometry_msgs/msg/PoseStamped", typestore=store)
+        for k in range(3):
+            pose = make["Pose"](make["Point"](float(k), 0.0, 1.0), make["Quaternion"](0.0, 0.0, 0.0, 1.0))
+            message = make["PoseStamped"](header(time(k, 500), "world"), pose)
+            writer.write(topic, k, store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
+    poses = read_poses(tmp_path / "bag")
+    assert poses.time_ns.tolist() == [500, 1_000_000_500, 2_000_000_500]
+    assert poses.body.tolist() == ["ifo001"] * 3
+    assert poses.position_m[:, 0].tolist() == [0.0, 1.0, 2.0]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A recording in host time without poses, and its motion capture in a file, 3.21 s late."""
+    folder = tmp_path_factory.mktemp("flight")
+    scenario = load(TEST1, ["run.duration_s=20"])
+    simulated = simulate(scenario)
+    from dataclasses import replace
+
+    e = simulated.exchanges
+    nothing = replace(
+        simulated.poses,
+        time_ns=simulated.poses.time_ns[:0],
+        body=simulated.poses.body[:0],
+        position_m=simulated.poses.position_m[:0],
+        quaternion=simulated.poses.quaternion[:0],
+    )
+    moved = replace(simulated, poses=nothing, exchanges=replace(e, time_ns=e.time_ns + SHIFT_NS))
+    write(moved, folder / "f.uwb")
+    write_poses(scenario, SHIFT_NS + 3_210_000_000, folder / "p.csv")
+    return folder
+
+
+def test_auto_finds_the_offset_from_the_ranges(flight, tmp_path):
+    copy = tmp_path / "f.uwb"
+    copy.write_bytes((flight / "f.uwb").read_bytes())
+    found = add_poses(copy, flight / "p.csv", offset="auto")
+    # A drone at 1 m/s moves 5 mm in 5 ms; 1500 ranges of 10 cm know a shift of that size.
+    assert found.offset_s == pytest.approx(-3.210, abs=0.015)
+    assert found.covered > 0.95 * found.exchanges
+    with Recording.open(copy) as recording:
+        assert recording.count("poses") == found.poses
+        assert recording.meta()["poses_offset_s"] == pytest.approx(found.offset_s)
+
+
+def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, tmp_path):
+    copy = tmp_path / "f.uwb"
+    copy.write_bytes((flight / "f.uwb").read_bytes())
+
+    def run(*words):
+        command = [str(Path(sys.executable).parent / "uwblink"), "poses", str(copy), *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    assert "3320 of 3320 exchanges have a true distance" in run("--from", flight / "p.csv", "--offset", "-3.21").stdout
+    for words, fragment in (
+        (("--from", tmp_path / "no.csv"), "no such file"),
+        (("--from", flight / "p.csv", "--offset", "soon"), "--offset"),
+        (("--from", flight / "p.csv", "--offset", "500000"), "no exchange lies within"),
+        (("--from", flight / "p.csv", "--tags", tmp_path / "no.toml"), "no such file"),
+    ):
+        done = run(*words)
+        assert done.returncode == 2
+        assert fragment in done.stderr
+        assert done.stderr.count("\n") == 1

@@ -1,0 +1,110 @@
+"""The recording: what goes in comes out, and what is not a recording says so."""
+
+import duckdb
+import numpy as np
+import pytest
+
+from uwblink.errors import RecordingError, RecordingExistsError, RecordingMissingError
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.twr import COLUMNS, Exchanges
+
+
+def random_exchanges(n=50, seed=1):
+    rng = np.random.default_rng(seed)
+    columns = {name: rng.integers(0, 2**32, n) for name in COLUMNS}
+    columns |= {name: rng.normal(size=n) for name in COLUMNS if name.endswith(("_m", "_dbm", "_ppm"))}
+    columns |= {name: rng.integers(0, 65536, n) for name in ("initiator", "target", "reporter")}
+    columns["protocol"] = rng.choice(["ss", "ds", "ds-alt"], n)
+    columns["truth_m"][::2] = np.nan
+    return Exchanges(**columns)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    path = tmp_path / "flight.uwb"
+    with Recording.create(path, meta={"seed": 7}) as r:
+        r.append_exchanges(random_exchanges())
+        r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
+        r.append_poses(Poses(np.array([5, 6]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
+        r.append_faults([Fault(9, "1", "time-out", "no answer")])
+    return path
+
+
+def test_everything_comes_back_bit_for_bit(recording):
+    expected = random_exchanges()
+    with Recording.open(recording) as r:
+        found = r.exchanges()
+        for name in COLUMNS:
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+        assert r.tags() == [Tag(1, "a", (0.0, 0.0, 0.0)), Tag(3, "b", (0.1, 0.2, 0.3))]
+        assert r.faults() == [Fault(9, "1", "time-out", "no answer")]
+        assert r.poses().body.tolist() == ["a", "b"]
+        assert r.meta()["seed"] == 7
+        assert r.meta()["speed_of_light"] == 299_702_547
+
+
+def test_an_existing_file_is_not_replaced_without_force(recording):
+    before = recording.read_bytes()
+    with pytest.raises(RecordingExistsError, match="--force"):
+        Recording.create(recording)
+    assert recording.read_bytes() == before
+    with Recording.create(recording, force=True):
+        pass
+    with Recording.open(recording) as r:
+        assert r.count("exchanges") == 0
+
+
+def test_a_failed_block_leaves_nothing_behind(tmp_path):
+    with pytest.raises(RuntimeError, match="midway"), Recording.create(tmp_path / "x.uwb") as r:
+        r.append_exchanges(random_exchanges())
+        raise RuntimeError("midway")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_directory_and_junk(tmp_path):
+    with pytest.raises(RecordingMissingError, match="no such recording"):
+        Recording.open(tmp_path / "none.uwb")
+    with pytest.raises(RecordingError, match="directory"):
+        Recording.open(tmp_path)
+    (tmp_path / "junk.uwb").write_text("time_s,from_id\n")
+    with pytest.raises(RecordingError, match=r"not a \.uwb recording"):
+        Recording.open(tmp_path / "junk.uwb")
+
+
+@pytest.mark.parametrize("share", [0.001, 0.3, 0.6, 0.9, 0.99])
+def test_a_truncated_recording_is_one_clear_error(recording, tmp_path, share):
+    content = recording.read_bytes()
+    cut = tmp_path / "cut.uwb"
+    cut.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(RecordingError, match=r"cut\.uwb"), Recording.open(cut) as r:
+        r.exchanges()
+
+
+def test_wrong_tables_and_newer_versions(recording, tmp_path):
+    other = tmp_path / "other.uwb"
+    with duckdb.connect(str(other)) as db:
+        db.execute("CREATE TABLE planets (name VARCHAR)")
+    with pytest.raises(RecordingError, match=r"not a \.uwb recording"):
+        Recording.open(other)
+    with duckdb.connect(str(recording)) as db:
+        db.execute("UPDATE meta SET value = '99' WHERE key = 'format_version'")
+    with pytest.raises(RecordingError, match="version 99 is newer"):
+        Recording.open(recording)
+    with duckdb.connect(str(recording)) as db:
+        db.execute("UPDATE meta SET value = '1' WHERE key = 'format_version'")
+        db.execute("ALTER TABLE exchanges DROP COLUMN rx3")
+    with pytest.raises(RecordingError, match="exchanges lacks rx3"):
+        Recording.open(recording)
+
+
+def test_a_hostile_view_cannot_read_other_files(recording, tmp_path):
+    (tmp_path / "secret.csv").write_text("key,value\nformat_version,1\n")
+    with duckdb.connect(str(recording)) as db:
+        db.execute("DROP TABLE faults")
+        db.execute(
+            "CREATE VIEW faults AS SELECT 1::BIGINT AS time_ns, key AS board, value AS kind, '' AS detail "
+            f"FROM read_csv('{tmp_path}/secret.csv')"
+        )
+    with pytest.raises(RecordingError, match="cannot be read"), Recording.open(recording) as r:
+        r.faults()

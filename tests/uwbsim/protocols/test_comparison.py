@@ -1,0 +1,145 @@
+"""The workbench's commands: what they print, what they write, and what they refuse."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwblink.twr import PROTOCOLS
+from uwbsim.protocols.comparison import calibrated, compare, costs, over_reply, over_skew, paper_bias_m, winners
+from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.reply_delay import optimum
+from uwbsim.scenario.loading import load
+
+ROOT = Path(__file__).parents[3]
+BIN = Path(sys.executable).parent
+TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
+ROWS = list(PROTOCOLS.values())
+
+
+def run(*words):
+    return subprocess.run([BIN / "uwbsim", *map(str, words)], capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load(TEST1)
+
+
+def test_predicted_stands_beside_simulated(scenario):
+    outcomes, samples = compare(scenario, ROWS, 300_000)
+    assert [o.protocol for o in outcomes] == list(PROTOCOLS)
+    for o in outcomes:
+        # Reflections: a heavy tail knows its mean to std/550 and its spread to 1 %.
+        assert o.bias_m == pytest.approx(o.predicted_bias_m, abs=4 * o.std_m / np.sqrt(300_000))
+        assert o.std_m == pytest.approx(o.predicted_std_m, rel=0.02)
+        assert o.rmse_m == pytest.approx(np.hypot(o.bias_m, o.std_m))
+        assert o.low_m < o.median_m < o.high_m
+        assert len(samples[o.protocol]) == 200_000
+
+
+def test_an_exchange_takes_what_its_frames_and_replies_take(scenario):
+    ss, ds, sym = (costs(scenario, PROTOCOLS[name], 1e-3) for name in ("ss", "ds", "ds-sym"))
+    # A second round adds the boards' reply at once; the symmetric one a whole scheduled reply.
+    assert ds["duration_s"] - ss["duration_s"] == pytest.approx(305e-6, abs=1e-9)
+    assert sym["duration_s"] - ds["duration_s"] == pytest.approx(1e-3 - 305e-6, abs=1e-9)
+    assert ss["air_s"] < ds["air_s"] == sym["air_s"] < ds["duration_s"]
+    assert ss["air_s"] < ss["radio_on_s"] < 2 * ss["duration_s"]
+
+
+def test_the_table_says_which_wins_where(scenario):
+    rows = winners(scenario, [PROTOCOLS["ss-cfo"], PROTOCOLS["ds"]])
+    # Short replies leave the carrier integrator little to spoil, and cost double-sided ranging its short third leg.
+    assert rows[0]["rmse"] == rows[0]["per_second"] == "ss-cfo"
+    assert rows[-1]["rmse"] == rows[-1]["per_second"] == "ds"
+
+
+def test_curves_follow_the_paper(scenario):
+    curve = over_skew(scenario, PROTOCOLS["ss"], 4096)
+    reply_s = scenario.ranging.response_delay_uus * 1.0256e-6
+    np.testing.assert_allclose(curve.bias_m, [paper_bias_m(x, reply_s) for x in curve.x], atol=0.02)
+    spread = over_reply(scenario, PROTOCOLS["ds"], 16_384)
+    np.testing.assert_allclose(spread.std_m, spread.predicted_std_m, rtol=0.04)
+    r = 305e-6 / (spread.x * 1e-6)
+    ratio = spread.predicted_std_m / np.sqrt(1 + r + r**2)
+    assert np.ptp(ratio) < 0.03 * ratio.mean()
+
+
+def test_the_optimum_is_where_nothing_near_is_better(scenario):
+    found = optimum(scenario, PROTOCOLS["ds"])
+    assert not found.on_edge
+    assert found.score_m2s <= found.scores_m2s.min() * (1 + 1e-9)
+    # (1 + r + r^2) (T + a), r = 305/T: the least of it, with the rest of the exchange a, by hand.
+    delays = np.linspace(300e-6, 3e-3, 100_000)
+    rest = costs(scenario, PROTOCOLS["ds"], 1e-3)["duration_s"] - 1e-3
+    r = 305e-6 / delays
+    by_hand = delays[np.argmin((1 + r + r**2) * (delays + rest))]
+    assert found.delay_s == pytest.approx(by_hand, rel=0.03)
+    assert optimum(scenario, PROTOCOLS["ds-sym"]).on_edge
+    assert optimum(scenario, PROTOCOLS["ds"], 2e-3).delay_s > 1.3 * found.delay_s, "overhead favours longer replies"
+
+
+def test_calibrated_leaves_skew_and_noise(scenario):
+    c = calibrated(conditions_of(scenario, 200))
+    assert not c.late.any()
+    assert not c.tx_delay_initiator.any()
+    assert c.multipath == 0
+    assert c.rx_std.any()
+    assert c.rate_initiator.any()
+
+
+def test_compare_writes_a_page_and_tables(tmp_path):
+    out = tmp_path / "out"
+    done = run("compare", TEST1, "-o", out, "--protocols", "ss, ds", "-n", "20000", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert [row["protocol"] for row in document["protocols"]] == ["ss", "ds"]
+    assert {p.name for p in out.iterdir()} == {"compare.html", "compare.csv", "compare.parquet"}
+    with (out / "compare.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert float(rows[1]["std_m"]) == document["protocols"][1]["std_m"]
+    page = (out / "compare.html").read_text()
+    assert page.count("<figure>") == 5
+    assert "src='http" not in page
+    again = run("compare", TEST1, "-o", out, "--protocols", "ss", "-n", "100")
+    assert (again.returncode, again.stderr.count("\n")) == (2, 1)
+    assert "--force" in again.stderr
+    assert run("compare", TEST1, "-o", out, "--protocols", "ss", "-n", "1000", "--force").returncode == 0
+
+
+def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
+    done = run("predict", "--protocol", "ss", "--skew-ppm", 10, "--reply-delay-us", 300, "--json")
+    assert json.loads(done.stdout)["bias_m"] == pytest.approx(0.4495, abs=0.0005)
+    assert "standard deviation" in run("predict", "--protocol", "ds").stdout
+    done = run("optimum", TEST1, "--protocols", "ds", "-o", tmp_path / "o", "--json")
+    assert json.loads(done.stdout)[0]["delay_s"] == pytest.approx(633e-6, rel=0.02)
+    assert (tmp_path / "o" / "optimum-ds.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "fragments"),
+    [
+        (["compare", TEST1, "-o", "out", "--protocols", "ss,tdoa"], ["tdoa", "ss-cfo", "ds-sym"]),
+        (["compare", TEST1, "-o", "out", "--protocols", ","], ["found none"]),
+        (["compare", TEST1, "-o", "out", "-n", "0"], ["-n", "expected 1 to"]),
+        (["compare", TEST1, "-o", "no/out"], ["does not exist"]),
+        (["predict", "--protocol", "aloha"], ["aloha", "allowed"]),
+        (["predict", "--skew-ppm", "nan"], ["--skew-ppm", "nan"]),
+        (["predict", "--final-delay-us", "0"], ["--final-delay-us", "at least"]),
+        (["optimum", "no.toml"], ["no such"]),
+        (["sweep", "no.toml", "-o", "out"], ["no such"]),
+        (["run", TEST1, "-o", "o.uwb", "--through-wire", "--set", "ranging.protocol=ds-sym"], ["ds-sym", "boards"]),
+    ],
+)
+def test_what_cannot_be_is_one_line(tmp_path, words, fragments):
+    done = subprocess.run([BIN / "uwbsim", *map(str, words)], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    for fragment in fragments:
+        assert fragment in done.stderr
+    assert not list(tmp_path.iterdir())

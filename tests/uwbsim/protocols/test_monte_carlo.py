@@ -1,0 +1,161 @@
+"""The Monte Carlo in columns against the event loop with its integer stamps, and against what theory says."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.twr import COLUMNS, PROTOCOLS, raw_range
+from uwbsim.protocols.conditions import Conditions, conditions_of
+from uwbsim.protocols.monte_carlo import error_pieces, range_errors_m
+from uwbsim.protocols.prediction import predict
+from uwbsim.scenario.loading import load
+from uwbsim.simulation.run import simulate
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+NAMES = list(PROTOCOLS)
+
+
+def world(count=16_384, **values):
+    """Five metres, clocks 10 ppm apart, the boards' delays; `values` change that."""
+    start = {"flight": 5 / SPEED_OF_LIGHT, "rate_initiator": 5e-6, "rate_target": -5e-6, "at_once": 305e-6}
+    plain = {k: values.pop(k) for k in list(values) if k in ("quantize", "multipath", "detour_s", "carrier_std_ppm")}
+    one = Conditions.single(**(start | {"scheduled": 1538.7e-6} | values), **plain)
+    return one[np.zeros(count, dtype=np.int64)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
+    settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=10"]
+    scenario = load(SCENARIOS / "icra2023" / "train.toml", settings)
+    loop, columns = simulate(scenario), simulate(scenario, contention=False)
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(loop.exchanges, column), getattr(columns.exchanges, column), column)
+    np.testing.assert_array_equal(loop.truth_m, columns.truth_m)
+
+
+def test_the_command_can_do_without_contention(tmp_path):
+    import subprocess
+    import sys
+
+    from uwblink.recording.file import Recording
+
+    found = []
+    for option in ("--contention", "--no-contention"):
+        words = [Path(sys.executable).parent / "uwbsim", "run", SCENARIOS / "noiseless.toml", option]
+        words += ["-o", tmp_path / f"{option}.uwb", "--set", "run.duration_s=3", "--set", "ranging.rate_hz=100"]
+        subprocess.run(words, check=True, capture_output=True)
+        with Recording.open(tmp_path / f"{option}.uwb") as recording:
+            found.append(recording.exchanges())
+    np.testing.assert_array_equal(found[0].rx3, found[1].rx3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_means_and_variances_are_those_of_integer_stamps(name):
+    settings = [f"ranging.protocol={name}", "ranging.rate_hz=100", "run.duration_s=300", "radio.tx_noise_ps=40"]
+    scenario = load(SCENARIOS / "icra2023" / "test1.toml", settings)
+    flight = simulate(scenario, contention=False)
+    exact = raw_range(flight.exchanges) - flight.truth_m
+    # The same 30 000 states, so what remains is the noise: a million ranges against them.
+    fast = range_errors_m(PROTOCOLS[name], conditions_of(scenario, 30_000), 7, 1_000_000)
+    within = predict(PROTOCOLS[name], conditions_of(scenario, 30_000)).variance_m2.mean()
+    error = np.sqrt(within * (1 / len(exact) + 1 / len(fast)))
+    assert abs(exact.mean() - fast.mean()) < 4 * error
+    # 30 000 heavy-tailed errors know their variance to 1.5 %.
+    assert exact.var() == pytest.approx(fast.var(), rel=0.06)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"rx_std": 150e-12},
+        {"tx_std": 80e-12},
+        {"rx_std": 100e-12, "tx_std": 60e-12, "quantize": True},
+        {"rx_std": 100e-12, "multipath": 0.2, "detour_s": 1e-9},
+        {"rx_std": 50e-12, "carrier_std_ppm": 0.2},
+        {"rx_std": 50e-12, "tx_delay_initiator": 0.3e-9, "rx_delay_target": -0.5e-9, "late": 0.2e-9},
+        {"rx_std": 50e-12, "flight_rate": 5e-9, "drift_initiator": 1e-6},
+    ],
+    ids=lambda v: "+".join(v),
+)
+def test_the_prediction_holds_at_a_million(name, values):
+    c = world(**values)
+    errors = range_errors_m(PROTOCOLS[name], c, 11, 1_000_000)
+    mean, variance = predict(PROTOCOLS[name], c).pooled()
+    assert abs(errors.mean() - mean) < 4 * np.sqrt(variance / 1e6) + 2e-6
+    # Variance of normal errors is known to 0.14 %, of exponential detours to 0.5 %.
+    assert errors.var() == pytest.approx(variance, rel=0.02)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_noise_the_prediction_is_exact(name):
+    c = world(
+        1, tx_delay_initiator=0.3e-9, rx_delay_initiator=-0.2e-9, tx_delay_target=-0.1e-9, late=0.4e-9,
+        flight_rate=4e-9, drift_initiator=2e-6, drift_target=-1e-6,
+    )  # fmt: skip
+    (error,) = range_errors_m(PROTOCOLS[name], c, 1, 1)
+    # Half a nanometre: what floats of a second lose in a millisecond.
+    assert predict(PROTOCOLS[name], c).mean_m[0] == pytest.approx(error, abs=1e-6)
+
+
+def test_single_sided_bias_is_the_papers():
+    c = world(1, scheduled=300e-6)
+    assert predict(PROTOCOLS["ss"], c).mean_m[0] == pytest.approx(0.4495, abs=0.0005)
+    for name in ("ds", "ds-alt", "ds-sym"):
+        assert abs(predict(PROTOCOLS[name], c).mean_m[0]) < 0.001, name
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 1.0])
+def test_double_sided_variance_is_the_papers(share):
+    """1 + r + r^2 times the variance of single-sided ranging, r = dt32/dt53; receive noise alone is half of it."""
+    both = world(1, rx_std=1e-10, tx_std=1e-10, at_once=share * 1538.7e-6)
+    single = (SPEED_OF_LIGHT * 1e-10) ** 2
+    factor = 1 + share + share**2
+    assert predict(PROTOCOLS["ds"], both).variance_m2[0] == pytest.approx(single * factor, rel=1e-3)
+    receive = world(1, rx_std=1e-10, at_once=share * 1538.7e-6)
+    assert predict(PROTOCOLS["ds"], receive).variance_m2[0] == pytest.approx(single * factor / 2, rel=1e-3)
+    assert predict(PROTOCOLS["ss"], both).variance_m2[0] == pytest.approx(single, rel=1e-3)
+
+
+def test_the_alternative_is_neiryncks():
+    """Equal replies halve the weight of each reading: 3/4 of single-sided variance (four stamps count half each, two
+    count for both), and the bias is the flight times the mean skew."""
+    c = world(1, rx_std=1e-10, tx_std=1e-10)
+    single = (SPEED_OF_LIGHT * 1e-10) ** 2
+    assert predict(PROTOCOLS["ds-sym"], c).variance_m2[0] == pytest.approx(0.75 * single, rel=1e-3)
+    skewed = world(1, rate_initiator=12e-6, rate_target=4e-6)
+    assert predict(PROTOCOLS["ds-sym"], skewed).mean_m[0] == pytest.approx(5 * 8e-6, rel=1e-3)
+
+
+def test_carrier_noise_adds_half_the_reply_times_it():
+    c = world(1, carrier_std_ppm=0.2)
+    expected = 0.5 * SPEED_OF_LIGHT * 1538.7e-6 * 0.2e-6
+    assert np.sqrt(predict(PROTOCOLS["ss-cfo"], c).carrier_m2[0]) == pytest.approx(expected, rel=1e-6)
+    assert abs(predict(PROTOCOLS["ss-cfo"], c).mean_m[0]) < 1e-4
+    assert predict(PROTOCOLS["ss"], c).carrier_m2[0] == 0
+
+
+def test_pieces_do_not_depend_on_how_many_are_asked_for():
+    c = world(1000, rx_std=1e-10, carrier_std_ppm=0.2, quantize=True, multipath=0.1, detour_s=1e-9)
+    few, many = (range_errors_m(PROTOCOLS["ss-cfo"], c, 5, n) for n in (2500, 9000))
+    np.testing.assert_array_equal(few, many[:2500])
+    assert sum(map(len, error_pieces(PROTOCOLS["ds"], c, 5, 2500))) == 2500
+
+
+def test_protocols_see_the_same_noise():
+    c = world(4096, rx_std=1e-10)
+    errors = [range_errors_m(PROTOCOLS[name], c, 5, 4096) for name in ("ss", "ss-cfo", "ds")]
+    assert np.corrcoef(errors[0], errors[1])[0, 1] > 0.9999
+    assert np.corrcoef(errors[0], errors[2])[0, 1] > 0.85
+    other = range_errors_m(PROTOCOLS["ss"], c, 6, 4096)
+    assert abs(np.corrcoef(errors[0], other)[0, 1]) < 0.08
+
+
+def test_a_world_of_many_states_meets_each_in_turn():
+    c = replace(world(3), flight=np.array([1.0, 2.0, 3.0]) / SPEED_OF_LIGHT, late=np.array([0.0, 1e-9, 2e-9]))
+    errors = range_errors_m(PROTOCOLS["ds"], c, 1, 7)
+    expected = np.array([0, 1, 2, 0, 1, 2, 0]) * 1e-9 * SPEED_OF_LIGHT
+    np.testing.assert_allclose(errors, expected, atol=1e-4)

@@ -1,0 +1,174 @@
+"""Scenarios of the world: what cannot be is one clear line, and what is named is read."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uwblink.recording.file import Recording
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
+from uwblink.twr import delay_weights, raw_range
+from uwbsim.errors import ScenarioError
+from uwbsim.scenario.loading import load
+from uwbsim.simulation.run import simulate
+from uwbsim.world.world import World
+
+ROOT = Path(__file__).parents[3]
+OFFICE = ROOT / "scenarios" / "nlos_office" / "office.toml"
+NOISELESS = ROOT / "scenarios" / "noiseless.toml"
+BIN = Path(sys.executable).parent
+
+
+def changed(tmp_path, old, new):
+    folder = tmp_path / "nlos_office"
+    folder.mkdir()
+    (tmp_path / "antennas").mkdir()
+    (tmp_path / "antennas" / "monopole.csv").write_text((ROOT / "scenarios/antennas/monopole.csv").read_text())
+    text = OFFICE.read_text()
+    assert old in text
+    (folder / "office.toml").write_text(text.replace(old, new, 1))
+    return folder / "office.toml"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fragments"),
+    [
+        (
+            "position_m = [0.3, 0.3, 2.6]",
+            "position_m = [0.3, 9.3, 2.6]",
+            ["bodies[0].motion.position_m", "outside"],
+        ),
+        ("[10.5, 1.0, 0.4]", "[10.5, 1.0, -0.4]", ["bodies[2].motion.points_m[3]", "outside the room"]),
+        ("box_max_m = [6.5, 7.2, 2.4]", "box_max_m = [6.5, 7.2, 3.4]", ["box_max_m", "outside the room"]),
+        (
+            'body = "drone"\nlever_arm_m = [0.15, 0.0, -0.05]',
+            'body = "robot"\nlever_arm_m = [0.02, 0.0, 0.35]',
+            ["tags 3 and 4", "closer than a wavelength"],
+        ),
+        ("rate_hz = 120.0", "rate_hz = 400.0", ["ranging.rate_hz", "400", "at most 329"]),
+        ('material = "brick"', "", ["obstacles[1].material", "missing"]),
+        ('material = "brick"', 'material = "cheese"', ["obstacles[1].material", "cheese", "concrete"]),
+        (
+            'bias = "aps011"',
+            'bias = "magic"',
+            ["radio.bias: found 'magic'", "none, icra2023, icra2023-july, miluv, aps011"],
+        ),
+        ("monopole.csv", "nothing.csv", ["radio.antenna.file", "no such file"]),
+        ("min_separation_m = 0.3", "min_separation_m = 9.0", ["min_separation_m", "robot"]),
+        ("speed_mps = 0.8\nacceleration", "times_s = [1, 2]\nspeed_mps = 0.8\nacceleration", ["times_s", "either"]),
+    ],
+)
+def test_worlds_that_cannot_be(tmp_path, old, new, fragments):
+    scenario = changed(tmp_path, old, new)
+    done = subprocess.run([BIN / "uwbsim", "run", scenario, "-o", tmp_path / "o.uwb"], capture_output=True, text=True)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    for fragment in fragments:
+        assert fragment in done.stderr, done.stderr
+    assert not (tmp_path / "o.uwb").exists()
+
+
+def test_an_antenna_table_with_a_hole_is_named(tmp_path):
+    scenario = changed(tmp_path, "reflection_loss_db = 9.0", "reflection_loss_db = 9.0")
+    table = tmp_path / "antennas" / "monopole.csv"
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join(lines[:20] + lines[21:]))
+    with pytest.raises(ScenarioError, match="a hole in the antenna table: no gain at azimuth -150, elevation"):
+        load(scenario)
+
+
+def trajectory(tmp_path, seconds):
+    rows = [f"{t / 10},b,{np.sin(t / 30)},{t / 50},1,0,0,0,1" for t in range(int(seconds * 10) + 1)]
+    (tmp_path / "path.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
+    text = NOISELESS.read_text()
+    begin = text.index("motion = {")
+    end = text.index("\n", begin)
+    moved = text[:begin] + 'motion = { model = "recorded", file = "path.csv" }' + text[end:]
+    (tmp_path / "s.toml").write_text(moved.replace("duration_s = 60.0", "duration_s = 10.0"))
+    return tmp_path / "s.toml"
+
+
+def test_a_recorded_trajectory_is_flown(tmp_path):
+    world = World.of(load(trajectory(tmp_path, 12)))
+    path = next(iter(world.trajectories.values()))
+    np.testing.assert_allclose(path.position_m(np.array([3.0]))[0], [np.sin(1.0), 0.6, 1.0], atol=1e-6)
+
+
+def test_a_trajectory_that_is_too_short_is_refused(tmp_path):
+    with pytest.raises(ScenarioError, match=r"lasts 8\.0 s and does not cover the run of 10 s"):
+        load(trajectory(tmp_path, 8))
+
+
+def test_a_plan_file_with_an_unknown_tag_is_refused(tmp_path):
+    (tmp_path / "plan.csv").write_text("time_s,initiator,target\n0.1,1,99\n")
+    text = NOISELESS.read_text().replace("rate_hz = 160.0", 'rate_hz = 160.0\nplan = { file = "plan.csv" }')
+    (tmp_path / "s.toml").write_text(text)
+    with pytest.raises(ScenarioError, match="slot 1 names tag 99"):
+        load(tmp_path / "s.toml")
+
+
+def test_common_random_numbers():
+    base = ["run.duration_s=10", "radio.rx_noise_ps=100", "radio.power_noise_db=0.5", "radio.skew_noise_ppm=0.2"]
+    one = simulate(load(NOISELESS, base))
+    other = simulate(load(NOISELESS, [*base, "tags.0.skew_ppm=5.5", "tags.0.delay_ns=0.9"]))
+    # Another clock moves when exchanges happen by microseconds, and nothing else of what chance decides.
+    np.testing.assert_array_equal(one.poses.position_m, other.poses.position_m)
+    np.testing.assert_allclose(one.exchanges.fpp1_dbm, other.exchanges.fpp1_dbm, atol=1e-2)
+    without = (one.exchanges.initiator != 1) & (one.exchanges.target != 1)
+    np.testing.assert_array_equal(one.exchanges.rx2[without], other.exchanges.rx2[without])
+    single = simulate(load(NOISELESS, [*base, "ranging.protocol=ss"]))
+    np.testing.assert_array_equal(one.poses.quaternion, single.poses.quaternion)
+    np.testing.assert_allclose(one.exchanges.fpp1_dbm, single.exchanges.fpp1_dbm, atol=1e-2)
+
+
+def test_thirty_hours_are_as_exact_as_a_second():
+    scenario = load(ROOT / "scenarios" / "wrap" / "wrap.toml")
+    result = simulate(scenario)
+    planted = {int(k): d * 1e-9 for k, d in scenario.planted()["delays_ns"].items()}
+    e = result.exchanges
+    first, second = delay_weights(e)
+    delay = np.array([planted.get(k, 0.0) for k in range(4)])
+    error = raw_range(e) + SPEED_OF_LIGHT * (first * delay[e.initiator] + second * delay[e.target]) - result.truth_m
+    assert len(error) == 5400
+    assert np.abs(error).max() < METRES_PER_TICK
+
+
+def test_motion_capture_has_gaps_and_latency():
+    base = simulate(load(NOISELESS, ["run.duration_s=30"]))
+    late = simulate(load(NOISELESS, ["run.duration_s=30", "mocap.latency_ms=8", "mocap.gaps_per_min=6"]))
+    assert late.poses.time_ns.min() == base.poses.time_ns.min() + 8_000_000
+    assert 0.7 * len(base.poses) < len(late.poses) < 0.99 * len(base.poses)
+
+
+def test_show_and_validate(tmp_path):
+    def run(*words):
+        return subprocess.run([str(BIN / "uwbsim"), *map(str, words)], capture_output=True, text=True)
+
+    assert run("show", OFFICE, "-o", tmp_path / "s.html").returncode == 0
+    page = (tmp_path / "s.html").read_text()
+    assert page.count("<figure>") == 5
+    assert "src='http" not in page
+    assert run("show", OFFICE, "-o", tmp_path / "s.png").returncode == 0
+    assert (tmp_path / "s.png").stat().st_size > 20_000
+    done = run("show", OFFICE, "-o", tmp_path / "s.xyz")
+    assert (done.returncode, "expected .html" in done.stderr) == (2, True)
+    told = run("validate", OFFICE).stdout
+    assert "7200 exchanges planned among 6 pairs" in told
+    warned = run("validate", ROOT / "scenarios" / "anchors_and_tag" / "bipartite.toml").stdout
+    assert "will not be determined" in warned
+    assert '"air_share"' in run("validate", OFFICE, "--json").stdout
+
+
+def test_listed_success_counts_failures(tmp_path):
+    flight = tmp_path / "f.uwb"
+    aloha = ROOT / "scenarios" / "collisions" / "aloha.toml"
+    words = [BIN / "uwbsim", "run", aloha, "-o", flight, "--set", "run.duration_s=5"]
+    subprocess.run(words, check=True, capture_output=True)
+    done = subprocess.run([BIN / "uwblink", "show", flight, "--json"], capture_output=True, text=True)
+    shown = json.loads(done.stdout)
+    with Recording.open(flight) as recording:
+        assert sum(p["failed"] for p in shown["pairs"]) == recording.count("faults") > 0
+        assert sum(p["exchanges"] for p in shown["pairs"]) == recording.count("exchanges")

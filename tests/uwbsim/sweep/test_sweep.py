@@ -1,0 +1,247 @@
+"""Sweeps: the same results whoever does the work, whatever dies on the way, and nothing twice."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pytest
+
+from uwbsim.errors import ScenarioError, UwbsimError
+from uwbsim.sweep.design import load_plan, toml_value
+from uwbsim.sweep.executors import Processes
+from uwbsim.sweep.results import Store
+from uwbsim.sweep.runner import run_sweep
+
+ROOT = Path(__file__).parents[3]
+BIN = Path(sys.executable).parent
+HEAD = f'[sweep]\nscenario = "{ROOT}/scenarios/icra2023/test1.toml"\nprotocols = ["ss-cfo", "ds"]\n'
+GRID = '[vary]\n"ranging.response_delay_uus" = [300, 1500]\n"radio.rx_noise_ps" = [0.0, 50.0, 100.0]\n'
+
+
+def plan(tmp_path, text=HEAD + "ranges = 3000\nseeds = 2\n" + GRID, name="plan.toml"):
+    path = tmp_path / name
+    path.write_text(text)
+    return load_plan(path)
+
+
+def rows(folder):
+    with (folder / "results.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_grid_has_every_combination_with_every_seed(tmp_path):
+    p = plan(tmp_path)
+    assert (p.points, p.total) == (6, 12)
+    runs = [p.run(k) for k in range(12)]
+    assert len({(*r.values.values(), r.seed) for r in runs}) == 12
+    assert runs[0].settings() == ["ranging.response_delay_uus=300", "radio.rx_noise_ps=0.0"]
+
+
+def test_a_latin_hypercube_has_one_value_in_each_part_of_each_axis(tmp_path):
+    text = (
+        HEAD + 'design = "latin-hypercube"\nsamples = 20\n[vary]\n"radio.rx_noise_ps" = { low = 10.0, high = 1000.0, '
+    )
+    text += 'scale = "log" }\n"ranging.response_delay_uus" = { low = 300, high = 6000 }\n'
+    p = plan(tmp_path, text)
+    noise = np.array([p.run(k).values["radio.rx_noise_ps"] for k in range(20)])
+    delay = np.array([p.run(k).values["ranging.response_delay_uus"] for k in range(20)])
+    assert sorted(np.floor(np.log10(noise / 10) / 2 * 20).astype(int)) == list(range(20))
+    assert all(isinstance(p.run(k).values["ranging.response_delay_uus"], int) for k in range(20))
+    assert np.all(np.diff(np.histogram(delay, np.linspace(300, 6000, 6))[0]) <= 1)
+    assert abs(np.corrcoef(np.log(noise), delay)[0, 1]) < 0.6, "axes are shuffled apart"
+
+
+def test_a_list_is_taken_as_it_is(tmp_path):
+    p = plan(
+        tmp_path, HEAD + 'design = "list"\n[[list]]\n"radio.rx_noise_ps" = 5.0\n[[list]]\n"ranging.rate_hz" = 20\n'
+    )
+    assert [p.run(k).settings() for k in range(2)] == [["radio.rx_noise_ps=5.0"], ["ranging.rate_hz=20"]]
+
+
+@pytest.mark.parametrize("value", [1, 2.5, True, "word", [1, 2.0], {"model": "static", "position_m": [0.0, 1.0, 2.0]}])
+def test_values_survive_as_toml(value):
+    import tomllib
+
+    assert tomllib.loads(f"x = {toml_value(value)}")["x"] == value
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alone")
+    p = plan(folder)
+    assert run_sweep(p, folder / "out", workers=1).done == 12
+    return p, folder / "out"
+
+
+def test_results_are_rows_with_settings_versions_and_outcomes(alone):
+    found = rows(alone[1])
+    assert len(found) == 24
+    assert {"scenario", "seed", "uwbcal", "numpy", "python", "status", "ranging.response_delay_uus", "std_m"} <= set(
+        found[0]
+    )
+    assert {row["status"] for row in found} == {"ok"}
+    with duckdb.connect() as db:
+        same = db.execute("SELECT number, std_m FROM read_parquet(?)", [str(alone[1] / "results.parquet")]).fetchall()
+    assert same == [(int(r["number"]), float(r["std_m"])) for r in found]
+    quiet, loud = (
+        np.mean([float(r["std_m"]) for r in found if r["radio.rx_noise_ps"] == n and r["protocol"] == "ds"])
+        for n in ("0.0", "100.0")
+    )
+    assert loud > quiet
+
+
+def test_two_processes_give_the_same_bytes(alone, tmp_path):
+    p, out = alone
+    run_sweep(p, tmp_path / "out", workers=2)
+    assert (tmp_path / "out" / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
+
+
+def test_what_fails_is_a_row_and_the_rest_goes_on(tmp_path):
+    text = HEAD + 'ranges = 100\n[vary]\n"ranging.rate_hz" = [50.0, 99999.0]\n'
+    summary = run_sweep(plan(tmp_path, text), tmp_path / "out", workers=1)
+    assert (summary.done, summary.failed) == (2, 1)
+    good, bad = [r for r in rows(tmp_path / "out") if r["protocol"] != "ss-cfo"]
+    assert good["status"] == "ok"
+    assert bad["status"] == "failed"
+    assert "rate_hz" in bad["error"]
+
+
+def test_a_killed_sweep_goes_on_where_it_was(tmp_path):
+    text = HEAD + "ranges = 60_000\nseeds = 12\n" + GRID
+    p = plan(tmp_path, text)
+    words = [BIN / "uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "2"]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, start_new_session=True)
+    store = tmp_path / "out" / "results.duckdb"
+    log = store.with_name(store.name + ".wal")
+    deadline = time.monotonic() + 30
+    # The log grows with every result; ten thousand bytes are a few of them.
+    while not (log.exists() and log.stat().st_size > 10_000) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    with Store.open(store) as opened:
+        before = opened.done()
+    assert 0 < len(before) < p.total
+    summary = run_sweep(p, tmp_path / "out", workers=2, resume=True)
+    assert (summary.done, summary.skipped) == (p.total - len(before), len(before))
+    numbers = [int(row["number"]) for row in rows(tmp_path / "out")]
+    assert numbers == sorted(numbers)
+    assert sorted(set(numbers)) == list(range(p.total))
+    assert len(numbers) == 2 * p.total, "nothing twice"
+
+
+def test_a_process_that_dies_is_replaced(alone, tmp_path, monkeypatch):
+    p, out = alone
+    killed = []
+
+    class Fragile(Processes):
+        count = 0
+
+        def submit(self, chunk):
+            super().submit(chunk)
+            self.count += 1
+            if self.count in (1, 8):
+                victim = next(process for process in self._pool._processes.values() if process.is_alive())
+                killed.append(victim.pid)
+                os.kill(victim.pid, signal.SIGKILL)
+
+    monkeypatch.setattr("uwbsim.sweep.runner.workers_for", lambda count, scheduler: Fragile(2))
+    run_sweep(p, tmp_path / "out")
+    assert len(killed) == 2
+    assert (tmp_path / "out" / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
+
+
+def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    text = HEAD + "ranges = 60_000\nseeds = 8\n" + GRID
+    p = plan(tmp_path, text)
+    done = threading.Event()
+    seen = []
+
+    def watch(fraction):
+        seen.append(fraction)
+        if len(seen) == 3:
+            done.set()
+
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        victim = next(iter(cluster.workers.values())).pid
+        killer = threading.Thread(target=lambda: (done.wait(60), os.kill(victim, signal.SIGKILL)))
+        killer.start()
+        summary = run_sweep(p, tmp_path / "out", scheduler=cluster.scheduler_address, progress=watch)
+        killer.join()
+    assert (summary.done, summary.failed) == (48, 0)
+    run_sweep(p, tmp_path / "alone", workers=1)
+    assert (tmp_path / "out" / "results.csv").read_bytes() == (tmp_path / "alone" / "results.csv").read_bytes()
+
+
+def test_calibrations_are_swept_too(tmp_path):
+    text = HEAD.replace('["ss-cfo", "ds"]', '["ds"]') + 'kind = "calibrate"\n[vary]\n"run.duration_s" = [5, 0.2]\n'
+    summary = run_sweep(plan(tmp_path, text), tmp_path / "out", workers=1)
+    assert (summary.done, summary.failed) == (2, 1)
+    good, bad = rows(tmp_path / "out")
+    assert float(good["full_robust_std_m"]) < float(good["raw_robust_std_m"])
+    assert float(good["delays_rms_ns"]) < 0.3
+    assert "too few" in bad["error"]
+
+
+def test_folders_and_files_that_do_not_fit_are_refused(alone, tmp_path):
+    p, out = alone
+    with pytest.raises(ScenarioError, match="--resume"):
+        run_sweep(p, out, workers=1)
+    with pytest.raises(ScenarioError, match=r"another sweep, plan\.toml"):
+        run_sweep(plan(tmp_path, name="other.toml"), out, workers=1, resume=True)
+    changed = plan(tmp_path, HEAD + "ranges = 3001\nseeds = 2\n" + GRID)
+    with pytest.raises(ScenarioError, match="has changed"):
+        run_sweep(changed, out, workers=1, resume=True)
+    with pytest.raises(ScenarioError, match="holds no sweep"):
+        run_sweep(p, tmp_path / "new", workers=1, resume=True)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").write_text("mine")
+    with pytest.raises(ScenarioError, match="other files"):
+        run_sweep(p, tmp_path / "full", workers=1)
+    assert run_sweep(p, out, workers=1, resume=True).done == 0
+
+
+def test_a_scheduler_that_does_not_answer_is_named(alone, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    monkeypatch.setattr("uwbsim.sweep.executors.CONNECT_S", 1)
+    with pytest.raises(UwbsimError, match=r"tcp://127.0.0.1:9 does not answer within 1 s"):
+        run_sweep(alone[0], tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "fragment"),
+    [
+        ("", "missing table"),
+        ("[sweep", "not valid TOML"),
+        ("[swoop]", "unknown table"),
+        ("[sweep]\n", "sweep.scenario"),
+        (HEAD + "seed = 3\n", "did you mean seeds"),
+        (HEAD + 'kind = "guess"\n', "compare, calibrate"),
+        (HEAD + "ranges = 0\n", "whole number"),
+        (HEAD + "seeds = -1\n", "seeds"),
+        (HEAD + "seeds = 10000000000000000000\n", "seeds"),
+        (HEAD.replace('["ss-cfo", "ds"]', "[[1]]"), "sweep.protocols"),
+        (HEAD.replace('"ds"', '"tdoa"'), "tdoa"),
+        (HEAD + '[vary]\n"ranging.rate_hz" = 5\n', "list of values"),
+        (HEAD + '[vary]\n"ranging.rate_hertz" = [5]\n', "did you mean rate_hz"),
+        (HEAD + '[vary]\n"tags.17.delay_ns" = [5]\n', "index"),
+        (HEAD + 'design = "list"\n', "[[list]]"),
+        (HEAD + 'design = "latin-hypercube"\n[vary]\n"ranging.rate_hz" = { low = 5, high = 1 }\n', "low below high"),
+    ],
+)
+def test_plans_that_cannot_be(tmp_path, text, fragment):
+    with pytest.raises(ScenarioError) as caught:
+        plan(tmp_path, text)
+    assert fragment in str(caught.value)
+    assert "\n" not in str(caught.value)

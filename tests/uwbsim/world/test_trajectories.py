@@ -1,0 +1,48 @@
+"""Where bodies go: inside their box, smoothly, through their waypoints."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from uwbsim.random_streams import stream
+from uwbsim.scenario.model import RandomFlight, Static, Waypoints
+from uwbsim.world.trajectories import sample
+
+
+def test_random_flight_stays_in_its_box_at_about_its_speed():
+    box = RandomFlight(model="random-flight", box_min_m=(-2, -1, 0.5), box_max_m=(2, 1, 2.5), speed_mps=1.0)
+    flight = sample(box, 300.0, partial(stream, 1, "a"))
+    time = np.linspace(0, 300, 30_001)
+    path = flight.position_m(time)
+    assert np.all(path >= box.box_min_m)
+    assert np.all(path <= box.box_max_m)
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=1) * 100
+    assert 0.3 < np.mean(speed) < 1.5
+    assert np.abs(np.diff(path, 2, axis=0)).max() * 1e4 < 30, "acceleration is bounded"
+
+
+def test_waypoints_are_passed_on_time():
+    way = Waypoints(model="waypoints", times_s=(0, 2, 5), points_m=((0, 0, 1), (1, 2, 1), (3, 0, 2)))
+    path = sample(way, 10.0, partial(stream, 1, "a")).position_m(np.array([0.0, 2.0, 5.0, 9.0]))
+    np.testing.assert_allclose(path, [(0, 0, 1), (1, 2, 1), (3, 0, 2), (3, 0, 2)], atol=1e-12)
+
+
+def test_lever_arm_turns_with_the_body():
+    post = sample(Static(model="static", position_m=(1, 2, 3), yaw_deg=90.0), 1.0, partial(stream, 1, "a"))
+    point = post.point_m(np.array([0.0]), (1.0, 0.0, 0.0))
+    assert point[0] == pytest.approx((1, 3, 3))
+
+
+def test_quaternions_are_unit():
+    box = RandomFlight(model="random-flight", box_min_m=(0, 0, 0), box_max_m=(1, 1, 1))
+    q = sample(box, 10.0, partial(stream, 1, "b")).quaternion(np.linspace(0, 10, 50))
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-12)
+
+
+def test_a_longer_run_continues_the_same_flight():
+    box = RandomFlight(model="random-flight", box_min_m=(0, 0, 0), box_max_m=(1, 1, 1))
+    short, long = (sample(box, duration, partial(stream, 1, "a")) for duration in (20.0, 500.0))
+    time = np.linspace(0, 20, 101)
+    np.testing.assert_array_equal(short.position_m(time), long.position_m(time))
+    np.testing.assert_array_equal(short.quaternion(time), long.quaternion(time))

@@ -1,0 +1,1 @@
+"""Boards on serial ports: driver, plans, recorder, replay."""

@@ -1,0 +1,185 @@
+"""A board at a serial port, for scripts and notebooks: ask it for ranges, listen to what it reports.
+
+```python
+from uwblink.boards.board import Board
+
+with Board.open("/dev/ttyACM0") as board:
+    report = board.range(20)
+    print(board.id, report.range_m)
+```
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Final, Self, TypeVar
+
+from uwblink.boards.connection import ANSWER_S, FENCE, Dialogue
+from uwblink.boards.ports import SerialPort, Transport
+from uwblink.errors import BoardError, NoAnswerError, RefusedError
+from uwblink.wire.codec import Event
+from uwblink.wire.messages import (
+    Broadcast,
+    Cir,
+    DoTests,
+    GetId,
+    IdReport,
+    Message,
+    RangeCommand,
+    RangeReport,
+    SetPassive,
+    SetResponseDelay,
+    Skipped,
+    TestsDone,
+)
+
+KEPT_REPORTS: Final = 10_000
+CIR_S: Final = 0.2
+PROTOCOL_FLAGS: Final = {"ss": False, "ds": True}
+"""The protocols of the boards, and their flag in C05."""
+
+Reply = TypeVar("Reply", bound=Message)
+
+
+class Board:
+    """One board. Not for use from several threads at once; one board a thread is fine."""
+
+    def __init__(self, transport: Transport, answer_s: float = ANSWER_S) -> None:
+        """Talk over an open transport; `open` is for a port by name."""
+        self._transport = transport
+        self._dialogue = Dialogue(transport.name, answer_s)
+        self._reports: deque[Event] = deque(maxlen=KEPT_REPORTS)
+        self._id: int | None = None
+
+    @classmethod
+    def open(cls, port: str) -> Self:
+        """Open a serial port or pyserial URL; raises one of the `PortError`s. Nothing is written to it."""
+        return cls(SerialPort(port))
+
+    def __enter__(self) -> Self:
+        """Return the board; the `with` block closes it."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the port."""
+        self.close()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._transport.close()
+
+    @property
+    def name(self) -> str:
+        """The port's name."""
+        return self._transport.name
+
+    @property
+    def id(self) -> int:
+        """The board's id; asked for once."""
+        if self._id is None:
+            self._id = self._ask(GetId(), IdReport).board
+        return self._id
+
+    def request(self, command: Message) -> Message:
+        """Send a command and return its reply.
+
+        Raises `RefusedError` (nothing was sent), `NoAnswerError`, `RangingFailedError` with the board's own line,
+        or `PortLostError`. Other reports that come meanwhile are kept for `reports`.
+        """
+        self._wait(self._dialogue.ready_s(self._transport.now_s()))
+        if self._dialogue.doubtful:
+            self._exchange(FENCE)
+        return self._exchange(command)
+
+    def range(
+        self, target: int, *, protocol: str = "ds", target_reports: bool = False, get_cir: bool = False
+    ) -> RangeReport:
+        """Range with another board; `protocol` is "ss" or "ds". Raises what `request` raises."""
+        if protocol not in PROTOCOL_FLAGS:
+            raise RefusedError(f"protocol {protocol!r}: the boards know {' and '.join(PROTOCOL_FLAGS)}")
+        if self._id is not None and target == self._id:
+            raise RefusedError(f"{self.name}: target {target} is the board's own id; name another one")
+        return self._ask(RangeCommand(target, target_reports, PROTOCOL_FLAGS[protocol], get_cir), RangeReport)
+
+    def cir(self, target: int, *, protocol: str = "ds") -> tuple[RangeReport, Cir]:
+        """Range with another board and return its report and the channel impulse response of the last frame."""
+        report = self.range(target, protocol=protocol, get_cir=True)
+        for event in self.reports(CIR_S):
+            if isinstance(event, Cir):
+                return report, event
+        raise NoAnswerError(f"{self.name}: no channel impulse response within {CIR_S * 1e3:.0f} ms of the range")
+
+    def set_passive(self, on: bool) -> None:
+        """Listen to the exchanges of others, or stop to; forgotten at a power cycle."""
+        self.request(SetPassive(on))
+
+    def set_response_delay(self, delay_uus: int) -> None:
+        """Set the delay of double-sided exchanges for which this board is the target, 280 to 6500 (512/499.2 us)."""
+        self.request(SetResponseDelay(delay_uus))
+
+    def send(self, data: bytes) -> None:
+        """Broadcast up to 92 bytes to every board in range; delivery is not confirmed."""
+        self.request(Broadcast(data))
+
+    def test(self) -> TestsDone:
+        """Have one field of each kind echoed; raises `BoardError` when the echo is wrong."""
+        sent = DoTests(12345, "uwblink", True, 1.25, b"\x00|\r\n\xff")
+        echo = self._ask(sent, TestsDone)
+        wrong = [n for n in DoTests.FIELDS if getattr(echo, n) != getattr(sent, n)]
+        if wrong:
+            raise BoardError(f"{self.name}: the echo differs in {', '.join(wrong)}: {echo}")
+        if echo.error:
+            raise BoardError(f"{self.name}: the board says its radio's id disagrees with its own (error {echo.error})")
+        return echo
+
+    def reports(self, timeout_s: float) -> Iterator[Event]:
+        """Yield what the board says unasked, messages and lines of text, until nothing came for `timeout_s`."""
+        while True:
+            while self._reports:
+                yield self._reports.popleft()
+            if not self._listen(timeout_s):
+                return
+
+    def _ask(self, command: Message, kind: type[Reply]) -> Reply:
+        reply = self.request(command)
+        if not isinstance(reply, kind):
+            raise BoardError(f"{self.name}: found {reply}, expected {kind.__name__}")
+        return reply
+
+    def _exchange(self, command: Message) -> Message:
+        transport, dialogue = self._transport, self._dialogue
+        transport.write(dialogue.send(command, transport.now_s()))
+        while True:
+            until_s = dialogue.deadline_s() or 0.0
+            data = transport.read(max(until_s - transport.now_s(), 0.0))
+            now_s = transport.now_s()
+            events, outcome = dialogue.receive(data, now_s)
+            outcome = outcome or dialogue.expire(now_s)
+            self._keep(events, outcome.reply if outcome else None)
+            if outcome and outcome.error:
+                raise outcome.error
+            if outcome and outcome.reply:
+                return outcome.reply
+
+    def _keep(self, events: list[Event], reply: Message | None) -> None:
+        self._reports.extend(e for e in events if e is not reply and not isinstance(e, Skipped))
+
+    def _listen(self, timeout_s: float) -> bool:
+        """Wait for the next report; False when none came in time."""
+        until_s = self._transport.now_s() + timeout_s
+        while (left_s := until_s - self._transport.now_s()) > 0:
+            events, _ = self._dialogue.receive(self._transport.read(left_s), self._transport.now_s())
+            self._keep(events, None)
+            if self._reports:
+                return True
+        return False
+
+    def _wait(self, seconds: float) -> None:
+        until_s = self._transport.now_s() + seconds
+        while (left_s := until_s - self._transport.now_s()) > 0:
+            events, _ = self._dialogue.receive(self._transport.read(left_s), self._transport.now_s())
+            self._keep(events, None)

@@ -1,0 +1,29 @@
+"""Pictures of what boards report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from uwblink.wire.messages import Cir
+
+TAP_NS = 1.0016
+AROUND = (20, 80)
+
+
+def plot_cir(cir: Cir, path: Path) -> None:
+    """Draw a channel impulse response around its first path, and write it in the format of the file's suffix."""
+    first = cir.first_path_milli / 1000
+    low, high = max(int(first) - AROUND[0], 0), min(int(first) + AROUND[1], cir.TAPS)
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([(k - first) * TAP_NS for k in range(low, high)], cir.magnitudes[low:high], color="#0072B2", lw=1.6)
+    axes.axvline(0, color="#D55E00", lw=1.2, label=f"first path, index {first:.3f}")
+    axes.set_xlabel("time after the first path (ns)")
+    axes.set_ylabel("magnitude")
+    axes.set_title(f"{cir.initiator} ranging with {cir.target}", loc="left", fontsize="medium")
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=150)

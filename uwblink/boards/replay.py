@@ -1,0 +1,133 @@
+"""Old flights through today's decoder: the stored bytes decoded again, or played back on pseudo-terminals."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwblink.boards.pseudo_terminals import Terminal
+from uwblink.boards.writer import overheard_row
+from uwblink.errors import RecordingError
+from uwblink.recording.file import Recording
+from uwblink.twr import COLUMNS, Exchanges
+from uwblink.wire.bulk import ColumnDecoder
+from uwblink.wire.messages import Cir, Overheard, TextLine
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """What the stored bytes hold: columns of exchanges in order of time, and the other reports."""
+
+    exchanges: Exchanges
+    overheard: list[dict[str, float]]
+    cirs: list[tuple[int, int, int, int, float, tuple[int, ...]]]
+    texts: int
+    skipped_bytes: int
+    messages: int
+
+
+def decode_again(recording: Recording) -> Decoded:
+    """Decode every byte that came from a board; raises `RecordingError` when the recording holds none."""
+    frames = [frame for frame in recording.frames() if frame[2] == "in"]
+    if not frames:
+        raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
+    ids = board_ids(recording)
+    decoders: dict[str, ColumnDecoder] = {}
+    for time_ns, name, _, data in frames:
+        if name not in decoders:
+            decoders[name] = ColumnDecoder(ids.get(name, len(decoders)))
+        decoders[name].feed(data, time_ns)
+    overheard, cirs, texts = [], [], 0
+    for name, decoder in decoders.items():
+        decoder.finish(frames[-1][0])
+        board = ids.get(name, 0)
+        for time_ns, event in decoder.events:
+            if isinstance(event, Overheard):
+                overheard.append(overheard_row(time_ns, board, event))
+            elif isinstance(event, Cir):
+                index = event.first_path_milli / 1000
+                cirs.append((time_ns, board, event.initiator, event.target, index, event.magnitudes))
+            texts += isinstance(event, TextLine)
+    return Decoded(
+        _in_order([d.exchanges() for d in decoders.values()]),
+        sorted(overheard, key=lambda row: row["time_ns"]),
+        sorted(cirs, key=lambda row: row[0]),
+        texts,
+        sum(d.decoder.skipped_bytes for d in decoders.values()),
+        sum(d.decoder.messages for d in decoders.values()),
+    )
+
+
+def board_ids(recording: Recording) -> dict[str, int]:
+    """Return which board was at each port when the recording began."""
+    ports = recording.meta().get("ports", {})
+    return {str(name): int(board) for board, name in ports.items()} if isinstance(ports, dict) else {}
+
+
+def rewrite(source: Recording, decoded: Decoded, output: Path, *, force: bool = False) -> None:
+    """Write a recording with what was decoded in place of what was stored; raises what `Recording.create` raises."""
+    with Recording.create(output, meta=source.meta(), force=force) as written:
+        written.append_tags(source.tags())
+        written.append_poses(source.poses())
+        written.append_faults(source.faults())
+        written.append_frames(source.frames())
+        written.append_exchanges(decoded.exchanges)
+        written.append_overheard(decoded.overheard)
+        written.append_cirs(decoded.cirs)
+
+
+def play(
+    recording: Recording,
+    ready: Callable[[dict[str, str]], None],
+    *,
+    speed: float = 1.0,
+    link_dir: Path | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> int:
+    """Play the bytes from boards back on one pseudo-terminal each; returns how many frames were played.
+
+    `ready` is told what each board's port is now called, before the first byte. Raises `RecordingError` when the
+    recording holds no bytes.
+    """
+    frames = [frame for frame in recording.frames() if frame[2] == "in"]
+    if not frames:
+        raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
+    ids = board_ids(recording)
+    names = sorted({frame[1] for frame in frames})
+    terminals = {n: Terminal(link_dir / f"tag{ids.get(n, k)}" if link_dir else None) for k, n in enumerate(names)}
+    try:
+        ready({name: terminal.name for name, terminal in terminals.items()})
+        start_s, first_ns = time.monotonic(), frames[0][0]
+        for count, (time_ns, name, _, data) in enumerate(frames):
+            while (wait_s := start_s + (time_ns - first_ns) * 1e-9 / speed - time.monotonic()) > 0:
+                if stop():
+                    return count
+                time.sleep(min(wait_s, 0.1))
+            terminals[name].write(data)
+        return len(frames)
+    finally:
+        for terminal in terminals.values():
+            terminal.unplug()
+
+
+def summarize(recording: Recording, decoded: Decoded) -> dict[str, Any]:
+    """Compare what was decoded now with what was stored then, JSON-ready."""
+    return {
+        "messages": decoded.messages,
+        "skipped_bytes": decoded.skipped_bytes,
+        "texts": decoded.texts,
+        "exchanges": {"stored": recording.count("exchanges"), "decoded": len(decoded.exchanges)},
+        "overheard": {"stored": recording.count("overheard"), "decoded": len(decoded.overheard)},
+        "cirs": {"stored": recording.count("cirs"), "decoded": len(decoded.cirs)},
+    }
+
+
+def _in_order(parts: list[Exchanges]) -> Exchanges:
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+    order = np.argsort(columns["time_ns"], kind="stable")
+    return Exchanges(**{name: column[order] for name, column in columns.items()})

@@ -1,0 +1,108 @@
+"""What a recorder has heard, on its way to the file: collected by the loop, written by a thread of its own.
+
+The thread commits every `FLUSH_S`, so that a slow disk never makes the loop miss bytes, and nothing that was handed
+over is longer out of the file than that and the commit itself.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from uwblink.errors import RecordingError
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Fault
+from uwblink.wire.bulk import exchanges_of
+from uwblink.wire.messages import Cir, Overheard, RangeReport
+
+FLUSH_S: Final = 0.1
+LONGEST_BACKLOG_S: Final = 20.0
+
+
+@dataclass(slots=True)
+class Batch:
+    """Rows that wait to be written, in the order in which they came."""
+
+    frames: list[tuple[int, str, str, bytes]] = field(default_factory=list)
+    exchanges: list[tuple[int, int, RangeReport]] = field(default_factory=list)
+    overheard: list[tuple[int, int, Overheard]] = field(default_factory=list)
+    cirs: list[tuple[int, int, Cir]] = field(default_factory=list)
+    faults: list[Fault] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to write."""
+        return bool(self.frames or self.exchanges or self.overheard or self.cirs or self.faults)
+
+    def write(self, recording: Recording) -> None:
+        """Append everything in one transaction; raises `RecordingError`."""
+        with recording.transaction():
+            recording.append_frames(self.frames)
+            if self.exchanges:
+                recording.append_exchanges(exchanges_of(self.exchanges))
+            recording.append_overheard(overheard_row(*row) for row in self.overheard)
+            recording.append_cirs(
+                (t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes) for t, board, c in self.cirs
+            )
+            recording.append_faults(self.faults)
+
+
+class Sink:
+    """Takes rows from the loop and has them written. Use as a context manager around the loop."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Begin writing to a live recording."""
+        self._recording = recording
+        self._batch = Batch()
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._written_s = time.monotonic()
+        self._error: RecordingError | None = None
+        self._thread = threading.Thread(target=self._work, name="uwblink sink", daemon=True)
+        self._thread.start()
+
+    def put(self, **rows: object) -> None:
+        """Hand over one row of each of the named lists of a `Batch`."""
+        with self._lock:
+            for name, row in rows.items():
+                getattr(self._batch, name).append(row)
+
+    def check(self) -> None:
+        """Raise `RecordingError` when nothing can be written any more, or the disk cannot keep up."""
+        if self._error:
+            raise self._error
+        behind_s = time.monotonic() - self._written_s
+        if behind_s > LONGEST_BACKLOG_S:
+            raise RecordingError(
+                f"{self._recording.path}: the disk is {behind_s:.0f} s behind; record to a faster one. "
+                "What was written before is kept"
+            )
+
+    def close(self) -> None:
+        """Write what is left; raises what `check` raises."""
+        self._ended.set()
+        self._thread.join(LONGEST_BACKLOG_S)
+        self.check()
+
+    def _work(self) -> None:
+        last = False
+        while not last and not self._error:
+            last = self._ended.wait(FLUSH_S)
+            with self._lock:
+                batch, self._batch = self._batch, Batch()
+            try:
+                if batch:
+                    batch.write(self._recording)
+            except RecordingError as error:
+                self._error = error
+            self._written_s = time.monotonic()
+
+
+def overheard_row(time_ns: int, listener: int, heard: Overheard) -> dict[str, float]:
+    """Return a passive listener's report as a row of the table `overheard`."""
+    values = {name: getattr(heard, name) for name in Overheard.FIELDS}
+    nothing = {name: np.nan for name, value in values.items() if value is None}
+    return {"time_ns": time_ns, "listener": listener} | values | nothing

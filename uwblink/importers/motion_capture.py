@@ -1,0 +1,82 @@
+"""Motion-capture truth for a recording of boards."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from uwblink.boards.ranging_plan import load_tags
+from uwblink.errors import ImportTableError
+from uwblink.importers.poses import read_poses
+from uwblink.recording.distances import distances_m
+from uwblink.recording.file import Recording
+from uwblink.recording.time_offset import find_offset
+
+
+@dataclass(frozen=True, slots=True)
+class AddedPoses:
+    """What was added: how many poses of which bodies, the offset used, and how many exchanges they cover."""
+
+    poses: int
+    bodies: tuple[str, ...]
+    offset_s: float
+    exchanges: int
+    covered: int
+
+
+def add_poses(
+    recording: Path, source: Path, *, offset: str = "0", tags_from: Path | None = None, body: str | None = None
+) -> AddedPoses:
+    """Put poses from a file in place of those of a recording; `offset` is in seconds, or "auto".
+
+    Raises `ImportTableError` for poses that cannot be used, what `load_tags` and `Recording.open` raise; the
+    recording stays as it was then.
+    """
+    shift_ns = None if offset == "auto" else _seconds(offset)
+    poses = read_poses(source, body)
+    tags = list(load_tags(tags_from)) if tags_from else None
+    with Recording.open(recording, update=True) as opened:
+        exchanges = opened.exchanges()
+        seats = opened.tags() if tags is None else tags
+        if not len(exchanges):
+            raise ImportTableError(f"{recording}: holds no exchanges to add truth to")
+        bodies = set(np.unique(poses.body).tolist())
+        sitting = [tag for tag in seats if tag.body in bodies]
+        if len(sitting) < 2:
+            found = ", ".join(sorted({tag.body for tag in seats})) or "none"
+            raise ImportTableError(
+                f"{source}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
+                "say with --tags where the tags sit"
+            )
+        if shift_ns is None:
+            shift_ns = find_offset(exchanges, poses, seats).offset_ns
+        moved = replace(poses, time_ns=poses.time_ns + shift_ns)
+        truth = distances_m(moved, seats, exchanges.initiator, exchanges.target, exchanges.time_ns)
+        covered = int(np.count_nonzero(np.isfinite(truth)))
+        if not covered:
+            raise ImportTableError(
+                f"{source}: no exchange lies within its poses, which end {_apart(exchanges.time_ns, moved.time_ns)}; "
+                "give --offset in seconds, or auto"
+            )
+        meta = {"poses_from": source.name, "poses_offset_s": shift_ns * 1e-9}
+        opened.replace_poses(moved, meta, tags)
+    return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(exchanges), covered)
+
+
+def _seconds(text: str) -> int:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or abs(value) > 4e9:
+        raise ImportTableError(f"--offset: found {text!r}, expected seconds or auto")
+    return round(value * 1e9)
+
+
+def _apart(exchanges_ns: np.ndarray, poses_ns: np.ndarray) -> str:
+    early_s = (int(exchanges_ns.min()) - int(poses_ns.max())) * 1e-9
+    late_s = (int(poses_ns.min()) - int(exchanges_ns.max())) * 1e-9
+    return f"{early_s:.1f} s before they begin" if early_s > 0 else f"and begin {late_s:.1f} s after they end"

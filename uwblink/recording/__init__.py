@@ -1,0 +1,1 @@
+"""The recording: file, tables, summary, and distances between its tags."""

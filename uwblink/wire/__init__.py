@@ -1,0 +1,1 @@
+"""What the boards say: messages, fields, the codec, and reports in bulk."""

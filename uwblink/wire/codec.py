@@ -1,0 +1,226 @@
+"""The codec: messages to bytes and back, without any I/O.
+
+Bytes go in as they come, in pieces of any size; messages, known text lines and counted skips come out, and every byte
+is in one of them. A message starts at the beginning, after something understood, or after a line end.
+After damage a message with fields is also taken up in the middle of a line, because the damage may have hit the line
+end before it; one without fields (`R00`) is not, because the payload of a damaged broadcast could spell it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from uwblink.errors import FrameError
+from uwblink.wire.fields import BAR, ID, INT, Kind, Malformed, NeedMore
+from uwblink.wire.messages import (
+    COMMANDS,
+    TEXTS,
+    Cir,
+    Message,
+    Overheard,
+    OverheardNothing,
+    Skipped,
+    TextLine,
+)
+
+Event = Message | TextLine | Skipped
+
+LONGEST_LINE: Final = 8192
+"""A CIR with five digits a tap has about 6100 bytes; nothing is longer."""
+
+TAP: Final = re.compile(rb"0|[1-9][0-9]{0,4}")
+
+
+def encode(message: Message) -> bytes:
+    """Return a command or report as the bytes on the wire; raises `FrameError` naming the field."""
+    parts = [message.KEY]
+    for name, kind in message.FIELDS.items():
+        try:
+            parts.append(kind.write(getattr(message, name)))
+        except FrameError as error:
+            raise FrameError(f"{message.KEY.decode()} {name}: {error}") from error
+    if isinstance(message, OverheardNothing):
+        parts += [b"0"] * message.ZEROS
+    if isinstance(message, Cir):
+        parts += [b"%d" % part for part in divmod(message.first_path_milli, 1000)]
+        parts += [b"%d" % tap for tap in message.magnitudes]
+    return BAR.join(parts) + _terminator(message.KEY)
+
+
+def _terminator(key: bytes) -> bytes:
+    return b"\r" if key in COMMANDS else b"\r\n"
+
+
+class Decoder:
+    """Decodes one direction of one port. `messages` and `skipped_bytes` count what came out."""
+
+    def __init__(self, table: Mapping[bytes, type[Message]]) -> None:
+        """Decode the messages of `COMMANDS` or of `REPORTS`."""
+        self._table = table
+        self._terminator = _terminator(next(iter(table)))
+        self._texts = TEXTS if self._terminator == b"\r\n" else ()
+        self._starts = (*self._texts, *table)
+        plausible = [re.escape(text) for text in self._texts] + [re.escape(key + BAR) for key in table]
+        ended = [re.escape(self._terminator + key) for key in table]
+        self._resume = re.compile(b"|".join([*ended, *plausible]), re.DOTALL)
+        self._longest_start = max(map(len, self._starts)) + 3
+        self._buffer = b""
+        self._tail = b""
+        self._clean = True
+        self.messages = 0
+        self.skipped_bytes = 0
+
+    def feed(self, data: bytes) -> list[Event]:
+        """Take in bytes and return what they complete; never raises on any bytes."""
+        self._buffer += data
+        return self._drain(final=False)
+
+    def take_back(self) -> bytes:
+        """Return the bytes of a message that has only begun, and forget them; none while in the middle of damage."""
+        if not self._clean:
+            return b""
+        data, self._buffer = self._buffer, b""
+        return data
+
+    @property
+    def between_messages(self) -> bool:
+        """Whether everything so far was understood or skipped, and the next byte begins a message."""
+        return self._clean and not self._buffer
+
+    def finish(self) -> list[Event]:
+        """Return what is left when no more bytes will come."""
+        return self._drain(final=True)
+
+    def _drain(self, *, final: bool) -> list[Event]:
+        events: list[Event] = []
+        buffer, at = self._buffer, 0
+        while at < len(buffer):
+            try:
+                event, end = self._understand(buffer, at)
+            except NeedMore:
+                if not final:
+                    break
+                end = self._next_start(buffer, at, final=True)
+                event = None
+            except Malformed:
+                end = self._next_start(buffer, at, final=final)
+                event = None
+            if end == at:
+                break
+            if event is None:
+                event = Skipped(buffer[at:end], "not a message")
+                self.skipped_bytes += end - at
+                # A line end may have come in two pieces, each of them skipped.
+                self._tail = (self._tail + buffer[at:end])[-len(self._terminator) :]
+                self._clean = self._tail == self._terminator
+            else:
+                self.messages += 1
+                self._tail, self._clean = b"", True
+            events.append(event)
+            at = end
+        self._buffer = buffer[at:]
+        return events
+
+    def _understand(self, buffer: bytes, at: int) -> tuple[Event, int]:
+        """Return the message or text at a place and where it ends, or say why there is none."""
+        key = buffer[at : at + 3]
+        kind = self._table.get(key)
+        if kind is not None and (self._clean or buffer[at + 3 : at + 4] == BAR):
+            return self._message(kind, buffer, at)
+        for text in self._texts:
+            if buffer.startswith(text, at):
+                return TextLine(text.decode()), at + len(text)
+        rest = buffer[at : at + self._longest_start]
+        if any(start.startswith(rest) for start in self._starts) or (kind is not None and len(buffer) == at + 3):
+            raise NeedMore
+        raise Malformed
+
+    def _message(self, kind: type[Message], buffer: bytes, at: int) -> tuple[Message, int]:
+        if any(field.size for field in kind.FIELDS.values()):
+            return self._counted(kind, buffer, at)
+        end = buffer.find(self._terminator, at + 3, at + LONGEST_LINE)
+        if end < 0:
+            raise Malformed if len(buffer) - at >= LONGEST_LINE else NeedMore
+        return _from_parts(kind, buffer[at + 3 : end].split(BAR)), end + len(self._terminator)
+
+    def _counted(self, kind: type[Message], buffer: bytes, at: int) -> tuple[Message, int]:
+        """Read a message whose fields hold arbitrary bytes, one field after the other."""
+        values, at = [], at + 3
+        for field in kind.FIELDS.values():
+            at = _expect(buffer, at, BAR)
+            end = self._field_end(field, buffer, at)
+            values.append(field.read(buffer[at:end]))
+            at = end
+        return kind(*values), _expect(buffer, at, self._terminator)
+
+    def _field_end(self, field: Kind, buffer: bytes, at: int) -> int:
+        if field.size:
+            end = at + field.size(buffer, at)
+            if end > len(buffer):
+                raise NeedMore
+            return end
+        end = buffer.find(BAR, at, at + 201)
+        if end < 0:
+            raise Malformed if len(buffer) - at > 200 else NeedMore
+        return end
+
+    def _next_start(self, buffer: bytes, at: int, *, final: bool) -> int:
+        """Return the first place after `at` at which a message could start."""
+        # The byte before the first candidate may be the end of a line.
+        found = self._resume.search(buffer, at)
+        while found:
+            place = found.start()
+            if buffer.startswith(self._terminator, place):
+                place += len(self._terminator)
+            if place > at:
+                return place
+            found = self._resume.search(buffer, found.start() + 1)
+        if final:
+            return len(buffer)
+        return self._partial_start(buffer, at)
+
+    def _partial_start(self, buffer: bytes, at: int) -> int:
+        """Return where the last bytes could be the first of a start that is not complete yet."""
+        for place in range(max(at + 1, len(buffer) - self._longest_start), len(buffer)):
+            rest = buffer[place:]
+            after_line = (self._terminator + start for start in self._starts)
+            with_bar = (key + BAR for key in self._table)
+            if any(s.startswith(rest) for s in (*after_line, *with_bar, *self._texts)):
+                return place
+        return len(buffer)
+
+
+def _expect(buffer: bytes, at: int, what: bytes) -> int:
+    found = buffer[at : at + len(what)]
+    if found == what:
+        return at + len(what)
+    raise NeedMore if what.startswith(found) else Malformed
+
+
+def _from_parts(kind: type[Message], parts: list[bytes]) -> Message:
+    """Build a message from its fields; `parts[0]` is what stands between key and first bar."""
+    if parts[0]:
+        raise Malformed
+    del parts[0]
+    if kind is Cir:
+        return _cir(parts)
+    if kind is Overheard and len(parts) == 2 + OverheardNothing.ZEROS:
+        if parts[2:] != [b"0"] * OverheardNothing.ZEROS:
+            raise Malformed
+        return OverheardNothing(ID.read(parts[0]), ID.read(parts[1]))
+    if len(parts) != len(kind.FIELDS):
+        raise Malformed
+    values: list[Any] = [f.read(part) for f, part in zip(kind.FIELDS.values(), parts, strict=True)]
+    return kind(*values)
+
+
+def _cir(parts: list[bytes]) -> Cir:
+    if len(parts) != 4 + Cir.TAPS:
+        raise Malformed
+    whole, milli = INT.read(parts[2]), INT.read(parts[3])
+    taps = parts[4:]
+    if not 0 <= milli < 1000 or not 0 <= whole < Cir.TAPS + 8 or not all(map(TAP.fullmatch, taps)):
+        raise Malformed
+    return Cir(ID.read(parts[0]), ID.read(parts[1]), 1000 * whole + milli, tuple(map(int, taps)))

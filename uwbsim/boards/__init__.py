@@ -1,0 +1,1 @@
+"""Virtual boards on virtual or pseudo-terminal ports."""

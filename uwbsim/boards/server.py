@@ -1,0 +1,172 @@
+"""Virtual boards behind pseudo-terminals, in wall time.
+
+One loop: the bench's clock follows the wall clock, bytes from clients go to the boards as they come, and what the
+boards print goes out when it is due.
+"""
+
+from __future__ import annotations
+
+import csv
+import heapq
+import selectors
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from uwblink.boards.pseudo_terminals import Terminal
+from uwbsim.boards.virtual_board import MS, NS_PER_S, Bench
+from uwbsim.random_streams import stream
+from uwbsim.scenario.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
+from uwbsim.scenario.model import Scenario
+from uwbsim.world.clocks import LONGEST_RUN_S
+from uwbsim.world.world import World
+
+LONGEST_WAIT_S: Final = 0.1
+
+
+PREPARED_S: Final = 7200.0
+"""For how long bodies go on moving when nobody says for how long to serve; then they hold their place."""
+
+
+def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
+    """Return a scenario that lasts as long as it is to be served."""
+    longer = max(scenario.run.duration_s, duration_s or PREPARED_S)
+    return scenario.model_copy(
+        update={"run": scenario.run.model_copy(update={"duration_s": min(longer, LONGEST_RUN_S)})}
+    )
+
+
+def write_poses(scenario: Scenario, epoch_ns: int, path: Path) -> None:
+    """Write what motion capture sees over the scenario's duration, in host time, as `uwblink poses` reads it."""
+    poses = World.of(scenario).motion_capture()
+    columns = zip(poses.time_ns + epoch_ns, poses.body, poses.position_m, poses.quaternion, strict=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time_ns", "body", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        for time_ns, body, position, quaternion in columns:
+            writer.writerow([time_ns, body, *(f"{v:.6f}" for v in (*position, *quaternion))])
+
+
+class Server:
+    """Serves the boards of a scenario. `names` maps tags to what clients open."""
+
+    def __init__(self, scenario: Scenario, link_dir: Path | None = None, faults: Faults | None = None) -> None:
+        """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made."""
+        self._faults = faults or Faults()
+        self.bench = Bench(scenario, self._printed, self._faults.lost_share())
+        self._chance = stream(scenario.run.seed, "serial faults")
+        self._terminals: dict[int, Terminal] = {}
+        self._selector = selectors.SelectSelector()
+        self._timed: list[tuple[int, int, Callable[[], None]]] = []
+        self._count = 0
+        try:
+            for tag in scenario.tags:
+                self._terminals[tag.id] = Terminal(link_dir / f"tag{tag.id}" if link_dir else None)
+                self._watch(tag.id)
+        except Exception:
+            self.close()
+            raise
+        self.names = {tag: terminal.name for tag, terminal in self._terminals.items()}
+        self._start_ns = time.monotonic_ns()
+        self.epoch_ns = time.time_ns()
+        """Host time (Unix epoch) at which the scenario's time is zero."""
+        for fault in self._faults.faults:
+            self._arrange(fault)
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes that found no reader."""
+        return sum(t.lost_bytes for t in self._terminals.values())
+
+    def run(self, stop: Callable[[], bool], duration_s: float = float("inf")) -> None:
+        """Serve until `stop` says so or the time is over."""
+        end_ns = duration_s * NS_PER_S
+        while not stop() and self._now_ns() < end_ns:
+            self.step()
+
+    def step(self) -> None:
+        """Wait for bytes or for what is due next, and do it."""
+        due = min(self.bench.next_ns(), self._timed[0][0] if self._timed else float("inf"))
+        wait_s = min(max((due - self._now_ns()) / NS_PER_S, 0.0), LONGEST_WAIT_S)
+        for key, _ in self._selector.select(wait_s):
+            tag: int = key.data
+            data = self._terminals[tag].read()
+            if data:
+                self.bench.advance(self._now_ns())
+                self.bench.boards[tag].write(data)
+        now = self._now_ns()
+        self.bench.advance(now)
+        while self._timed and self._timed[0][0] <= now:
+            heapq.heappop(self._timed)[2]()
+
+    def close(self) -> None:
+        """Unplug everything."""
+        for terminal in self._terminals.values():
+            terminal.unplug()
+        self._selector.close()
+
+    def unplug(self, tag: int) -> None:
+        """Pull a board's cable, from any thread: `step` does it, so that nothing closes what it waits on."""
+        self._at(self._now_ns(), partial(self._unplug, tag))
+
+    def _unplug(self, tag: int) -> None:
+        terminal = self._terminals[tag]
+        if terminal.fileno is not None:
+            self._selector.unregister(terminal.fileno)
+        terminal.unplug()
+        self.bench.boards[tag].power_off()
+
+    def _plug(self, tag: int) -> None:
+        """Plug a board in again: it boots."""
+        if self._terminals[tag].fileno is None:
+            self._terminals[tag].plug()
+            self._watch(tag)
+            self.bench.boards[tag].power_cycle()
+
+    def _watch(self, tag: int) -> None:
+        number = self._terminals[tag].fileno
+        if number is not None:
+            self._selector.register(number, selectors.EVENT_READ, tag)
+
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() - self._start_ns
+
+    def _at(self, time_ns: int, what: Callable[[], None]) -> None:
+        self._count += 1
+        heapq.heappush(self._timed, (time_ns, self._count, what))
+
+    def _arrange(self, fault: Fault) -> None:
+        if isinstance(fault, Hang):
+            board = self.bench.boards[fault.tag]
+            self._at(int(fault.at_s * NS_PER_S), board.hang)
+        if isinstance(fault, Unplug):
+            self._at(int(fault.at_s * NS_PER_S), partial(self._unplug, fault.tag))
+            self._at(int((fault.at_s + fault.for_s) * NS_PER_S), partial(self._plug, fault.tag))
+
+    def _printed(self, time_ns: int, tag: int, data: bytes) -> None:
+        """Send what a board prints, in one write, unless a fault says otherwise."""
+        terminal = self._terminals[tag]
+        for fault in self._faults.faults:
+            if getattr(fault, "tag", tag) not in (tag, None):
+                continue
+            if isinstance(fault, Bytes):
+                data = self._damaged(fault, data)
+            elif isinstance(fault, LateReplies) and self._chance.random() < fault.share:
+                self._at(time_ns + int(fault.delay_ms * MS), partial(terminal.write, data))
+                return
+            elif isinstance(fault, SplitWrites) and len(data) > 1 and self._chance.random() < fault.share:
+                cut = int(self._chance.integers(1, len(data)))
+                self._at(time_ns + int(fault.gap_ms * MS), partial(terminal.write, data[cut:]))
+                data = data[:cut]
+        terminal.write(data)
+
+    def _damaged(self, fault: Bytes, data: bytes) -> bytes:
+        values = np.frombuffer(data, dtype=np.uint8)
+        hit = self._chance.random(len(values)) < fault.share
+        if fault.kind == "drop-bytes":
+            return values[~hit].tobytes()
+        return np.where(hit, self._chance.integers(0, 256, len(values)), values).astype(np.uint8).tobytes()

@@ -1,0 +1,129 @@
+"""What a scenario will do, before it is run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.twr import PROTOCOLS
+from uwbsim.scenario.model import UUS_S, Scenario
+from uwbsim.simulation.schedule import schedule
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.world import World
+
+SAMPLES: Final = 200
+
+
+@dataclass(frozen=True, slots=True)
+class PairPreview:
+    """What to expect of a pair: rate, distances and first-path powers over the run, and its bias by skew in SS-TWR."""
+
+    initiator: int
+    target: int
+    exchanges: int
+    rate_hz: float
+    distance_m: tuple[float, float]
+    power_dbm: tuple[float, float]
+    audible: float
+    ss_bias_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """What to expect of a run; `air_share` is the share of time in which some frame is on the air."""
+
+    pairs: tuple[PairPreview, ...]
+    exchanges: int
+    rate_hz: float
+    fastest_hz: float
+    air_share: float
+    duration_s: float
+
+
+def preview(scenario: Scenario) -> Preview:
+    """Work out what a scenario will do; raises what building its world raises."""
+    plan, world = schedule(scenario), World.of(scenario)
+    duration, radio = scenario.run.duration_s, scenario.radio
+    time = (np.linspace(0, duration, SAMPLES) * SUBTICKS_PER_SECOND).astype(np.int64)
+    pairs = []
+    for i, j in sorted(set(zip(plan.initiator.tolist(), plan.target.tolist(), strict=True))):
+        count = int(np.count_nonzero((plan.initiator == i) & (plan.target == j)))
+        link = world.link(np.full(SAMPLES, i), np.full(SAMPLES, j), time)
+        one, two = scenario.tags[i], scenario.tags[j]
+        reply_s = scenario.ranging.response_delay_uus * UUS_S
+        pairs.append(
+            PairPreview(
+                one.id,
+                two.id,
+                count,
+                count / duration,
+                (float(link.distance_m.min()), float(link.distance_m.max())),
+                (float(link.power_dbm.min()), float(link.power_dbm.max())),
+                float(np.mean(link.power_dbm >= radio.sensitivity_dbm)),
+                SPEED_OF_LIGHT / 2 * (one.skew_ppm - two.skew_ppm) * 1e-6 * reply_s,
+            )
+        )
+    return Preview(
+        tuple(pairs),
+        len(plan.start),
+        len(plan.start) / duration,
+        scenario.ranging.fastest_hz(),
+        scenario.ranging.air_share(radio.preamble_symbols),
+        duration,
+    )
+
+
+def sentences(scenario: Scenario, found: Preview) -> list[str]:
+    """Return the preview in words, a line each; warnings begin with "warning:"."""
+    protocol = PROTOCOLS[scenario.ranging.protocol]
+    plan = scenario.ranging.plan if isinstance(scenario.ranging.plan, str) else scenario.ranging.plan.file
+    lines = [
+        f"{scenario.run.name}: {protocol.title}, plan {plan}, {found.duration_s:g} s",
+        f"{found.exchanges} exchanges planned among {len(found.pairs)} pairs, {found.rate_hz:.3g} a second "
+        f"(one after the other at most {found.fastest_hz:.0f}); "
+        f"frames on the air {100 * found.air_share:.1f} % of the time",
+    ]
+    for pair in found.pairs:
+        lines.append(
+            f"  {pair.initiator:3d} -> {pair.target:3d}  {pair.exchanges:6d} exchanges  {pair.rate_hz:6.3g} Hz  "
+            f"{pair.distance_m[0]:5.2f} to {pair.distance_m[1]:5.2f} m  {pair.power_dbm[0]:6.1f} to "
+            f"{pair.power_dbm[1]:6.1f} dBm  bias by skew in SS-TWR {100 * pair.ss_bias_m:+.1f} cm"
+        )
+        if pair.audible < 0.9:
+            lines.append(
+                f"warning: {pair.initiator} and {pair.target} hear each other {100 * pair.audible:.0f} % of the time "
+                f"(sensitivity {scenario.radio.sensitivity_dbm:g} dBm)"
+            )
+    # Pairs that would not determine delays are known beforehand: a two-coloured graph leaves one direction free.
+    if _is_bipartite([(p.initiator, p.target) for p in found.pairs]):
+        lines.append(
+            "warning: the pairs split the tags into two groups that range only with each other; their antenna delays "
+            "will not be determined"
+        )
+    return lines
+
+
+def _is_bipartite(pairs: list[tuple[int, int]]) -> bool:
+    """Whether any connected part of the graph of pairs has no odd cycle."""
+    neighbours: dict[int, set[int]] = {}
+    for a, b in pairs:
+        neighbours.setdefault(a, set()).add(b)
+        neighbours.setdefault(b, set()).add(a)
+    colour: dict[int, int] = {}
+    for root in neighbours:
+        if root in colour:
+            continue
+        colour[root], waiting, odd = 0, [root], False
+        while waiting:
+            node = waiting.pop()
+            for other in neighbours[node]:
+                if other not in colour:
+                    colour[other] = 1 - colour[node]
+                    waiting.append(other)
+                odd |= colour[other] == colour[node]
+        if not odd:
+            return True
+    return False

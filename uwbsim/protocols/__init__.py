@@ -1,0 +1,1 @@
+"""The protocol workbench: Monte Carlo, prediction, comparison."""

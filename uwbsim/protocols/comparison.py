@@ -1,0 +1,237 @@
+"""Protocols side by side in the same random world: what they know, what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
+from uwblink.twr import PROTOCOLS, RangingProtocol
+from uwbsim.errors import ScenarioError
+from uwbsim.protocols.conditions import Conditions, conditions_of
+from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.prediction import predict
+from uwbsim.scenario.airtime import after_marker_s, before_marker_s, exchange_air_s, frame_s, message_bytes
+from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.air import RECEIVER_ON_S, TURNAROUND_S
+
+Floats = NDArray[np.float64]
+
+MOST: Final = 50_000_000
+"""Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""
+
+MEDIAN_REPLY_S: Final = 305e-6
+"""Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
+
+WINNER_DELAYS_US: Final = (300, 600, 1000, 1500, 2000, 3000, 5000)
+
+
+@dataclass(frozen=True, slots=True)
+class ProtocolErrors:
+    """One protocol in a world: errors of raw ranges in metres, simulated and predicted, and what an exchange costs.
+
+    `air_s` is how long its frames are on the air, `duration_s` how long it takes from the first preamble to the end of
+    the last frame, `radio_on_s` how long the two radios send and listen together (a proxy of energy), `rate_hz` how
+    many exchanges a second follow one another.
+    """
+
+    protocol: str
+    title: str
+    ranges: int
+    bias_m: float
+    std_m: float
+    rmse_m: float
+    low_m: float
+    median_m: float
+    high_m: float
+    predicted_bias_m: float
+    predicted_std_m: float
+    messages: int
+    air_s: float
+    duration_s: float
+    radio_on_s: float
+    rate_hz: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the outcome as a row of a table."""
+        return asdict(self)
+
+
+def chosen(names: Sequence[str]) -> list[RangingProtocol]:
+    """Return the rows of protocols by name; raises `ScenarioError` that lists what there is."""
+    for name in names:
+        if name not in PROTOCOLS:
+            raise ScenarioError(f"--protocols: found {name!r}, allowed: {', '.join(PROTOCOLS)}")
+    if not names:
+        raise ScenarioError(f"--protocols: found none, allowed: {', '.join(PROTOCOLS)}")
+    return [PROTOCOLS[name] for name in dict.fromkeys(names)]
+
+
+def compare(
+    scenario: Scenario,
+    protocols: Sequence[RangingProtocol],
+    count: int,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[list[ProtocolErrors], dict[str, Floats]]:
+    """Range `count` times with each protocol in one world; return what came out, and a sample of each one's errors."""
+    if not 1 <= count <= MOST:
+        raise ScenarioError(f"-n: found {count}, expected 1 to {MOST}")
+    conditions = conditions_of(scenario)
+    outcomes, samples = [], {}
+    for number, protocol in enumerate(protocols):
+
+        def report(share: float, number: int = number) -> None:
+            if progress:
+                progress((number + share) / len(protocols))
+
+        errors = range_errors_m(protocol, conditions, scenario.run.seed, count, report)
+        outcomes.append(_outcome(scenario, protocol, conditions, errors))
+        samples[protocol.name] = errors[:200_000].copy()
+    return outcomes, samples
+
+
+def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditions, errors: Floats) -> ProtocolErrors:
+    low, median, high = np.quantile(errors, (0.025, 0.5, 0.975))
+    bias, variance = predict(protocol, conditions).pooled()
+    cost = costs(scenario, protocol)
+    return ProtocolErrors(
+        protocol.name,
+        protocol.title,
+        len(errors),
+        float(np.mean(errors)),
+        float(np.std(errors)),
+        float(np.sqrt(np.mean(errors**2))),
+        float(low),
+        float(median),
+        float(high),
+        bias,
+        float(np.sqrt(variance)),
+        len(protocol.messages),
+        cost["air_s"],
+        cost["duration_s"],
+        cost["radio_on_s"],
+        1 / (cost["duration_s"] + TURNAROUND_S),
+    )
+
+
+def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | None = None) -> dict[str, float]:
+    """Return what an exchange takes: `air_s`, `duration_s`, `radio_on_s`.
+
+    `scheduled_s` replaces the scenario's delay.
+    """
+    symbols = scenario.radio.preamble_symbols
+    scheduled = scheduled_s or scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S
+    reply = scenario.ranging.reply
+    at_once = reply.delay_us * 1e-6 if reply.model == "fixed" else MEDIAN_REPLY_S
+    lengths = message_bytes(protocol)
+    marker, end = 0.0, after_marker_s(lengths[0])
+    radio = 2 * frame_s(lengths[0], symbols)
+    for message, length in zip(protocol.messages[1:], lengths[1:], strict=True):
+        marker += scheduled if message.timing == "scheduled" else at_once
+        # The receiver listens from the end of the frame before, as soon as it is on again.
+        listening = marker + after_marker_s(length) - end - RECEIVER_ON_S
+        radio += frame_s(length, symbols) + max(listening, 0.0)
+        end = marker + after_marker_s(length)
+    return {
+        "air_s": exchange_air_s(protocol, symbols),
+        "duration_s": before_marker_s(symbols) + end,
+        "radio_on_s": radio,
+    }
+
+
+def calibrated(conditions: Conditions) -> Conditions:
+    """Return the same world as a calibration leaves it: no antenna delays, no bias by power, no reflections."""
+    from dataclasses import replace
+
+    delays = {f"{end}_delay_{side}": 0.0 for end in ("tx", "rx") for side in ("initiator", "target")}
+    return replace(conditions.with_columns(late=0.0, **delays), multipath=0.0)
+
+
+def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[dict[str, Any]]:
+    """Say which protocol wins at which delay of the scheduled reply, as a calibration leaves it, by prediction.
+
+    By `rmse`, a single range; by `per_second`, the mean squared error times the time that an exchange takes, which is
+    what counts where the air is full and ranges are averaged.
+    """
+    world = calibrated(conditions_of(scenario, 2048))
+    rows = []
+    for delay_us in WINNER_DELAYS_US:
+        here = world.with_columns(scheduled=delay_us * 1e-6)
+        rmse, score = {}, {}
+        for protocol in protocols:
+            bias, variance = predict(protocol, here).pooled()
+            duration = costs(scenario, protocol, delay_us * 1e-6)["duration_s"]
+            rmse[protocol.name] = float(np.sqrt(bias**2 + variance))
+            score[protocol.name] = (bias**2 + variance) * duration
+        rows.append(
+            {
+                "scheduled_us": delay_us,
+                "rmse": min(rmse, key=lambda name: rmse[name]),
+                "per_second": min(score, key=lambda name: score[name]),
+                **{f"rmse_m {name}": value for name, value in rmse.items()},
+            }
+        )
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorCurve:
+    """Error over something: where, simulated mean and spread, predicted mean and spread, metres, (n,) each."""
+
+    x: Floats
+    bias_m: Floats
+    std_m: Floats
+    predicted_bias_m: Floats
+    predicted_std_m: Floats
+
+
+def over_skew(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
+    """Error over the relative skew of the two clocks, in ppm, everything else as in the scenario."""
+    world = calibrated(conditions_of(scenario, 2048))
+    skews = np.linspace(-20, 20, 17)
+    worlds = [world.with_columns(rate_initiator=s * 0.5e-6, rate_target=-s * 0.5e-6) for s in skews]
+    return _curve(protocol, skews, worlds, scenario.run.seed, count)
+
+
+def over_reply(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
+    """Error over the delay of the scheduled message, in microseconds."""
+    world = calibrated(conditions_of(scenario, 2048))
+    delays = np.geomspace(300, 6000, 15)
+    worlds = [world.with_columns(scheduled=delay * 1e-6) for delay in delays]
+    return _curve(protocol, delays, worlds, scenario.run.seed, count)
+
+
+def _curve(protocol: RangingProtocol, x: Floats, worlds: Sequence[Conditions], seed: int, count: int) -> ErrorCurve:
+    errors = [range_errors_m(protocol, world, seed, count) for world in worlds]
+    pooled = np.array([predict(protocol, world).pooled() for world in worlds])
+    means, spreads = (np.array([f(e) for e in errors]) for f in (np.mean, np.std))
+    return ErrorCurve(x, means, spreads, pooled[:, 0], np.sqrt(pooled[:, 1]))
+
+
+def over_state(
+    protocol: RangingProtocol, conditions: Conditions, values: Floats, errors: Floats, groups: int = 14
+) -> ErrorCurve:
+    """Error over something that the states have, `values` (states,), from `errors` that met them in turn."""
+    used = np.resize(np.arange(len(conditions)), len(errors))
+    prediction = predict(protocol, conditions)
+    parts = np.array_split(np.argsort(values), groups)
+    place = np.empty(len(conditions), dtype=np.int64)
+    for k, rows in enumerate(parts):
+        place[rows] = k
+    group = place[used]
+    counts = np.maximum(np.bincount(group, minlength=groups), 1)
+    mean = np.bincount(group, errors, groups) / counts
+    std = np.sqrt(np.maximum(np.bincount(group, errors**2, groups) / counts - mean**2, 0))
+    means = np.array([prediction.mean_m[rows].mean() for rows in parts])
+    spreads = np.array([prediction.variance_m2[rows].mean() + prediction.mean_m[rows].var() for rows in parts])
+    middles = np.array([np.median(values[rows]) for rows in parts])
+    return ErrorCurve(middles, mean, std, means, np.sqrt(spreads))
+
+
+def paper_bias_m(skew_ppm: float, reply_s: float) -> float:
+    """Return the bias of SS-TWR, c/2 times relative skew times reply (ICRA 2023, section III)."""
+    return 0.5 * SPEED_OF_LIGHT * skew_ppm * 1e-6 * reply_s

@@ -1,0 +1,128 @@
+"""What exchanges meet apart from chance: distances, clocks, powers, delays, sampled from a scenario as columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
+from uwbsim.random_streams import stream
+from uwbsim.scenario.airtime import before_marker_s
+from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.schedule import schedule
+from uwbsim.simulation.timestamps import draw_reply_s
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.radio import reception_bias_s, reception_noise_s
+from uwbsim.world.world import World
+
+Floats = NDArray[np.float64]
+
+STATES: Final = 16_384
+"""So many states of the world are sampled; it is also the length of the pieces that fit into a core's cache."""
+
+STEP_S: Final = 1e-3
+"""Over this time the speed along the line between two tags is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """The state of the world in exchanges, columns of length n; times of flight and delays in seconds.
+
+    Clocks run at 1 + rate; `drift` is the change of the rate in 1/s. `late` is what power adds to each reception and
+    `rx_std` its noise; `tx_std` the noise of a transmission. `at_once` and `scheduled` are the two kinds of reply,
+    `carrier_bias_ppm` and `carrier_std_ppm` those of the carrier integrator; `multipath` is the probability of a
+    detour of `detour_s` on average, which all messages of an exchange take. `quantize` says whether stamps are whole
+    ticks and delayed transmissions on the chip's grid.
+    """
+
+    flight: Floats
+    flight_rate: Floats
+    rate_initiator: Floats
+    rate_target: Floats
+    drift_initiator: Floats
+    drift_target: Floats
+    late: Floats
+    rx_std: Floats
+    tx_std: Floats
+    tx_delay_initiator: Floats
+    rx_delay_initiator: Floats
+    tx_delay_target: Floats
+    rx_delay_target: Floats
+    at_once: Floats
+    scheduled: Floats
+    power_dbm: Floats
+    carrier_bias_ppm: float = 0.0
+    carrier_std_ppm: float = 0.0
+    multipath: float = 0.0
+    detour_s: float = 0.0
+    quantize: bool = False
+
+    def __len__(self) -> int:
+        """Return the number of states."""
+        return len(self.flight)
+
+    @property
+    def distance_m(self) -> Floats:
+        """Return the distances of the states."""
+        return self.flight * SPEED_OF_LIGHT
+
+    def __getitem__(self, rows: slice | NDArray[np.int64]) -> Conditions:
+        """Return the chosen states."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in COLUMNS}
+        return replace(self, **columns)
+
+    def with_columns(self, **values: float | Floats) -> Conditions:
+        """Return the same states with some columns changed."""
+        columns: dict[str, Any] = {
+            name: np.broadcast_to(np.asarray(v, dtype=float), (len(self),)) for name, v in values.items()
+        }
+        return replace(self, **columns)
+
+    @classmethod
+    def single(cls, **values: Any) -> Conditions:
+        """Return one state: zeros, but for what is given."""
+        columns: dict[str, Any] = {name: np.array([float(values.pop(name, 0.0))]) for name in COLUMNS}
+        return cls(**columns, **values)
+
+
+COLUMNS: Final = tuple(f.name for f in fields(Conditions) if f.type == "Floats")
+
+
+def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
+    """Sample the exchanges of a scenario's plan, evenly over its duration; fewer than `count` if it plans fewer."""
+    plan = schedule(scenario)
+    rows = np.unique(np.linspace(0, len(plan.start) - 1, min(count, len(plan.start))).astype(np.int64))
+    marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
+    start, i, j = plan.start[rows] + marker, plan.initiator[rows], plan.target[rows]
+    world, clocks, radio = World.of(scenario), Clocks.of(scenario), scenario.radio
+    link = world.link(i, j, start)
+    later = world.link(i, j, start + round(STEP_S * SUBTICKS_PER_SECOND))
+    path = link.distance_m + link.excess_m
+    delays = np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9
+    nothing = np.zeros(len(rows))
+    return Conditions(
+        flight=path / SPEED_OF_LIGHT,
+        flight_rate=(later.distance_m - link.distance_m) / STEP_S / SPEED_OF_LIGHT,
+        rate_initiator=clocks.rate(i, start),
+        rate_target=clocks.rate(j, start),
+        drift_initiator=nothing,
+        drift_target=nothing,
+        late=reception_bias_s(radio, link.power_dbm, link.total_dbm),
+        rx_std=reception_noise_s(radio, link.power_dbm),
+        tx_std=np.full(len(rows), radio.tx_noise_ps * 1e-12),
+        tx_delay_initiator=delays[i, 0],
+        rx_delay_initiator=delays[i, 1],
+        tx_delay_target=delays[j, 0],
+        rx_delay_target=delays[j, 1],
+        at_once=draw_reply_s(scenario, stream(scenario.run.seed, "reply latency"), len(rows)),
+        scheduled=np.full(len(rows), scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S),
+        power_dbm=link.power_dbm,
+        carrier_bias_ppm=radio.skew_bias_ppm,
+        carrier_std_ppm=radio.skew_noise_ppm,
+        multipath=radio.multipath.probability if radio.multipath else 0.0,
+        detour_s=radio.multipath.mean_excess_m / SPEED_OF_LIGHT if radio.multipath else 0.0,
+        quantize=radio.quantize,
+    )

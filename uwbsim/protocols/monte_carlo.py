@@ -1,0 +1,184 @@
+"""Monte Carlo of exchanges as NumPy columns, in pieces that fit into the cache: any protocol, from its row.
+
+The same model as the event loop with its integer stamps (`uwbsim.simulation.timestamps`), in floats about the start of
+an exchange, for exchanges that disturb no other. Noise comes from the same named streams, so all protocols see the same
+noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
+from uwblink.twr import Intervals, ProtocolMessage, RangingProtocol
+from uwbsim.protocols.conditions import STATES, Conditions
+from uwbsim.random_streams import stream
+
+Floats = NDArray[np.float64]
+
+METRES: Final = TICK_S * SPEED_OF_LIGHT
+SIDES: Final = ("initiator", "target")
+
+
+def range_errors_m(
+    protocol: RangingProtocol,
+    conditions: Conditions,
+    seed: int,
+    count: int,
+    progress: Callable[[float], None] | None = None,
+) -> Floats:
+    """Return the errors of `count` ranges in metres, (count,); range k meets the state k modulo their number.
+
+    An error is the range by the protocol's formula less the mean distance at its first two messages, before any
+    calibration. `progress` is called with the done fraction.
+    """
+    errors = np.empty(count)
+    begin = 0
+    for part in error_pieces(protocol, conditions, seed, count):
+        errors[begin : begin + len(part)] = part
+        begin += len(part)
+        if progress:
+            progress(begin / count)
+    return errors
+
+
+def error_pieces(protocol: RangingProtocol, conditions: Conditions, seed: int, count: int) -> Iterator[Floats]:
+    """Yield the same errors in pieces as long as there are states, at most `STATES`, so that memory stays flat."""
+    source = _Noise(protocol, conditions, seed)
+    length = min(len(conditions), STATES)
+    pieces = [_Ticks(conditions[k : k + length]) for k in range(0, len(conditions), length)]
+    done, turn = 0, 0
+    while done < count:
+        ticks = pieces[turn % len(pieces)]
+        error = _execute(protocol, ticks, source.draw(len(ticks.flight)))
+        yield error[: count - done]
+        done += len(error)
+        turn += 1
+
+
+class _Ticks:
+    """Conditions with times in device ticks."""
+
+    def __init__(self, c: Conditions) -> None:
+        scale = 1 / TICK_S
+        self.flight, self.flight_rate = c.flight * scale, c.flight_rate
+        self.faster = {"initiator": 1 + c.rate_initiator, "target": 1 + c.rate_target}
+        self.slower = {side: 1 / rate for side, rate in self.faster.items()}
+        drifts = {"initiator": c.drift_initiator, "target": c.drift_target}
+        self.half_drift = {s: d * (TICK_S / 2) if np.any(d) else None for s, d in drifts.items()}
+        self.tx_delay = {"initiator": c.tx_delay_initiator * scale, "target": c.tx_delay_target * scale}
+        rx_delay = {"initiator": c.rx_delay_initiator * scale, "target": c.rx_delay_target * scale}
+        self.rx_late = {side: c.late * scale + delay for side, delay in rx_delay.items()}
+        self.rx_std, self.tx_std = c.rx_std * scale, c.tx_std * scale
+        self.reply = {"at once": c.at_once * scale, "scheduled": c.scheduled * scale}
+        self.carrier_ppm = (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+        self.carrier_std_ppm, self.detour = c.carrier_std_ppm, c.detour_s * scale
+        self.moving = bool(np.any(c.flight_rate))
+
+
+@dataclass(frozen=True, slots=True)
+class _Draws:
+    """Standard draws for one piece; None where the conditions need none."""
+
+    transmit: list[Floats] | None
+    receive: list[Floats] | None
+    carrier: Floats | None
+    phase: dict[str, Floats] | None
+    detour: Floats | None
+
+
+class _Noise:
+    """The named streams that an engine draws from, one after the other in the order of exchanges."""
+
+    def __init__(self, protocol: RangingProtocol, c: Conditions, seed: int) -> None:
+        numbers = range(len(protocol.messages))
+        self._transmit = [stream(seed, "transmit noise", k) for k in numbers] if np.any(c.tx_std) else None
+        self._receive = [stream(seed, "receive noise", k) for k in numbers] if np.any(c.rx_std) else None
+        self._carrier = stream(seed, "skew reading", 2) if c.carrier_std_ppm else None
+        self._phase = {side: stream(seed, "counter phase", side) for side in SIDES} if c.quantize else None
+        self._hit = stream(seed, "multipath") if c.multipath else None
+        self._share = c.multipath
+
+    def draw(self, count: int) -> _Draws:
+        """Draw for the next `count` exchanges."""
+        detour = None
+        if self._hit is not None:
+            hit = self._hit.random(count)
+            # What is left of a uniform draw below a threshold is uniform again: one draw decides both.
+            detour = np.where(hit < self._share, -np.log(np.maximum(hit / self._share, 1e-300)), 0.0)
+        return _Draws(
+            [g.standard_normal(count) for g in self._transmit] if self._transmit else None,
+            [g.standard_normal(count) for g in self._receive] if self._receive else None,
+            self._carrier.standard_normal(count) if self._carrier else None,
+            {side: g.random(count) * DELAYED_TX_GRID for side, g in self._phase.items()} if self._phase else None,
+            detour,
+        )
+
+
+def _execute(protocol: RangingProtocol, c: _Ticks, draws: _Draws) -> Floats:
+    """Return range errors in metres of one piece."""
+    stamps: dict[str, Floats] = {}
+    flights: list[Floats] = []
+    path = c.flight if draws.detour is None else c.flight + draws.detour * c.detour
+    for k, message in enumerate(protocol.messages):
+        sender = message.sender
+        receiver = SIDES[1 - SIDES.index(sender)]
+        printed = _transmission(message, stamps, c, draws)
+        left = printed - c.tx_delay[sender]
+        if draws.transmit is not None:
+            left += draws.transmit[k] * c.tx_std
+        departure = left * c.slower[sender]
+        half = c.half_drift[sender]
+        if half is not None:
+            departure -= half * departure**2
+        flight = c.flight + c.flight_rate * departure if c.moving else c.flight
+        arrival = departure + (path if not c.moving else path + c.flight_rate * departure)
+        seen = arrival * c.faster[receiver]
+        half = c.half_drift[receiver]
+        if half is not None:
+            seen += half * arrival**2
+        seen += c.rx_late[receiver]
+        if draws.receive is not None:
+            seen += draws.receive[k] * c.rx_std
+        if draws.phase is not None:
+            phase = draws.phase[receiver]
+            seen += phase
+            np.rint(seen, out=seen)
+            seen -= phase
+        stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = printed, seen
+        flights.append(flight)
+    spans = _intervals(protocol, stamps, c, draws)
+    truth = (flights[0] + flights[1]) / 2
+    return np.asarray((protocol.flight_ticks(spans) - truth) * METRES)
+
+
+def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks, draws: _Draws) -> Floats:
+    """Return the printed transmit stamp, in ticks since the start: the poll's is near nought."""
+    due = stamps[message.after] + c.reply[message.timing] if message.after else np.zeros_like(c.flight)
+    if draws.phase is None:
+        return due
+    # The counter shows `phase` at the start; delayed transmissions begin on its grid.
+    phase = draws.phase[message.sender]
+    due = due + phase
+    if message.timing == "scheduled":
+        return np.asarray(np.floor(due / DELAYED_TX_GRID) * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - phase)
+    latency = due - ANTENNA_DELAY_TICKS
+    return np.asarray(np.ceil(latency / DELAYED_TX_GRID) * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - phase)
+
+
+def _intervals(protocol: RangingProtocol, stamps: dict[str, Floats], c: _Ticks, draws: _Draws) -> Intervals:
+    carrier = c.carrier_ppm
+    if draws.carrier is not None:
+        carrier = carrier + draws.carrier * c.carrier_std_ppm
+    none = c.flight
+    dt53 = dt64 = none
+    if len(protocol.messages) == 3:
+        from_target = protocol.messages[2].sender == "target"
+        dt53 = stamps["tx3"] - stamps["tx2" if from_target else "rx2"]
+        dt64 = stamps["rx3"] - stamps["rx2" if from_target else "tx2"]
+    return Intervals(stamps["rx2"] - stamps["tx1"], stamps["tx2"] - stamps["rx1"], dt53, dt64, carrier)

@@ -1,0 +1,155 @@
+"""Mean and variance of a protocol's error without simulating it (docs/theory.md, "Predicting a protocol").
+
+The mean is the protocol's formula at the intervals that exchanges without noise have; the variance propagates the
+errors of stamps through the formula to first order. Both come from the protocol's row, for as many states of the world
+at once as there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
+from uwblink.twr import Intervals, RangingProtocol
+from uwbsim.protocols.conditions import Conditions
+
+Floats = NDArray[np.float64]
+
+METRES: Final = TICK_S * SPEED_OF_LIGHT
+STEP: Final = 16.0
+"""Ticks by which an interval is changed to see what it does; the formulas are smooth over thousands."""
+
+# Which stamps an interval is made of, with their signs: errors of stamps enter intervals so.
+FROM_TARGET: Final = {
+    "dt41": {"rx2": 1, "tx1": -1}, "dt32": {"tx2": 1, "rx1": -1},
+    "dt53": {"tx3": 1, "tx2": -1}, "dt64": {"rx3": 1, "rx2": -1},
+}  # fmt: skip
+FROM_INITIATOR: Final = {
+    "dt41": {"rx2": 1, "tx1": -1}, "dt32": {"tx2": 1, "rx1": -1},
+    "dt53": {"tx3": 1, "rx2": -1}, "dt64": {"rx3": 1, "tx2": -1},
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Errors of ranges, (n,) each: their mean in metres, and the parts of their variance in square metres."""
+
+    mean_m: Floats
+    transmit_m2: Floats
+    receive_m2: Floats
+    quantization_m2: Floats
+    carrier_m2: Floats
+    multipath_m2: Floats
+
+    @property
+    def variance_m2(self) -> Floats:
+        """Return the whole variance."""
+        return self.transmit_m2 + self.receive_m2 + self.quantization_m2 + self.carrier_m2 + self.multipath_m2
+
+    def pooled(self) -> tuple[float, float]:
+        """Return mean and variance over all states together: the variance has the spread of the means in it."""
+        return float(np.mean(self.mean_m)), float(np.mean(self.variance_m2) + np.var(self.mean_m))
+
+
+def predict(protocol: RangingProtocol, c: Conditions) -> Prediction:
+    """Predict the error of a protocol under conditions (n,)."""
+    spans, truth = _noiseless(protocol, c)
+    slopes = dict(_slopes(protocol, spans))
+    stamps = _by_stamp(protocol, slopes)
+    squares = {kind: _sum_of_squares(stamps, kind) for kind in ("tx", "rx")}
+    # A detour of all messages lengthens the two flights of the first round trip; the formulas hold it to the same
+    # precision as the flight itself.
+    p, detour = c.multipath, c.detour_s * SPEED_OF_LIGHT
+    flight = protocol.flight_ticks(spans) - truth
+    return Prediction(
+        mean_m=np.asarray(flight * METRES + p * detour),
+        transmit_m2=np.asarray(squares["tx"] * (c.tx_std * SPEED_OF_LIGHT) ** 2),
+        receive_m2=np.asarray(squares["rx"] * (c.rx_std * SPEED_OF_LIGHT) ** 2),
+        quantization_m2=np.asarray(squares["rx"] * METRES**2 / 12 * c.quantize),
+        carrier_m2=np.asarray((slopes["carrier_ppm"] * c.carrier_std_ppm * METRES) ** 2),
+        multipath_m2=np.full(len(c), p * (2 - p) * detour**2),
+    )
+
+
+def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, Floats]:
+    """Return the intervals of exchanges without noise in ticks, and the mean flight of the first two messages.
+
+    From true durations: what a clock reads of one is its length times 1 + rate, plus half of drift times the difference
+    of squares of its ends; what antennas and power add to stamps comes on top.
+    """
+    ticks = 1 / TICK_S
+    tx = {"initiator": c.tx_delay_initiator, "target": c.tx_delay_target}
+    rx = {"initiator": c.rx_delay_initiator + c.late, "target": c.rx_delay_target + c.late}
+    rate = {"initiator": c.rate_initiator, "target": c.rate_target}
+    drift = {"initiator": c.drift_initiator, "target": c.drift_target}
+    replies = [_reply_s(protocol, k, c) for k in range(1, len(protocol.messages))]
+    # True instants at the antennas, from the departure of the poll.
+    leave = [np.zeros(len(c))]
+    arrive = [c.flight]
+    for k, message in enumerate(protocol.messages[1:], start=1):
+        side, before = message.sender, message.after
+        since = arrive[k - 1] if before.startswith("rx") else leave[k - 1]
+        # The printed reply runs from stamp to stamp; at the antenna it is shorter by what antenna and power add.
+        added = tx[side] - (rx[side] if before.startswith("rx") else tx[side])
+        true = (replies[k - 1] - added) / (1 + rate[side])
+        leave.append(since + true)
+        arrive.append(leave[k] + c.flight + c.flight_rate * leave[k])
+
+    def read(side: str, later: Floats, earlier: Floats) -> Floats:
+        return (1 + rate[side]) * (later - earlier) + drift[side] / 2 * (later**2 - earlier**2)
+
+    i, j = "initiator", "target"
+    dt41 = read(i, arrive[1], leave[0]) + rx[i] - tx[i]
+    dt32 = read(j, leave[1], arrive[0]) + tx[j] - rx[j]
+    dt53 = dt64 = np.ones(len(c))
+    if len(protocol.messages) == 3:
+        if protocol.messages[2].sender == j:
+            dt53 = read(j, leave[2], leave[1])
+            dt64 = read(i, arrive[2], arrive[1])
+        else:
+            dt53 = read(i, leave[2], arrive[1]) + tx[i] - rx[i]
+            dt64 = read(j, arrive[2], leave[1]) + rx[j] - tx[j]
+    carrier = (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+    truth = (arrive[0] - leave[0] + arrive[1] - leave[1]) / 2
+    return Intervals(dt41 * ticks, dt32 * ticks, dt53 * ticks, dt64 * ticks, carrier), truth * ticks
+
+
+def _reply_s(protocol: RangingProtocol, k: int, c: Conditions) -> Floats:
+    """Return the reply before message k, as printed, on average over where the counter's grid happens to lie."""
+    scheduled = protocol.messages[k].timing == "scheduled"
+    reply = c.scheduled if scheduled else c.at_once
+    if not c.quantize:
+        return reply
+    # A grid that is rounded down, and the boards' antenna delay on top; or rounded up, to where they want to be.
+    half = DELAYED_TX_GRID / 2 * TICK_S
+    return reply - half + ANTENNA_DELAY_TICKS * TICK_S if scheduled else reply + half
+
+
+def _slopes(protocol: RangingProtocol, spans: Intervals) -> Iterator[tuple[str, Floats]]:
+    """Yield the derivative of the flight by each interval, and by the carrier's ppm."""
+    for name in ("dt41", "dt32", "dt53", "dt64", "carrier_ppm"):
+        step = STEP if name != "carrier_ppm" else 1.0
+        value = getattr(spans, name)
+        up, down = (protocol.flight_ticks(replace(spans, **{name: value + s})) for s in (step, -step))
+        yield name, np.asarray((up - down) / (2 * step))
+
+
+def _by_stamp(protocol: RangingProtocol, slopes: dict[str, Floats]) -> dict[str, Floats]:
+    """Return the derivative of the flight by the error of each stamp."""
+    third = len(protocol.messages) == 3
+    signs = FROM_INITIATOR if third and protocol.messages[2].sender == "initiator" else FROM_TARGET
+    found: dict[str, Floats] = {}
+    for interval, parts in signs.items():
+        if third or interval in ("dt41", "dt32"):
+            for stamp, sign in parts.items():
+                found[stamp] = found.get(stamp, 0.0) + sign * slopes[interval]
+    return found
+
+
+def _sum_of_squares(stamps: dict[str, Floats], kind: str) -> Floats:
+    return np.asarray(sum(slope**2 for name, slope in stamps.items() if name.startswith(kind)))

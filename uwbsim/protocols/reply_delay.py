@@ -1,0 +1,88 @@
+"""The delay of the scheduled message that gives the most accurate ranging for the time that it takes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.twr import RangingProtocol
+from uwbsim.protocols.comparison import calibrated, costs
+from uwbsim.protocols.conditions import Conditions, conditions_of
+from uwbsim.protocols.prediction import predict
+from uwbsim.scenario.model import Scenario
+
+Floats = NDArray[np.float64]
+
+SHORTEST_S: Final = 287e-6
+"""280 UWB microseconds, below which the boards miss the time to send (firmware wire format)."""
+
+LONGEST_S: Final = 6.6e-3
+POINTS: Final = 121
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """The best delay, and the curve: delays in seconds, variance of a range in m^2, and variance times time in m^2 s.
+
+    `on_edge` says that the best delay is the shortest or the longest one that boards take.
+    """
+
+    protocol: str
+    delay_s: float
+    std_m: float
+    duration_s: float
+    score_m2s: float
+    on_edge: bool
+    delays_s: Floats
+    variance_m2: Floats
+    scores_m2s: Floats
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `uwbsim optimum --json` prints."""
+        document = asdict(self)
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in document.items()}
+
+
+def optimum(scenario: Scenario, protocol: RangingProtocol, overhead_s: float = 0.0) -> Optimum:
+    """Minimise mean squared error times duration over the delay of the scheduled message.
+
+    A second of air holds 1/duration exchanges, whose mean has the variance of one times the duration. Antenna delays,
+    power bias and reflections are left out: calibration deals with them, and no delay does. `overhead_s` is what an
+    exchange takes besides (commands, turnaround).
+    """
+    from scipy.optimize import minimize_scalar
+
+    world = calibrated(conditions_of(scenario, 2048))
+    # The grid of delayed transmissions would show as teeth of 8 ns on the curve.
+    world = replace(world, quantize=False)
+    delays = np.geomspace(SHORTEST_S, LONGEST_S, POINTS)
+    squares = np.array([_square_m2(protocol, world, delay) for delay in delays])
+    durations = np.array([costs(scenario, protocol, float(d))["duration_s"] + overhead_s for d in delays])
+    scores = squares * durations
+    best = int(np.argmin(scores))
+    low, high = delays[max(best - 1, 0)], delays[min(best + 1, POINTS - 1)]
+
+    def score(delay: float) -> float:
+        return _square_m2(protocol, world, delay) * (costs(scenario, protocol, delay)["duration_s"] + overhead_s)
+
+    refined = float(minimize_scalar(score, bounds=(low, high), method="bounded", options={"xatol": 1e-8}).x)
+    delay = min((refined, float(delays[best])), key=score)
+    return Optimum(
+        protocol.name,
+        delay,
+        float(np.sqrt(_square_m2(protocol, world, delay))),
+        costs(scenario, protocol, delay)["duration_s"] + overhead_s,
+        score(delay),
+        best in (0, POINTS - 1),
+        delays,
+        squares,
+        scores,
+    )
+
+
+def _square_m2(protocol: RangingProtocol, world: Conditions, delay_s: float) -> float:
+    bias, variance = predict(protocol, world.with_columns(scheduled=delay_s)).pooled()
+    return bias**2 + variance

@@ -1,0 +1,1 @@
+"""Scenarios: their models, and the way from a file to them."""

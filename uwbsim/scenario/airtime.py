@@ -1,0 +1,45 @@
+"""How long frames are on the air (DW1000 User Manual 2.10, section 10)."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from uwblink.twr import RangingProtocol
+
+PREAMBLE_SYMBOL_S: Final = 508 / 499.2e6
+HEADER_SYMBOL_S: Final = 512 / 499.2e6
+DATA_SYMBOL_S: Final = 64 / 499.2e6
+SFD_SYMBOLS: Final = 8
+HEADER_SYMBOLS: Final = 21
+
+POLL_BYTES: Final = 11
+RESPONSE_BYTES: Final = 8
+FINAL_BYTES: Final = 28
+
+
+def before_marker_s(preamble_symbols: int) -> float:
+    """Return the time from the start of a frame to its ranging marker, which all stamps refer to."""
+    return (preamble_symbols + SFD_SYMBOLS) * PREAMBLE_SYMBOL_S
+
+
+def after_marker_s(length_bytes: int) -> float:
+    """Return the time from the ranging marker to the end of a frame at 6.8 Mb/s, with its Reed-Solomon parity."""
+    bits = 8 * length_bytes
+    return HEADER_SYMBOLS * HEADER_SYMBOL_S + (bits + 48 * math.ceil(bits / 330)) * DATA_SYMBOL_S
+
+
+def frame_s(length_bytes: int, preamble_symbols: int) -> float:
+    """Return the whole duration of a frame in seconds."""
+    return before_marker_s(preamble_symbols) + after_marker_s(length_bytes)
+
+
+def message_bytes(protocol: RangingProtocol) -> tuple[int, ...]:
+    """Return the lengths of a protocol's frames: poll, a response where there is one, final."""
+    middle = [RESPONSE_BYTES] * (len(protocol.messages) - 2)
+    return (POLL_BYTES, *middle, FINAL_BYTES)
+
+
+def exchange_air_s(protocol: RangingProtocol, preamble_symbols: int) -> float:
+    """Return how long one exchange occupies the air, all its frames together."""
+    return sum(frame_s(length, preamble_symbols) for length in message_bytes(protocol))

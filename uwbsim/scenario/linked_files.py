@@ -1,0 +1,135 @@
+"""Files that a scenario names: antenna tables, trajectories, plans. Their contents take the place of their names.
+
+Names are relative to the scenario's folder.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwblink.errors import UwblinkError
+from uwblink.importers.poses import read_poses
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Poses
+from uwbsim.errors import ScenarioError
+
+MOST_POSES = 200_000
+
+
+def fill_in(table: dict[str, Any], scenario: Path) -> None:
+    """Read what a scenario's table names, in place; raises `ScenarioError`. What is not a table is left alone."""
+    radio = table.get("radio")
+    if isinstance(radio, dict) and isinstance(radio.get("antenna"), dict) and "file" in radio["antenna"]:
+        radio["antenna"] = _antenna(_found(scenario, "radio.antenna.file", radio["antenna"]["file"]))
+    ranging = table.get("ranging")
+    if isinstance(ranging, dict) and isinstance(ranging.get("plan"), dict) and "file" in ranging["plan"]:
+        plan = ranging["plan"]
+        plan["slots"] = _plan(_found(scenario, "ranging.plan.file", plan["file"]))
+    bodies = table.get("bodies")
+    for k, body in enumerate(bodies if isinstance(bodies, list) else []):
+        motion = body.get("motion") if isinstance(body, dict) else None
+        if isinstance(motion, dict) and motion.get("model") == "recorded" and "file" in motion:
+            path = _found(scenario, f"bodies[{k}].motion.file", motion["file"])
+            motion |= _trajectory(path, motion.get("body"), _duration(table))
+
+
+def _found(scenario: Path, key: str, name: Any) -> Path:
+    if not isinstance(name, str):
+        raise ScenarioError(f"{scenario}: {key}: found {name!r}, expected the name of a file")
+    path = scenario.parent / name
+    if not path.exists():
+        raise ScenarioError(f"{scenario}: {key}: found {name!r}, but there is no such file beside the scenario")
+    return path
+
+
+def _duration(table: dict[str, Any]) -> float:
+    settings = table.get("run")
+    value = settings.get("duration_s") if isinstance(settings, dict) else None
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            lines = (line for line in file if not line.startswith("#"))
+            reader = csv.DictReader(lines)
+            missing = [c for c in columns if c not in (reader.fieldnames or [])]
+            if missing:
+                raise ScenarioError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}")
+            return [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ScenarioError(f"{path}: cannot be read as a table ({error})") from error
+
+
+def _number(path: Path, line: int, column: str, cell: str | None) -> float:
+    try:
+        value = float(cell or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ScenarioError(f"{path}: row {line}: column {column!r}: found {cell!r}, expected a number")
+    return value
+
+
+def _antenna(path: Path) -> dict[str, Any]:
+    """Read azimuth_deg, elevation_deg, gain_db rows into a full grid."""
+    rows = _rows(path, ("azimuth_deg", "elevation_deg", "gain_db"))
+    azimuth, elevation = (sorted({row[k] for row in rows}) for k in (0, 1))
+    gain = {(row[0], row[1]): row[2] for row in rows}
+    if len(gain) != len(rows):
+        raise ScenarioError(f"{path}: two rows are for the same direction")
+    for a in azimuth:
+        for e in elevation:
+            if (a, e) not in gain:
+                raise ScenarioError(
+                    f"{path}: a hole in the antenna table: no gain at azimuth {a:g}, elevation {e:g} degrees"
+                )
+    return {
+        "azimuth_deg": azimuth,
+        "elevation_deg": elevation,
+        "gain_db": [[gain[a, e] for e in elevation] for a in azimuth],
+    }
+
+
+def _plan(path: Path) -> list[tuple[float, int, int]]:
+    rows = _rows(path, ("time_s", "initiator", "target"))
+    if not rows:
+        raise ScenarioError(f"{path}: a plan without slots")
+    return [(row[0], int(row[1]), int(row[2])) for row in rows]
+
+
+def _trajectory(path: Path, body: str | None, duration_s: float) -> dict[str, Any]:
+    try:
+        if path.suffix == ".uwb":
+            with Recording.open(path) as recording:
+                poses = recording.poses()
+        else:
+            poses = read_poses(path, body if path.suffix in (".tum", ".txt") else None)
+    except UwblinkError as error:
+        raise ScenarioError(str(error)) from error
+    one = _of_body(path, poses, body)
+    time_s = (one.time_ns - one.time_ns[0]) * 1e-9
+    if time_s[-1] < duration_s:
+        raise ScenarioError(
+            f"{path}: its trajectory lasts {time_s[-1]:.1f} s and does not cover the run of {duration_s:g} s"
+        )
+    return {
+        "times_s": time_s.tolist(),
+        "positions_m": one.position_m.tolist(),
+        "quaternions": one.quaternion.tolist(),
+    }
+
+
+def _of_body(path: Path, poses: Poses, body: str | None) -> Poses:
+    names = sorted(set(poses.body.tolist()))
+    if body is None and len(names) == 1:
+        body = names[0]
+    if body not in names:
+        raise ScenarioError(f"{path}: found body {body!r}, the file has {', '.join(names) or 'none'}")
+    rows = np.flatnonzero(poses.body == body)[:MOST_POSES]
+    return Poses(poses.time_ns[rows], poses.body[rows], poses.position_m[rows], poses.quaternion[rows])

@@ -1,0 +1,258 @@
+"""The scenario: what a TOML file may say, validated. Units are in the key names and leave here.
+
+`uwbsim.scenario.loading.load` turns every mistake into one `ScenarioError` line; the models here and in `radio` and
+`motion` are the whole schema.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import Field, model_validator
+
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.twr import PROTOCOLS
+from uwbsim.scenario.airtime import exchange_air_s
+from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
+from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints
+from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline
+
+ProtocolName = Annotated[str, Field(json_schema_extra={"enum": sorted(PROTOCOLS)})]
+PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
+
+OVERHEAD_S: Final = 0.0015
+"""From the last stamp of an exchange until the board answers the next command: start-up of the poll, three frames, and
+the transfer over USB (firmware wire format, 1.5)."""
+
+UUS_S: Final = 512 / 499.2e6
+WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
+
+
+class RunSettings(Section):
+    """Name, seed and length of the simulation."""
+
+    name: str = "unnamed"
+    seed: Annotated[int, Field(ge=0)] = 0
+    duration_s: Positive
+
+
+class BoardReply(Section):
+    """The reply latency measured on boards: two modes near 304 and 306 us, a tail to 386 us."""
+
+    model: Literal["boards"] = "boards"
+
+
+class FixedReply(Section):
+    """A reply latency that is always the same."""
+
+    model: Literal["fixed"]
+    delay_us: Annotated[float, Field(ge=180, le=6000)]
+
+
+class PlanFile(Section):
+    """A plan from a CSV file with the columns time_s, initiator, target; `slots` is filled in on reading."""
+
+    file: str
+    slots: tuple[tuple[float, int, int], ...] = ()
+
+
+class Ranging(Section):
+    """Who ranges with whom, how, and how often.
+
+    `response_delay_uus` is the boards' C08 setting, in UWB microseconds (1.0256 us): the delay of
+    the scheduled message. `pairs` are (initiator, target). `rate_hz` counts all exchanges together.
+    """
+
+    protocol: ProtocolName = "ds"
+    rate_hz: Positive
+    pairs: Literal["between-bodies"] | tuple[tuple[TagId, TagId], ...] = "between-bodies"
+    plan: PlanName | PlanFile = "round-robin"
+    sync_error_ms: NotNegative = 0.1
+    list_timeout_ms: NotNegative = 10.0
+    response_delay_uus: Annotated[int, Field(ge=280, le=6500)] = 1500
+    reply: Annotated[BoardReply | FixedReply, Field(discriminator="model")] = BoardReply()
+    get_cir: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.protocol not in PROTOCOLS:
+            raise ValueError(f"protocol: found {self.protocol!r}, allowed: {', '.join(PROTOCOLS)}")
+        if self.pairs == ():
+            raise ValueError("pairs: found none, give at least one [initiator, target]")
+        for pair in self.pairs if self.pairs != "between-bodies" else ():
+            if pair[0] == pair[1]:
+                raise ValueError(f"pairs: tag {pair[0]} cannot range with itself")
+        if self.plan != "aloha" and self.rate_hz > self.fastest_hz():
+            raise ValueError(
+                f"rate_hz: found {self.rate_hz:g}, at this response_delay_uus the air allows "
+                f"at most {self.fastest_hz():.0f}"
+            )
+        return self
+
+    def fastest_hz(self) -> float:
+        """Return how many exchanges a second one after the other allow."""
+        scheduled = sum(message.timing == "scheduled" for message in PROTOCOLS[self.protocol].messages)
+        return 1 / (OVERHEAD_S + scheduled * self.response_delay_uus * UUS_S)
+
+    def air_share(self, preamble_symbols: int) -> float:
+        """Return the share of time for which the plan keeps the air busy."""
+        return self.rate_hz * exchange_air_s(PROTOCOLS[self.protocol], preamble_symbols)
+
+
+class Mocap(Section):
+    """The motion capture that writes the poses of the recording.
+
+    Its times are late by `latency_ms`; `gaps_per_min` times a minute it loses sight of each body for `gap_s`.
+    """
+
+    rate_hz: Positive = 100.0
+    position_noise_m: NotNegative = 0.0
+    attitude_noise_rad: NotNegative = 0.0
+    latency_ms: float = 0.0
+    gaps_per_min: NotNegative = 0.0
+    gap_s: Positive = 0.5
+
+
+class Body(Section):
+    """Something that carries tags, and may stand in the way of waves."""
+
+    name: Annotated[str, Field(min_length=1)]
+    motion: Motion
+    shadow: Shadow | None = None
+
+
+class Tag(Section):
+    """A board: where it sits, its antenna delay and its clock.
+
+    Give the aggregate `delay_ns` = transmit - receive, split 0.44 / 0.56, or both parts.
+    The clock: `drift_ppm_per_sqrt_s` is the random walk of its rate (Allan deviation q sqrt(tau/3)),
+    `white_ppm_sqrt_s` white noise of its rate (Allan deviation h/sqrt(tau)), `ramp_ppm_per_s` what a change of
+    temperature adds. A `passive` tag records the exchanges that it overhears.
+    """
+
+    id: TagId
+    body: str
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    delay_ns: float | None = None
+    tx_delay_ns: float | None = None
+    rx_delay_ns: float | None = None
+    skew_ppm: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    drift_ppm_per_sqrt_s: NotNegative = 0.0
+    white_ppm_sqrt_s: NotNegative = 0.0
+    ramp_ppm_per_s: float = 0.0
+    passive: bool = False
+    clock_offset_s: NotNegative | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        parts = (self.tx_delay_ns is not None, self.rx_delay_ns is not None)
+        if parts[0] != parts[1] or (parts[0] and self.delay_ns is not None):
+            raise ValueError("delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
+        return self
+
+    def delays_ns(self) -> tuple[float, float]:
+        """Return what the antenna adds to a transmit and to a receive stamp."""
+        if self.tx_delay_ns is not None and self.rx_delay_ns is not None:
+            return self.tx_delay_ns, self.rx_delay_ns
+        aggregate = self.delay_ns or 0.0
+        return 0.44 * aggregate, -0.56 * aggregate
+
+
+class Scenario(Section):
+    """A whole scenario file."""
+
+    run: RunSettings
+    ranging: Ranging
+    radio: Radio = Radio()
+    mocap: Mocap = Mocap()
+    room: Room | None = None
+    obstacles: tuple[Obstacle, ...] = ()
+    min_separation_m: NotNegative = 0.0
+    bodies: Annotated[tuple[Body, ...], Field(min_length=1)]
+    tags: Annotated[tuple[Tag, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names = [body.name for body in self.bodies]
+        ids = [tag.id for tag in self.tags]
+        for k, name in enumerate(names):
+            if name in names[:k]:
+                raise ValueError(f"bodies[{k}].name: found a second {name!r}, names must differ")
+        for k, tag in enumerate(self.tags):
+            if tag.id in ids[:k]:
+                raise ValueError(f"tags[{k}].id: found a second {tag.id}, ids must differ")
+            if tag.body not in names:
+                raise ValueError(f"tags[{k}].body: found {tag.body!r}, the bodies are {', '.join(names)}")
+        for pair in self.ranging.pairs if self.ranging.pairs != "between-bodies" else ():
+            for tag_id in pair:
+                if tag_id not in ids:
+                    known = ", ".join(map(str, ids))
+                    raise ValueError(f"ranging.pairs: found tag {tag_id}, the tags are {known}")
+        self._check_places()
+        self._check_plan(ids)
+        if not self.pairs():
+            raise ValueError("ranging.pairs: no two tags sit on different bodies, so nobody ranges")
+        return self
+
+    def _check_places(self) -> None:
+        """Bodies must be inside the room, and tags of one body further apart than a wavelength."""
+        for k, body in enumerate(self.bodies):
+            for key, point in _named_points(body):
+                if self.room and any(
+                    not lo <= v <= hi for lo, v, hi in zip(self.room.min_m, point, self.room.max_m, strict=True)
+                ):
+                    raise ValueError(
+                        f"bodies[{k}].motion.{key}: found {list(point)}, outside the room "
+                        f"{list(self.room.min_m)} to {list(self.room.max_m)}"
+                    )
+        for a, b in combinations(range(len(self.tags)), 2):
+            one, two = self.tags[a], self.tags[b]
+            apart = sum((x - y) ** 2 for x, y in zip(one.lever_arm_m, two.lever_arm_m, strict=True)) ** 0.5
+            if one.body == two.body and apart < WAVELENGTH_M:
+                raise ValueError(
+                    f"tags[{b}].lever_arm_m: tags {one.id} and {two.id} of body {one.body!r} are {100 * apart:.1f} cm "
+                    f"apart, closer than a wavelength ({100 * WAVELENGTH_M:.1f} cm)"
+                )
+
+    def _check_plan(self, ids: list[int]) -> None:
+        if isinstance(self.ranging.plan, str):
+            return
+        for k, (time_s, initiator, target) in enumerate(self.ranging.plan.slots):
+            for tag_id in (initiator, target):
+                if tag_id not in ids:
+                    known = ", ".join(map(str, ids))
+                    raise ValueError(f"ranging.plan: slot {k + 1} names tag {tag_id}, the tags are {known}")
+            if initiator == target or not 0 <= time_s <= self.run.duration_s:
+                raise ValueError(f"ranging.plan: slot {k + 1} is tag {initiator} to {target} at {time_s:g} s")
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Return the (initiator, target) pairs in the order in which they range."""
+        if self.ranging.pairs != "between-bodies":
+            return list(self.ranging.pairs)
+        return [(a.id, b.id) for a, b in combinations(self.tags, 2) if a.body != b.body]
+
+    def planted(self) -> dict[str, Any]:
+        """Return what a calibration of this scenario should find, JSON-ready."""
+        delays = {str(t.id): t.delays_ns()[0] - t.delays_ns()[1] for t in self.tags}
+        bias = self.radio.bias if isinstance(self.radio.bias, Spline) else None
+        sigma = self.radio.sigma
+        fields = {"knots", "coefficients", "degree"}
+        return {
+            "delays_ns": delays,
+            "bias_curve": bias.model_dump(mode="json", include=fields) if bias else None,
+            "sigma_curve": sigma.model_dump(mode="json", include=fields) if sigma else None,
+            "alpha_dbm": -82.0,
+        }
+
+
+def _named_points(body: Body) -> list[tuple[str, Vector]]:
+    """The points that a body's motion is known to reach, with their keys."""
+    motion = body.motion
+    if isinstance(motion, Static):
+        return [("position_m", motion.position_m)]
+    if isinstance(motion, RandomFlight):
+        return [("box_min_m", motion.box_min_m), ("box_max_m", motion.box_max_m)]
+    if isinstance(motion, Waypoints):
+        return [(f"points_m[{k}]", point) for k, point in enumerate(motion.points_m)]
+    return []

@@ -1,0 +1,187 @@
+"""The radios of a scenario: power, noise, bias, and what is between them."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from uwbsim.scenario.base import NotNegative, Positive, Section, Share, Vector
+from uwbsim.scenario.published_curves import BIAS, SIGMA
+
+MATERIALS: Final = {
+    "air": (0.0, 1.0),
+    "drywall": (15.0, 1.6),
+    "wood": (25.0, 1.5),
+    "glass": (40.0, 2.5),
+    "brick": (45.0, 2.0),
+    "concrete": (80.0, 2.4),
+    "person": (60.0, 6.0),
+    "metal": (2000.0, 1.0),
+}
+"""Loss in dB a metre and refractive index near 4 GHz: round values from ITU-R P.2040-3 (building materials; person as
+wet tissue). Excess delay is (index - 1) times the thickness."""
+
+
+class Spline(Section):
+    """A B-spline over lifted first-path power 10^((fpp_dbm + 82)/10), held constant beyond its ends."""
+
+    knots: tuple[float, ...]
+    coefficients: tuple[float, ...]
+    degree: Annotated[int, Field(ge=0, le=5)] = 3
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.knots) != len(self.coefficients) + self.degree + 1:
+            raise ValueError(
+                f"knots: found {len(self.knots)}, a spline of degree {self.degree} with "
+                f"{len(self.coefficients)} coefficients has {len(self.coefficients) + self.degree + 1}"
+            )
+        if list(self.knots) != sorted(self.knots) or self.knots[0] == self.knots[-1]:
+            raise ValueError("knots: must not decrease, and must span a range")
+        return self
+
+
+class SigmaSpline(Spline):
+    """Standard deviation of the range in metres, where dt32/dt53 is `reply_ratio`."""
+
+    reply_ratio: NotNegative = 0.0
+
+
+class BiasTable(Section):
+    """Bias in metres at received powers in dBm, linear between them and constant beyond."""
+
+    power_dbm: tuple[float, ...]
+    bias_m: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.power_dbm) != len(self.bias_m) or len(self.power_dbm) < 2:
+            raise ValueError(
+                f"bias_m: found {len(self.bias_m)} values at {len(self.power_dbm)} powers, give two or more of each"
+            )
+        steps = [b - a for a, b in zip(self.power_dbm, self.power_dbm[1:], strict=False)]
+        if not (all(s > 0 for s in steps) or all(s < 0 for s in steps)):
+            raise ValueError("power_dbm: must go one way")
+        return self
+
+
+def _named(known: dict[str, dict[str, Any] | None]) -> Any:
+    def look_up(value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        if value not in known:
+            raise ValueError(f"found {value!r}, known curves are {', '.join(known)}")
+        return known[value]
+
+    return BeforeValidator(look_up)
+
+
+class Multipath(Section):
+    """The positive tail: with `probability` an exchange travels an exponential excess distance."""
+
+    probability: Share
+    mean_excess_m: Positive
+
+
+class AntennaTable(Section):
+    """Gain in dB over azimuth and elevation in the body's frame: a full grid, interpolated linearly."""
+
+    azimuth_deg: tuple[float, ...]
+    elevation_deg: tuple[float, ...]
+    gain_db: tuple[tuple[float, ...], ...]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name, low, high in (("azimuth_deg", -180.0, 180.0), ("elevation_deg", -90.0, 90.0)):
+            values = getattr(self, name)
+            if len(values) < 2 or any(b <= a for a, b in itertools.pairwise(values)):
+                raise ValueError(f"{name}: must increase, and hold two values or more")
+            if values[0] != low or values[-1] != high:
+                raise ValueError(f"{name}: runs from {values[0]:g} to {values[-1]:g}, expected {low:g} to {high:g}")
+        if len(self.gain_db) != len(self.azimuth_deg):
+            raise ValueError(f"gain_db: found {len(self.gain_db)} rows, the azimuths are {len(self.azimuth_deg)}")
+        for k, row in enumerate(self.gain_db):
+            if len(row) != len(self.elevation_deg):
+                raise ValueError(f"gain_db[{k}]: found {len(row)} values, the elevations are {len(self.elevation_deg)}")
+        return self
+
+
+class Radio(Section):
+    """Power, noise and bias of every radio; the defaults are those of measured boards.
+
+    Sources (firmware wire format, section 5): `rx_noise_ps` and `skew_noise_ppm`, `skew_bias_ppm` from 1833 exchanges
+    of MILUV; `sensitivity_dbm` a little below the weakest first path seen there (-104.2 dBm); frame settings those of
+    the firmware. `capture_db` and `dynamic_range_db` are typical of the chip's correlator, and not measured here.
+    """
+
+    first_path_at_1m_dbm: float = -80.0
+    path_loss_exponent: NotNegative = 2.0
+    antenna: Literal["isotropic", "dipole"] | AntennaTable = "isotropic"
+    shadowing_db: NotNegative = 0.0
+    power_noise_db: NotNegative = 0.0
+    sensitivity_dbm: float = -105.0
+    tx_noise_ps: NotNegative = 0.0
+    rx_noise_ps: NotNegative = 116.0
+    skew_noise_ppm: NotNegative = 0.20
+    skew_bias_ppm: float = -0.13
+    quantize: bool = True
+    preamble_symbols: Literal[64, 128, 256, 512, 1024, 1536, 2048, 4096] = 128
+    capture_db: NotNegative = 6.0
+    dynamic_range_db: Positive = 15.0
+    bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = None
+    sigma: Annotated[SigmaSpline | None, _named(SIGMA)] = None
+    multipath: Multipath | None = None
+
+
+class Material(Section):
+    """What an obstacle is made of: loss in dB a metre, and refractive index."""
+
+    loss_db_per_m: NotNegative
+    index: Annotated[float, Field(ge=1)] = 1.0
+
+
+class Obstacle(Section):
+    """A box that waves go through, at a loss and late. `material` is a name or a table of its own."""
+
+    name: str = "obstacle"
+    min_m: Vector
+    max_m: Vector
+    material: str | Material
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
+            raise ValueError("min_m: must be below max_m in every direction")
+        if isinstance(self.material, str) and self.material not in MATERIALS:
+            raise ValueError(f"material: found {self.material!r}, known are {', '.join(MATERIALS)}")
+        return self
+
+    def properties(self) -> tuple[float, float]:
+        """Return loss in dB a metre, and refractive index."""
+        if isinstance(self.material, str):
+            return MATERIALS[self.material]
+        return self.material.loss_db_per_m, self.material.index
+
+
+class Room(Section):
+    """The room: a box, whose six surfaces reflect with `reflection_loss_db` where it is given."""
+
+    min_m: Vector
+    max_m: Vector
+    reflection_loss_db: NotNegative | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
+            raise ValueError("min_m: must be below max_m in every direction")
+        return self
+
+
+class Shadow(Section):
+    """The part of a body that waves do not pass unharmed: an ellipsoid in the body's frame."""
+
+    semi_axes_m: tuple[Positive, Positive, Positive]
+    centre_m: Vector = (0.0, 0.0, 0.0)
+    loss_db_per_m: NotNegative = 40.0

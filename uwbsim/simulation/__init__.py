@@ -1,0 +1,1 @@
+"""A flight: schedule, air, time stamps, listeners, recording."""

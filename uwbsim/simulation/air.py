@@ -1,0 +1,209 @@
+"""The discrete-event loop: who sends when, what collides, and which exchanges fail.
+
+The loop decides what happens and in which order. It runs on nominal delays, within a few tens of nanoseconds of the
+exact instants, on which nothing in it depends; those are computed afterwards in batches (`timestamps`).
+
+A frame is noted when it is decided to send it and judged when it has ended, so that every frame which overlaps it is
+known by then: one event a message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import simpy
+from numpy.typing import NDArray
+
+from uwblink.twr import RangingProtocol
+from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+
+PREAMBLE_TIMEOUT_S: Final = 6.521e-3
+"""How long a board waits for a preamble (firmware wire format, 3.1)."""
+
+RECEIVER_ON_S: Final = 40e-6
+"""From the end of a frame until the receiver is on again (firmware wire format, 3.1)."""
+
+TURNAROUND_S: Final = 0.5e-3
+"""From the end of an exchange until the initiator's host can command the next."""
+
+WEAK, COLLIDED, BUSY, FOREIGN, LATE = "below sensitivity", "collision", "receiver busy", "another's frame", "too late"
+
+Steps = Generator[simpy.Event, Any, None]
+Powers = Callable[[int, int], NDArray[np.float64]]
+"""Returns the power (dBm) at every tag from a sender, at a true time in sub-ticks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """One planned exchange: when, who, and what the radios will make of each message.
+
+    `heard[k]` says whether message k is above the receiver's sensitivity, `delay[k]` is the sub-ticks from the stamp
+    it waits for until message k leaves, `number` its place in the plan, `pause` what the initiator waits first.
+    """
+
+    number: int
+    start: int
+    initiator: int
+    target: int
+    heard: tuple[bool, ...]
+    delay: tuple[int, ...]
+    pause: int = 0
+
+
+@dataclass(slots=True)
+class Outcomes:
+    """What became of each slot: when its poll left (-1: never), the message that was lost (-1: none), and why."""
+
+    start: list[int]
+    lost: list[int]
+    reason: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    start: int
+    end: int
+    sender: int
+    exchange: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What decides a reception besides its own power."""
+
+    sensitivity_dbm: float
+    capture_db: float
+    preamble_symbols: int
+
+
+class Air:
+    """The medium and the radios on it, while the slots of a plan are played."""
+
+    def __init__(self, protocol: RangingProtocol, slots: int, tags: int, powers: Powers, rules: Rules) -> None:
+        """Be silent."""
+        self.env = simpy.Environment()
+        self._messages = protocol.messages
+        self._powers, self._rules = powers, rules
+        self._before = _subticks(before_marker_s(rules.preamble_symbols))
+        self._after = [_subticks(after_marker_s(n)) for n in message_bytes(protocol)]
+        self._patience = _subticks(PREAMBLE_TIMEOUT_S + RECEIVER_ON_S)
+        self._turnaround = _subticks(TURNAROUND_S)
+        self._frames: list[_Frame] = []
+        self._busy_until = [0] * tags
+        self.outcomes = Outcomes([-1] * slots, [-1] * slots, [""] * slots)
+
+    def play(self, slots: Sequence[Slot], report: Callable[[int], None] | None = None) -> Steps:
+        """Play the slots of one host, one after the other."""
+        env = self.env
+        for count, slot in enumerate(slots):
+            if slot.start > env.now:
+                yield env.timeout(slot.start - int(env.now))
+            if slot.pause:
+                yield env.timeout(slot.pause)
+            yield from self._exchange(slot)
+            yield env.timeout(self._turnaround)
+            if report and not count % 500:
+                report(count)
+
+    def _exchange(self, slot: Slot) -> Steps:
+        """Send the messages of an exchange in turn; stop, after the wait for it, at one that is not received."""
+        env, outcomes, number = self.env, self.outcomes, slot.number
+        busy, me, other = self._busy_until, slot.initiator, slot.target
+        if busy[me] > env.now:  # a board that answers somebody takes its own command when it is done
+            yield env.timeout(busy[me] - int(env.now))
+        marker = int(env.now) + self._before
+        outcomes.start[number] = marker
+        listening_since = marker
+        for k, message in enumerate(self._messages):
+            if k:
+                marker += slot.delay[k]
+            sender, receiver = (me, other) if message.sender == "initiator" else (other, me)
+            frame = _Frame(marker - self._before, marker + self._after[k], sender, number)
+            self._frames.append(frame)
+            yield env.timeout(frame.end - int(env.now))
+            reason = self._fate(slot, k, frame, receiver, listening_since, marker)
+            if reason:
+                outcomes.lost[number], outcomes.reason[number] = k, reason
+                # Whoever waits for the missing message gives up when its preamble does not come.
+                until = listening_since + self._patience
+                busy[me] = max(until, int(env.now))
+                yield env.timeout(max(until - int(env.now), 0))
+                return
+            listening_since = frame.end
+            if not k:
+                # From now on both are in this exchange; the target will send its last frame whatever becomes of others.
+                busy[me] = busy[other] = marker + sum(slot.delay[1:]) + self._after[-1]
+
+    def _fate(self, slot: Slot, k: int, frame: _Frame, receiver: int, since: int, marker: int) -> str:
+        """Why a frame that has just ended was not received, empty if it was."""
+        if not slot.heard[k]:
+            return WEAK
+        if k and frame.start - since > self._patience:
+            return LATE
+        if not k and self._busy_until[receiver] > frame.start:
+            return BUSY
+        if len(self._frames) > 1:
+            return self._interference(slot, k, frame, receiver, since)
+        self._frames.clear()
+        return ""
+
+    def _interference(self, slot: Slot, k: int, frame: _Frame, receiver: int, since: int) -> str:
+        """What the other frames on the air do to one: collide with it, or come in the place of it."""
+        now = int(self.env.now)
+        oldest = now - 2 * self._patience
+        self._frames = [f for f in self._frames if f.end > oldest]
+        earliest = min(since, frame.start) if k else frame.start
+        others = [f for f in self._frames if f.exchange != slot.number and f.end > earliest and f.start < frame.end]
+        if not others:
+            return ""
+        signal = float(self._powers(frame.sender, frame.start)[receiver])
+        for f in others:
+            if f.sender == receiver:
+                return BUSY
+            power = float(self._powers(f.sender, f.start)[receiver])
+            if power < self._rules.sensitivity_dbm:
+                continue
+            if f.end <= frame.start:
+                if k and f.start >= since:
+                    return FOREIGN  # a board that waits for an answer takes the first frame that comes
+                continue
+            captured = signal >= power + self._rules.capture_db and frame.start <= f.start
+            if not captured:
+                return COLLIDED
+        return ""
+
+
+def run(
+    protocol: RangingProtocol,
+    hosts: Sequence[Sequence[Slot]],
+    tags: int,
+    powers: Powers,
+    rules: Rules,
+    progress: Callable[[float], None] | None = None,
+) -> Outcomes:
+    """Play the slots of all hosts, each host's in order; returns what became of every slot."""
+    total = sum(map(len, hosts))
+    air = Air(protocol, total, tags, powers, rules)
+    counts = [0] * len(hosts)
+
+    def reporter(host: int) -> Callable[[int], None] | None:
+        if progress is None:
+            return None
+
+        def report(count: int) -> None:
+            counts[host] = count
+            progress(sum(counts) / max(total, 1))
+
+        return report
+
+    processes = [air.env.process(air.play(slots, reporter(h))) for h, slots in enumerate(hosts)]
+    air.env.run(until=air.env.all_of(processes))
+    return air.outcomes
+
+
+def _subticks(seconds: float) -> int:
+    return round(seconds * SUBTICKS_PER_SECOND)

@@ -1,0 +1,249 @@
+"""Runs a scenario: plan, event loop, stamps, and the recording that a real flight would have made."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.ticks import REPORT_BITS, UUS_TICKS
+from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, RangingProtocol, board_range, raw_range
+from uwbsim.errors import ScenarioError
+from uwbsim.random_streams import stream
+from uwbsim.scenario.airtime import before_marker_s
+from uwbsim.scenario.model import Scenario
+from uwbsim.simulation import air
+from uwbsim.simulation.overhearing import overhear, responses
+from uwbsim.simulation.schedule import Schedule, schedule
+from uwbsim.simulation.timestamps import Draws, Stamped, draw, stamp
+from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.lookahead import SampledWorld
+from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm
+from uwbsim.world.world import World
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """What a scenario gave. `truth_m` (n,) is the true distance of each exchange, not recorded."""
+
+    exchanges: Exchanges
+    poses: Poses
+    tags: list[Tag]
+    faults: list[Fault]
+    overheard: dict[str, NDArray[Any]]
+    cirs: list[tuple[int, int, int, int, float, tuple[int, ...]]]
+    truth_m: Floats
+    meta: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Everything a run needs at hand, made once from the scenario."""
+
+    scenario: Scenario
+    protocol: RangingProtocol
+    world: World
+    clocks: Clocks
+
+
+def simulate(
+    scenario: Scenario, progress: Callable[[float], None] | None = None, *, contention: bool = True
+) -> Simulated:
+    """Simulate a scenario; the same scenario gives the same result on every machine.
+
+    Without `contention` there is no event loop: every exchange begins when it is planned and disturbs no other, so
+    where exchanges do not meet the stamps are the same, sooner. `progress` is called with the done fraction. Raises
+    `ScenarioError` for a run longer than the integer true time carries (36 h).
+    """
+    if scenario.run.duration_s > LONGEST_RUN_S:
+        raise ScenarioError(f"run.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
+    protocol = PROTOCOLS[scenario.ranging.protocol]
+    run = _Run(scenario, protocol, World.of(scenario), Clocks.of(scenario))
+    plan = schedule(scenario)
+    draws = draw(scenario, len(plan.start), len(protocol.messages))
+    if contention:
+        hosts, powers = _hosts(run, plan, draws), _powers(run.world)
+        outcomes = air.run(protocol, hosts, len(scenario.tags), powers, _rules(scenario), progress)
+    else:
+        outcomes = _undisturbed(run, plan)
+    lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)
+    kept = np.flatnonzero(lost < 0)
+    kept = kept[np.argsort(begun[kept], kind="stable")]
+    rows = (begun[kept], plan.initiator[kept], plan.target[kept])
+    stamped = stamp(scenario, protocol, run.world, run.clocks, *rows, draws[kept])
+    exchanges = _exchanges(run, kept, len(plan.start), rows, stamped)
+    return Simulated(
+        exchanges=exchanges,
+        poses=run.world.motion_capture(),
+        tags=[Tag(t.id, t.body, t.lever_arm_m) for t in scenario.tags],
+        faults=_faults(run, begun, plan, outcomes),
+        overheard=overhear(
+            scenario, protocol, run.world, run.clocks, plan.initiator[kept], plan.target[kept], stamped, exchanges
+        ),
+        cirs=responses(scenario, run.world, protocol, exchanges, stamped) if scenario.ranging.get_cir else [],
+        truth_m=(stamped.distance_m[0] + stamped.distance_m[1]) / 2,
+        meta=_provenance(scenario),
+    )
+
+
+def write(
+    simulated: Simulated,
+    path: str | os.PathLike[str],
+    *,
+    frames: Sequence[tuple[int, str, str, bytes]] = (),
+    force: bool = False,
+) -> None:
+    """Write the recording, with the bytes of boards where there are any; raises what `Recording.create` raises."""
+    with Recording.create(path, meta=simulated.meta, force=force) as recording:
+        recording.append_tags(simulated.tags)
+        recording.append_poses(simulated.poses)
+        recording.append_exchanges(simulated.exchanges)
+        recording.append_faults(simulated.faults)
+        recording.append_columns("overheard", simulated.overheard)
+        recording.append_cirs(simulated.cirs)
+        recording.append_frames(frames)
+
+
+def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
+    """Give the event loop what it needs, as plain integers, a list a host: it does no arithmetic of its own."""
+    scenario, messages = run.scenario, run.protocol.messages
+    power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
+    heard = _heard(scenario, power, len(messages))
+    scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
+    at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
+    delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in messages]
+    columns = zip(
+        range(len(plan.start)),
+        plan.start.tolist(),
+        plan.initiator.tolist(),
+        plan.target.tolist(),
+        zip(*heard.tolist(), strict=True),
+        zip(*(d.tolist() for d in delay), strict=True),
+        _pauses(run, plan),
+        strict=True,
+    )
+    hosts: dict[int, list[air.Slot]] = {}
+    for host, row in zip(plan.host.tolist(), columns, strict=True):
+        hosts.setdefault(host, []).append(air.Slot(*row))
+    return list(hosts.values())
+
+
+def _undisturbed(run: _Run, plan: Schedule) -> air.Outcomes:
+    """What becomes of exchanges that do not meet: only a message too weak to be heard is lost."""
+    power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
+    heard = _heard(run.scenario, power, len(run.protocol.messages))
+    lost = np.where(heard.all(axis=0), -1, np.argmin(heard, axis=0))
+    marker = round(before_marker_s(run.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
+    reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
+    return air.Outcomes((plan.start + marker).tolist(), lost.tolist(), reasons)
+
+
+def _pauses(run: _Run, plan: Schedule) -> list[int]:
+    """How long each slot's initiator waits first: in a common list, for what it does not hear of the one before."""
+    scenario = run.scenario
+    none = np.zeros(len(plan.start), dtype=np.int64)
+    if scenario.ranging.plan != "common-list" or len(none) < 2:
+        return [0] * len(none)
+    before, power = plan.target[:-1], np.full(len(none), np.inf)
+    mine = plan.initiator[1:]
+    other = np.flatnonzero(before != mine)
+    power[other + 1] = run.world.link(before[other], mine[other], plan.start[other + 1]).power_dbm
+    timeout = round(scenario.ranging.list_timeout_ms * 1e-3 * SUBTICKS_PER_SECOND)
+    return [timeout if weak else 0 for weak in (power < scenario.radio.sensitivity_dbm).tolist()]
+
+
+def _powers(world: World) -> air.Powers:
+    ahead = SampledWorld(world)
+    return lambda sender, time: ahead.from_sender(sender, max(time, 0)).power_dbm
+
+
+def _rules(scenario: Scenario) -> air.Rules:
+    radio = scenario.radio
+    return air.Rules(radio.sensitivity_dbm, radio.capture_db, radio.preamble_symbols)
+
+
+def _heard(scenario: Scenario, power_dbm: Floats, messages: int) -> NDArray[np.bool_]:
+    """Whether each message (messages, n) is received; a little fading makes the edge soft."""
+    fading = stream(scenario.run.seed, "fading").normal(size=(messages, len(power_dbm)))
+    level = power_dbm + fading * scenario.radio.power_noise_db
+    return level >= scenario.radio.sensitivity_dbm
+
+
+def _exchanges(run: _Run, kept: Ints, planned: int, rows: tuple[Ints, Ints, Ints], stamped: Stamped) -> Exchanges:
+    _, initiator, target = rows
+    ids = np.array([tag.id for tag in run.scenario.tags], dtype=np.int64)
+    mask = (1 << REPORT_BITS) - 1
+    none = np.zeros(len(kept), dtype=np.int64)
+    stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & mask for name in STAMPS}
+    fpp1, skew1 = _readings(run, 1, kept, planned, (initiator, target), stamped)
+    fpp2, skew2 = _readings(run, 2, kept, planned, (target, initiator), stamped)
+    nan = np.full(len(kept), np.nan)
+    exchanges = Exchanges(
+        time_ns=np.rint(stamped.departure[0] * (1e9 / SUBTICKS_PER_SECOND)).astype(np.int64),
+        initiator=ids[initiator],
+        target=ids[target],
+        protocol=np.full(len(kept), run.protocol.name),
+        reporter=ids[initiator],
+        range_m=nan,
+        fpp1_dbm=fpp1,
+        fpp2_dbm=fpp2,
+        skew1_ppm=skew1,
+        skew2_ppm=skew2,
+        truth_m=nan,
+        bits=REPORT_BITS,
+        **stamps,
+    )
+    printed = board_range if run.scenario.radio.quantize else raw_range
+    return replace(exchanges, range_m=printed(exchanges))
+
+
+def _readings(
+    run: _Run, number: int, kept: Ints, planned: int, ends: tuple[Ints, Ints], stamped: Stamped
+) -> tuple[Floats, Floats]:
+    """What the receiver of message `number` prints: first-path power and relative skew."""
+    radio, seed = run.scenario.radio, run.scenario.run.seed
+    sender, receiver = ends
+    time = stamped.departure[number - 1]
+    power_noise = stream(seed, "power reading", number).normal(size=planned)[kept]
+    skew_noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
+    skew = (run.clocks.rate(receiver, time) - run.clocks.rate(sender, time)) * 1e6
+    return (
+        printed_power_dbm(radio, stamped.power_dbm[number - 1], power_noise),
+        printed_skew_ppm(radio, skew, skew_noise),
+    )
+
+
+def _faults(run: _Run, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
+    ids = [tag.id for tag in run.scenario.tags]
+    faults = []
+    for k in np.flatnonzero(np.array(outcomes.lost) >= 0):
+        a, b = ids[plan.initiator[k]], ids[plan.target[k]]
+        reason = outcomes.reason[k]
+        faults.append(
+            Fault(
+                round(int(begun[k]) * (1e9 / SUBTICKS_PER_SECOND)),
+                str(a),
+                "lost frame" if reason == air.WEAK else reason,
+                f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {reason}",
+            )
+        )
+    return faults
+
+
+def _provenance(scenario: Scenario) -> dict[str, Any]:
+    return {
+        "source": "simulation",
+        "scenario": scenario.model_dump(mode="json"),
+        "scenario_name": scenario.run.name,
+        "seed": scenario.run.seed,
+        "planted": scenario.planted(),
+    }

@@ -1,0 +1,54 @@
+"""A simulated flight as bytes: every exchange encoded as its initiator's report, and decoded again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from uwblink.ticks import TICK_S, elapsed
+from uwblink.twr import COLUMNS, ON_BOARDS
+from uwblink.wire.bulk import ColumnDecoder
+from uwblink.wire.codec import encode
+from uwblink.wire.messages import RangeReport
+from uwbsim.errors import ScenarioError
+from uwbsim.simulation.run import Simulated
+
+Frame = tuple[int, str, str, bytes]
+
+
+def frames_of(simulated: Simulated) -> list[Frame]:
+    """Return the bytes that the boards would have sent, as a recorder stores them.
+
+    Raises `ScenarioError` for a protocol that the boards do not know.
+    """
+    e = simulated.exchanges
+    strange = sorted(set(np.unique(e.protocol).tolist()) - set(ON_BOARDS))
+    if strange:
+        raise ScenarioError(
+            f"ranging.protocol: found {strange[0]!r}, but the boards report only {', '.join(ON_BOARDS)}"
+        )
+    last = np.where(e.rx3 != 0, e.rx3, e.rx2)
+    time_ns = e.time_ns + np.rint(elapsed(last, e.tx1) * (TICK_S * 1e9)).astype(np.int64)
+    names = [name for name in RangeReport.FIELDS if name != "neighbour"]
+    columns = [e.target.tolist(), *(getattr(e, name).tolist() for name in names)]
+    reports = (encode(RangeReport(*row)) for row in zip(*columns, strict=True))
+    return [
+        (t, f"board {i}", "in", data)
+        for t, i, data in zip(time_ns.tolist(), e.initiator.tolist(), reports, strict=True)
+    ]
+
+
+def through_wire(simulated: Simulated) -> tuple[Simulated, list[Frame]]:
+    """Return a flight whose exchanges were decoded from the boards' bytes, and those bytes."""
+    frames = frames_of(simulated)
+    decoders = {f"board {i}": ColumnDecoder(int(i)) for i in np.unique(simulated.exchanges.initiator)}
+    for time_ns, name, _, data in frames:
+        decoders[name].feed(data, time_ns)
+    parts = [d.exchanges() for d in decoders.values()]
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+    order = np.argsort(columns["time_ns"], kind="stable")
+    exchanges = replace(parts[0], **{name: column[order] for name, column in columns.items()})
+    ports = {name.removeprefix("board "): name for name in decoders}
+    return replace(simulated, exchanges=exchanges, meta=simulated.meta | {"ports": ports}), frames

@@ -1,0 +1,167 @@
+"""The exact instants and stamps of many exchanges at once, with the firmware's arithmetic.
+
+Works through the messages of a protocol's row, whichever it is: when does each leave, when does it
+arrive, and which integers do the two boards write down.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.ticks import (
+    ANTENNA_DELAY_TICKS,
+    DELAYED_TX_GRID,
+    SPEED_OF_LIGHT,
+    TICK_S,
+    UUS_TICKS,
+)
+from uwblink.twr import ProtocolMessage, RangingProtocol
+from uwbsim.random_streams import stream
+from uwbsim.scenario.model import Scenario
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.propagation import Link
+from uwbsim.world.radio import reception_bias_s, reception_noise_s
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+GRID: Final = DELAYED_TX_GRID
+
+
+class Links(Protocol):
+    """What knows how far apart tags are and how strongly they hear each other: a `World`, or `SampledWorld` of one."""
+
+    def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
+        """Return what reaches one tag from another (n,) at true times (n,)."""
+        ...
+
+
+@dataclass(slots=True)
+class Draws:
+    """What chance decides, one row a planned slot, so that a lost exchange shifts no other draw.
+
+    `transmit` and `receive` are standard normal, shape (messages, n); `reply_s` is the latency of a
+    reply sent at once; `excess_m` the detour of the multipath.
+    """
+
+    transmit: Floats
+    receive: Floats
+    reply_s: Floats
+    excess_m: Floats
+
+    def __getitem__(self, rows: Ints) -> Draws:
+        """Return the draws of the chosen slots."""
+        return Draws(self.transmit[:, rows], self.receive[:, rows], self.reply_s[rows], self.excess_m[rows])
+
+
+@dataclass(slots=True)
+class Stamped:
+    """Stamps in whole ticks, not wrapped, and what the messages met on their way, shape (n,)."""
+
+    stamps: dict[str, Ints]
+    departure: list[Ints]
+    distance_m: list[Floats]
+    power_dbm: list[Floats]
+
+
+def draw(scenario: Scenario, count: int, messages: int) -> Draws:
+    """Draw for `count` planned slots from the scenario's named streams."""
+    seed, radio = scenario.run.seed, scenario.radio
+    numbers = range(messages)
+    excess = np.zeros(count)
+    if radio.multipath:
+        rng = stream(seed, "multipath")
+        hit = rng.random(count) < radio.multipath.probability
+        excess = np.where(hit, rng.exponential(radio.multipath.mean_excess_m, count), 0.0)
+    return Draws(
+        transmit=np.array([stream(seed, "transmit noise", k).normal(size=count) for k in numbers]),
+        receive=np.array([stream(seed, "receive noise", k).normal(size=count) for k in numbers]),
+        reply_s=draw_reply_s(scenario, stream(seed, "reply latency"), count),
+        excess_m=excess,
+    )
+
+
+def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Floats:
+    """Draw reply latencies (count,) whose quantiles are those measured on boards (firmware wire format, 3.4).
+
+    Two modes near 304.1 and 305.9 us, a shoulder, and a tenth delayed by the board's reading of its USB buffer.
+    """
+    reply = scenario.ranging.reply
+    if reply.model == "fixed":
+        return np.full(count, reply.delay_us * 1e-6)
+    kind = rng.random(count)
+    microseconds = np.select(
+        [kind < 0.41, kind < 0.86, kind < 0.91],
+        [rng.normal(0.6, 0.3, count), rng.normal(2.4, 0.7, count), rng.normal(4.8, 0.7, count)],
+        rng.uniform(6.5, 83.0, count),
+    )
+    return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * 1e-6)
+
+
+def stamp(
+    scenario: Scenario,
+    protocol: RangingProtocol,
+    world: Links,
+    clocks: Clocks,
+    start: Ints,
+    initiator: Ints,
+    target: Ints,
+    draws: Draws,
+    response_delay_uus: int | None = None,
+) -> Stamped:
+    """Execute exchanges that start at true times `start` (n,) between tags given by their places.
+
+    `response_delay_uus` replaces the scenario's.
+    """
+    delay_uus = scenario.ranging.response_delay_uus if response_delay_uus is None else response_delay_uus
+    radio = scenario.radio
+    delays = np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9 * SUBTICKS_PER_SECOND
+    excess = draws.excess_m / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
+    result = Stamped({}, [], [], [])
+    ready = clocks.read(initiator, start)
+    for k, message in enumerate(protocol.messages):
+        sender, receiver = (initiator, target) if message.sender == "initiator" else (target, initiator)
+        if message.after:
+            reference = result.stamps[message.after]
+            printed = _transmission(message, reference, draws.reply_s, delay_uus)
+        else:
+            printed = _next_grid(-(-ready // SUBTICKS)) + ANTENNA_DELAY_TICKS
+        jitter = draws.transmit[k] * radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
+        left = np.rint(jitter - delays[sender, 0]).astype(np.int64) + printed * SUBTICKS
+        departure = clocks.when(sender, left)
+        link = world.link(initiator, target, departure)
+        power = link.power_dbm
+        flight = np.rint((link.distance_m + link.excess_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND + excess)
+        late_s = reception_bias_s(radio, power, link.total_dbm)
+        late_s = late_s + draws.receive[k] * reception_noise_s(radio, power)
+        arrival = departure + flight.astype(np.int64)
+        result.stamps[f"tx{k + 1}"] = printed
+        result.stamps[f"rx{k + 1}"] = reception(clocks, receiver, arrival, late_s, delays[receiver, 1])
+        result.departure.append(departure)
+        result.distance_m.append(link.distance_m)
+        result.power_dbm.append(power)
+    return result
+
+
+def reception(clocks: Clocks, receiver: Ints, arrival: Ints, late_s: Floats, delay_subticks: Floats) -> Ints:
+    """Return the stamps in whole ticks of frames that reach antennas at true times `arrival` (n,)."""
+    shift = np.rint(late_s * SUBTICKS_PER_SECOND + delay_subticks).astype(np.int64)
+    return (clocks.read(receiver, arrival) + shift + SUBTICKS // 2) // SUBTICKS
+
+
+def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, delay_uus: int) -> Ints:
+    """Return the printed transmit stamp of a message that waits for the stamp `reference`."""
+    if message.timing == "scheduled":
+        due = reference + delay_uus * UUS_TICKS
+        # The chip ignores the low nine bits of the time at which it is told to send.
+        return due // GRID * GRID + ANTENNA_DELAY_TICKS
+    latency = np.rint(reply_s / TICK_S).astype(np.int64)
+    return _next_grid(reference + latency - ANTENNA_DELAY_TICKS) + ANTENNA_DELAY_TICKS
+
+
+def _next_grid(ticks: Ints) -> Ints:
+    return -(-ticks // GRID) * GRID

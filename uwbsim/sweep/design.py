@@ -1,0 +1,228 @@
+"""What a sweep varies: a grid, a Latin hypercube or a list over any keys of a scenario, several seeds each."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from uwblink.twr import PROTOCOLS
+from uwbsim.errors import ScenarioError
+from uwbsim.random_streams import stream
+from uwbsim.scenario.loading import load
+
+KINDS: Final = ("compare", "calibrate")
+DESIGNS: Final = ("grid", "latin-hypercube", "list")
+KEYS: Final = ("name", "scenario", "kind", "protocols", "ranges", "seeds", "design", "samples")
+MOST_RUNS: Final = 10_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run: its number, the values of what varies, and the seed."""
+
+    number: int
+    values: dict[str, Any]
+    seed: int
+
+    def settings(self) -> list[str]:
+        """Return the values as `--set` would have them."""
+        return [f"{key}={toml_value(value)}" for key, value in self.values.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class SweepDesign:
+    """A sweep as its file has it, and where its runs come from: `axes` of a grid, or `rows` one by one."""
+
+    path: Path
+    name: str
+    scenario: Path
+    kind: str
+    protocols: tuple[str, ...]
+    ranges: int
+    seeds: tuple[int, ...]
+    axes: dict[str, list[Any]]
+    rows: list[dict[str, Any]] | None
+    fingerprint: str
+
+    @property
+    def points(self) -> int:
+        """Return how many combinations of values there are."""
+        return len(self.rows) if self.rows is not None else int(np.prod([len(v) for v in self.axes.values()]))
+
+    @property
+    def total(self) -> int:
+        """Return how many runs there are."""
+        return self.points * len(self.seeds)
+
+    def run(self, number: int) -> Run:
+        """Return a run by its number, 0 to `total` - 1; made when asked for, so that any number of runs fits."""
+        point, seed = divmod(number, len(self.seeds))
+        if self.rows is not None:
+            return Run(number, self.rows[point], self.seeds[seed])
+        places = np.unravel_index(point, [len(v) for v in self.axes.values()])
+        values = {key: listed[int(k)] for (key, listed), k in zip(self.axes.items(), places, strict=True)}
+        return Run(number, values, self.seeds[seed])
+
+
+def load_plan(path: Path) -> SweepDesign:
+    """Read a sweep; raises `ScenarioError` that says where, what, and the near key where one is misspelt."""
+    table, text = _parse(path)
+    unknown = sorted(set(table) - {"sweep", "vary", "list"})
+    if unknown:
+        raise ScenarioError(f"{path}: {unknown[0]}: unknown table; known are sweep, vary, list")
+    head = table.get("sweep")
+    if not isinstance(head, dict):
+        raise ScenarioError(f"{path}: sweep: missing table [sweep]")
+    _known_keys(path, head)
+    scenario = _scenario(path, head)
+    design = _word(path, head, "design", DESIGNS, "grid")
+    kind = _word(path, head, "kind", KINDS, "compare")
+    protocols = head.get("protocols", list(PROTOCOLS) if kind == "compare" else ["ds"])
+    named = isinstance(protocols, list) and all(isinstance(p, str) and p in PROTOCOLS for p in protocols)
+    if not named or not protocols:
+        raise ScenarioError(f"{path}: sweep.protocols: found {protocols!r}, allowed: {', '.join(PROTOCOLS)}")
+    vary, listed = table.get("vary", {}), table.get("list", [])
+    axes, rows = _points(path, head, design, vary, listed)
+    plan = SweepDesign(
+        path,
+        str(head.get("name", path.stem)),
+        scenario,
+        kind,
+        tuple(protocols),
+        _whole(path, head, "ranges", 100_000, 1, 10_000_000),
+        _seeds(path, head),
+        axes,
+        rows,
+        _fingerprint(text, scenario),
+    )
+    if plan.total > MOST_RUNS:
+        raise ScenarioError(f"{path}: {plan.total} runs are too many, at most {MOST_RUNS}")
+    _check_keys(plan)
+    return plan
+
+
+def toml_value(value: Any) -> str:
+    """Return a value as TOML has it."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{json.dumps(str(k))} = {toml_value(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps(value)
+
+
+def _parse(path: Path) -> tuple[dict[str, Any], str]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        return tomllib.loads(text), text
+    except FileNotFoundError as error:
+        raise ScenarioError(f"{path}: no such file") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{path}: not valid TOML: {error}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: cannot be read ({error})") from error
+
+
+def _known_keys(path: Path, head: Mapping[str, Any]) -> None:
+    import difflib
+
+    for key in head:
+        if key not in KEYS:
+            near = difflib.get_close_matches(key, KEYS, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(KEYS)}"
+            raise ScenarioError(f"{path}: sweep.{key}: unknown key; {hint}")
+
+
+def _scenario(path: Path, head: Mapping[str, Any]) -> Path:
+    name = head.get("scenario")
+    if not isinstance(name, str):
+        raise ScenarioError(f"{path}: sweep.scenario: missing, expected a scenario file, relative to this one")
+    return path.parent / name
+
+
+def _word(path: Path, head: Mapping[str, Any], key: str, allowed: Sequence[str], default: str) -> str:
+    value = head.get(key, default)
+    if value not in allowed:
+        raise ScenarioError(f"{path}: sweep.{key}: found {value!r}, allowed: {', '.join(allowed)}")
+    return str(value)
+
+
+def _whole(path: Path, head: Mapping[str, Any], key: str, default: int, low: int, high: int) -> int:
+    value = head.get(key, default)
+    if type(value) is not int or not low <= value <= high:
+        raise ScenarioError(f"{path}: sweep.{key}: found {value!r}, expected a whole number {low} to {high}")
+    return value
+
+
+def _seeds(path: Path, head: Mapping[str, Any]) -> tuple[int, ...]:
+    value = head.get("seeds", 1)
+    seeds = list(range(1, value + 1)) if type(value) is int and value <= MOST_RUNS else value
+    if not isinstance(seeds, list) or not seeds or not all(type(s) is int and s >= 0 for s in seeds):
+        raise ScenarioError(f"{path}: sweep.seeds: found {value!r}, expected a number of seeds or a list of them")
+    return tuple(seeds)
+
+
+def _points(
+    path: Path, head: Mapping[str, Any], design: str, vary: Any, listed: Any
+) -> tuple[dict[str, list[Any]], list[dict[str, Any]] | None]:
+    if design == "list":
+        if vary or not isinstance(listed, list) or not listed or not all(isinstance(r, dict) for r in listed):
+            raise ScenarioError(f"{path}: a list needs tables [[list]], and no [vary]")
+        return {}, listed
+    if listed:
+        raise ScenarioError(f'{path}: list: goes with design = "list"')
+    if not isinstance(vary, dict):
+        raise ScenarioError(f"{path}: vary: expected a table")
+    if design == "grid":
+        for key, values in vary.items():
+            if not isinstance(values, list) or not values:
+                raise ScenarioError(f"{path}: vary: {key}: found {values!r}, expected a list of values")
+        return vary, None
+    return {}, _hypercube(path, head, vary)
+
+
+def _hypercube(path: Path, head: Mapping[str, Any], vary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return points of which every axis has one in each of its equal parts, in an order of its own."""
+    samples = _whole(path, head, "samples", 16, 1, MOST_RUNS)
+    columns: dict[str, list[Any]] = {}
+    for key, span in vary.items():
+        if not isinstance(span, dict) or not {"low", "high"} <= set(span) <= {"low", "high", "scale", "whole"}:
+            raise ScenarioError(f'{path}: vary: {key}: expected {{ low = ..., high = ..., scale = "log" }}')
+        low, high, scale = span["low"], span["high"], span.get("scale", "linear")
+        numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in (low, high))
+        if not numbers or not low < high or scale not in ("linear", "log") or (scale == "log" and low <= 0):
+            raise ScenarioError(f"{path}: vary: {key}: expected low below high, both above zero where scale is log")
+        # A stream a key: another key more changes nothing in this one's values.
+        rng = stream(0, "latin hypercube", key)
+        share = (rng.permutation(samples) + rng.random(samples)) / samples
+        values = low * (high / low) ** share if scale == "log" else low + (high - low) * share
+        whole = span.get("whole", isinstance(low, int) and isinstance(high, int))
+        columns[key] = [round(v) if whole else float(v) for v in values.tolist()]
+    return [dict(zip(columns, point, strict=True)) for point in zip(*columns.values(), strict=True)] or [{}]
+
+
+def _fingerprint(text: str, scenario: Path) -> str:
+    """What a result depends on besides its number: the plan's text and the scenario's."""
+    try:
+        known = scenario.read_bytes()
+    except OSError as error:
+        raise ScenarioError(f"{scenario}: no such scenario file") from error
+    return hashlib.sha256(text.encode() + b"\0" + known).hexdigest()
+
+
+def _check_keys(plan: SweepDesign) -> None:
+    """Load the scenario with one value of each key, so that a key which is not there is found before anything runs."""
+    load(plan.scenario)
+    first = {key: listed[0] for key, listed in plan.axes.items()}
+    for key, value in (first or (plan.rows or [{}])[0]).items():
+        try:
+            load(plan.scenario, [f"{key}={toml_value(value)}"])
+        except ScenarioError as error:
+            if "unknown key" in str(error) or "nothing lies" in str(error) or "index" in str(error):
+                raise ScenarioError(f"{plan.path}: vary: {error}") from error

@@ -1,0 +1,181 @@
+"""Who does the work of a sweep: this process, all cores, or a Dask cluster that runs already."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any, Final, Protocol
+
+from uwbsim.errors import UwbsimError
+from uwbsim.sweep.task import Task, run_chunk
+
+Chunk = list[Task]
+Done = tuple[Chunk, list[tuple[int, list[dict[str, Any]]]] | None, float]
+"""A chunk, its rows by number (None: its worker died), and the seconds that it took."""
+
+CONNECT_S: Final = 10
+THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Workers(Protocol):
+    """Does chunks of runs, in whatever order; `size` of them at once."""
+
+    size: int
+
+    def submit(self, chunk: Chunk) -> None:
+        """Take on a chunk."""
+        ...
+
+    def finished(self) -> Sequence[Done]:
+        """Wait until something is done, and return all that is."""
+        ...
+
+    def close(self) -> None:
+        """Let the workers go, without waiting for what they do."""
+        ...
+
+
+class InProcess:
+    """This process."""
+
+    size = 1
+
+    def __init__(self) -> None:
+        """Have nothing to do."""
+        self._waiting: list[Chunk] = []
+
+    def submit(self, chunk: Chunk) -> None:
+        """Take on a chunk."""
+        self._waiting.append(chunk)
+
+    def finished(self) -> Sequence[Done]:
+        """Do one chunk."""
+        chunk = self._waiting.pop(0)
+        rows, seconds = run_chunk(chunk)
+        return [(chunk, rows, seconds)]
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class Processes:
+    """Processes of this machine; when one dies the pool is made anew, and its chunks come back as lost."""
+
+    def __init__(self, size: int) -> None:
+        """Start `size` processes."""
+        self.size = size
+        self._pool = self._new()
+        self._running: dict[Any, Chunk] = {}
+
+    def _new(self) -> Any:
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor
+
+        with _one_thread_each():
+            pool = ProcessPoolExecutor(self.size, multiprocessing.get_context("spawn"))
+            # Processes inherit the environment when they start, which they do at the first task.
+            list(pool.map(abs, range(self.size)))
+        return pool
+
+    def submit(self, chunk: Chunk) -> None:
+        """Take on a chunk."""
+        from concurrent.futures.process import BrokenProcessPool
+
+        try:
+            future = self._pool.submit(run_chunk, chunk)
+        except BrokenProcessPool:
+            self._pool = self._new()
+            future = self._pool.submit(run_chunk, chunk)
+        self._running[future] = chunk
+
+    def finished(self) -> Sequence[Done]:
+        """Wait for the first chunk that is done."""
+        from concurrent.futures import FIRST_COMPLETED, wait
+        from concurrent.futures.process import BrokenProcessPool
+
+        found: list[Done] = []
+        for future in wait(self._running, return_when=FIRST_COMPLETED).done:
+            chunk = self._running.pop(future)
+            try:
+                rows, seconds = future.result()
+                found.append((chunk, rows, seconds))
+            except BrokenProcessPool:
+                found.append((chunk, None, 0.0))
+        return found
+
+    def close(self) -> None:
+        """End the processes."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class Cluster:
+    """A Dask cluster by the address of its scheduler; `distributed` moves the work of a dead worker to another."""
+
+    def __init__(self, address: str) -> None:
+        """Connect; raises `UwbsimError` where nobody answers within ten seconds."""
+        try:
+            self._dask: Any = import_module("distributed")
+        except ImportError as error:
+            raise UwbsimError("--scheduler: needs the extra 'cluster': pip install 'uwbcal[cluster]'") from error
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        try:
+            self._client = self._dask.Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise UwbsimError(f"--scheduler: {address} does not answer within {CONNECT_S} s") from error
+        self.size = max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
+        self._running: dict[Any, Chunk] = {}
+
+    def submit(self, chunk: Chunk) -> None:
+        """Take on a chunk."""
+        self._running[self._client.submit(run_chunk, chunk, pure=False)] = chunk
+
+    def finished(self) -> Sequence[Done]:
+        """Wait for the first chunk that is done."""
+        found: list[Done] = []
+        with self._client.as_current():
+            ready = self._dask.wait(list(self._running), return_when="FIRST_COMPLETED").done
+        for future in ready:
+            chunk = self._running.pop(future)
+            try:
+                rows, seconds = future.result()
+                found.append((chunk, rows, seconds))
+            except self._dask.KilledWorker:
+                found.append((chunk, None, 0.0))
+            future.release()
+        return found
+
+    def close(self) -> None:
+        """Leave the cluster as it was."""
+        self._client.close()
+
+
+def workers_for(count: int | None, scheduler: str | None) -> Workers:
+    """Return the workers that were asked for: a cluster by address, or processes, or this one if one is enough."""
+    if scheduler:
+        return Cluster(scheduler)
+    size = count or _cores()
+    return InProcess() if size == 1 else Processes(size)
+
+
+def _cores() -> int:
+    """Return the cores that this process may use; not every system says, then all that there are."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Keep libraries of linear algebra from starting threads of their own in every process."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,165 @@
+"""Runs a sweep: hands out chunks, stores what comes back, and goes on where a killed one ended.
+
+A result depends on its run alone, so neither the number of workers nor their order changes a bit of it. At most a few
+chunks are out at a time and every result goes to the store at once, so memory does not grow with the number of runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import uwblink
+from uwbsim.errors import ScenarioError
+from uwbsim.output import check_folder
+from uwbsim.scenario.loading import load
+from uwbsim.sweep.design import SweepDesign
+from uwbsim.sweep.executors import Chunk, Workers, workers_for
+from uwbsim.sweep.results import Store, export
+from uwbsim.sweep.task import Task, failure
+
+STORE: Final = "results.duckdb"
+CHUNK_S: Final = 1.0
+"""How long a chunk should take: long beside the milliseconds of handing it out, short beside a patience."""
+
+LONGEST_CHUNK: Final = 512
+ATTEMPTS: Final = 3
+"""How often a run may take its worker down before it counts as failed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """How a sweep went: runs done now, of which failed, and runs whose results were there already."""
+
+    done: int
+    failed: int
+    skipped: int
+
+
+def run_sweep(
+    plan: SweepDesign,
+    folder: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    resume: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Summary:
+    """Run what is not done yet, and write results.csv and results.parquet in the order of the runs.
+
+    Raises `ScenarioError` where the folder holds another sweep's results, or the same one's without `resume`, and
+    `UwbsimError` where the scheduler does not answer; nothing is written then.
+    """
+    check_folder(folder)
+    _check(plan, folder, resume=resume)
+    team = workers_for(workers, scheduler)
+    try:
+        folder.mkdir(exist_ok=True)
+        path = folder / STORE
+        with Store.open(path) if Store.begun(path) else Store.create(path, _identity(plan)) as store:
+            known = store.done()
+            done, failed = _work(plan, store, team, known, progress)
+            export(store, folder / "results.csv", folder / "results.parquet")
+    finally:
+        team.close()
+    return Summary(done, failed, len(known))
+
+
+def _identity(plan: SweepDesign) -> dict[str, Any]:
+    return {"name": plan.name, "plan": plan.path.name, "fingerprint": plan.fingerprint, "uwbcal": uwblink.__version__}
+
+
+def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
+    path = folder / STORE
+    if not Store.begun(path):
+        if resume and not path.exists():
+            raise ScenarioError(f"--resume: {folder} holds no sweep to go on with")
+        if folder.is_dir() and any(item.name != STORE for item in folder.iterdir()):
+            raise ScenarioError(f"{folder}: holds other files; give an empty folder or a new one")
+        return
+    with Store.open(path) as store:
+        known = store.identity()
+    if known.get("plan") != plan.path.name:
+        raise ScenarioError(f"{folder}: holds the results of another sweep, {known.get('plan')}; give another folder")
+    if known.get("fingerprint") != plan.fingerprint:
+        raise ScenarioError(
+            f"{folder}: {plan.path.name} or its scenario has changed since its results were made; give another folder"
+        )
+    if known.get("uwbcal") != uwblink.__version__:
+        raise ScenarioError(
+            f"{folder}: its results are of uwbcal {known.get('uwbcal')}, this is {uwblink.__version__}; "
+            "give another folder"
+        )
+    if not resume:
+        raise ScenarioError(f"{folder}: holds results of this sweep; go on with --resume, or give another folder")
+
+
+def _work(
+    plan: SweepDesign, store: Store, team: Workers, known: set[int], progress: Callable[[float], None] | None
+) -> tuple[int, int]:
+    numbers = (number for number in range(plan.total) if number not in known)
+    # Work that was lost with its worker is done first, one run at a time, so that only a run that kills is to blame.
+    again: list[Chunk] = []
+    attempts: dict[int, int] = {}
+    out, done, failed, size, rest = 0, 0, 0, 1, True
+    while True:
+        while out < 2 * team.size and (again or rest):
+            chunk = again.pop() if again else [_task(plan, n) for n in _take(numbers, size)]
+            rest = rest and bool(chunk)
+            if chunk:
+                team.submit(chunk)
+                out += 1
+        if not out:
+            return done, failed
+        for chunk, rows, seconds in team.finished():
+            out -= 1
+            if rows is None:
+                rows = _lost(chunk, attempts, again)
+            else:
+                size = min(max(int(CHUNK_S * len(chunk) / max(seconds, 1e-6)), 1), LONGEST_CHUNK)
+            store.append(rows)
+            done += len(rows)
+            failed += sum(row["status"] == "failed" for _, some in rows for row in some[:1])
+            if progress:
+                progress((len(known) + done) / max(plan.total, 1))
+
+
+def _take(numbers: Iterator[int], count: int) -> list[int]:
+    return [number for _, number in zip(range(count), numbers, strict=False)]
+
+
+def _lost(chunk: Chunk, attempts: dict[int, int], again: list[Chunk]) -> list[tuple[int, list[dict[str, Any]]]]:
+    """Queue the runs of a lost chunk one by one; return the rows of those that were lost too often."""
+    rows = []
+    for task in chunk:
+        number = task["number"]
+        attempts[number] = attempts.get(number, 0) + 1
+        if attempts[number] >= ATTEMPTS:
+            rows.append((number, [failure(task, f"its worker died {ATTEMPTS} times")]))
+        else:
+            again.append([task])
+    return rows
+
+
+def _task(plan: SweepDesign, number: int) -> Task:
+    """Return a run as plain data; a scenario that cannot be is an error that travels with it."""
+    run = plan.run(number)
+    task: Task = {
+        "number": number,
+        "seed": run.seed,
+        "values": run.values,
+        "kind": plan.kind,
+        "protocols": list(plan.protocols),
+        "ranges": plan.ranges,
+        "name": plan.scenario.stem,
+        "scenario": "",
+        "error": "",
+    }
+    try:
+        task["scenario"] = load(plan.scenario, run.settings(), run.seed).model_dump_json()
+    except ScenarioError as error:
+        # Where the file lies is no part of a result.
+        task["error"] = str(error).removeprefix(f"{plan.scenario}: ")
+    return task

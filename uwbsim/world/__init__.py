@@ -1,0 +1,1 @@
+"""What is there: clocks, trajectories, propagation, radios."""

@@ -1,0 +1,162 @@
+"""Where bodies are: smooth trajectories, evaluated at many instants at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
+
+from uwbsim.scenario.motion import Figure, RandomFlight, Recorded, Static, Waypoints
+
+Floats = NDArray[np.float64]
+
+Draw = Callable[[str], np.random.Generator]
+"""Returns the random stream of a body for a purpose."""
+
+TILT_RAD: Final = 0.12
+"""Standard deviation of roll and pitch of a quadcopter in calm flight."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A body's path: `position` maps seconds (n,) to metres (n, 3), `angles` to yaw, pitch, roll.
+
+    Where `attitude` is given, it maps seconds to quaternions instead of `angles`.
+    """
+
+    position: Callable[[Floats], Floats]
+    angles: Callable[[Floats], Floats]
+    attitude: Callable[[Floats], Floats] | None = None
+
+    def position_m(self, time_s: Floats) -> Floats:
+        """Return r_iw_a, shape (n, 3), in the world frame (ENU)."""
+        return self.position(time_s)
+
+    def quaternion(self, time_s: Floats) -> Floats:
+        """Return the attitude (body to world) as quaternions x y z w, shape (n, 4)."""
+        if self.attitude is not None:
+            return self.attitude(time_s)
+        quaternions: Floats = Rotation.from_euler("ZYX", self.angles(time_s)).as_quat()
+        return quaternions
+
+    def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+        """Return where a point of the body is, shape (n, 3)."""
+        rotated = Rotation.from_quat(self.quaternion(time_s)).apply(np.array(lever_arm_m))
+        return np.asarray(self.position(time_s) + rotated)
+
+
+def sample(motion: RandomFlight | Waypoints | Figure | Static | Recorded, duration_s: float, draw: Draw) -> Trajectory:
+    """Make the trajectory of a body over [0, duration_s]; random ones draw from the streams that `draw` names.
+
+    A longer duration continues the same flight.
+    """
+    return _MAKERS[type(motion)](motion, duration_s, draw)
+
+
+def _static(motion: Static, _duration_s: float, _draw: Draw) -> Trajectory:
+    point = np.array(motion.position_m)
+    yaw = np.array([np.radians(motion.yaw_deg), 0.0, 0.0])
+    return Trajectory(
+        lambda t: np.broadcast_to(point, (len(t), 3)).copy(),
+        lambda t: np.broadcast_to(yaw, (len(t), 3)).copy(),
+    )
+
+
+def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory:
+    points = np.array(motion.points_m)
+    if motion.times_s is None:
+        return Trajectory(_straight(points, motion.speed_mps or 1.0, motion.acceleration_mps2), _level)
+    times = np.array(motion.times_s)
+    path = CubicSpline(times, points, bc_type="clamped")
+    # Before the first and after the last point the body hovers there.
+    return Trajectory(lambda t: np.asarray(path(np.clip(t, times[0], times[-1]))), _level)
+
+
+def _level(time_s: Floats) -> Floats:
+    return np.zeros((len(time_s), 3))
+
+
+def _straight(points: Floats, speed: float, acceleration: float) -> Callable[[Floats], Floats]:
+    """Straight legs from standstill to standstill: trapezoids of speed, triangles where a leg is short."""
+    legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    top = np.minimum(speed, np.sqrt(legs * acceleration))
+    ramp = top / acceleration
+    took = ramp + legs / top
+    begins = np.concatenate([[0.0], np.cumsum(took)])
+
+    def position(time_s: Floats) -> Floats:
+        time = np.clip(time_s, 0, begins[-1])
+        leg = np.clip(np.searchsorted(begins, time, side="right") - 1, 0, len(legs) - 1)
+        into, left = time - begins[leg], begins[leg + 1] - time
+        along = np.where(
+            into < ramp[leg],
+            0.5 * acceleration * into**2,
+            np.where(left < ramp[leg], legs[leg] - 0.5 * acceleration * left**2, top[leg] * (into - ramp[leg] / 2)),
+        )
+        share = along / legs[leg]
+        return np.asarray(points[leg] + share[:, None] * (points[leg + 1] - points[leg]))
+
+    return position
+
+
+def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
+    centre, radius = np.array(motion.centre_m), motion.radius_m
+
+    def position(time_s: Floats) -> Floats:
+        angle = 2 * np.pi * time_s / motion.period_s + np.radians(motion.phase_deg)
+        sideways = np.sin(2 * angle) / 2 if motion.shape == "eight" else np.sin(angle)
+        # A helix climbs and sinks once in five rounds, the others once a round.
+        slow = angle / 5 if motion.shape == "helix" else angle
+        height = 0.5 * motion.climb_m * np.sin(slow)
+        return np.asarray(centre + np.column_stack([radius * np.cos(angle), radius * sideways, height]))
+
+    def angles(time_s: Floats) -> Floats:
+        yaw = 2 * np.pi * motion.turns_per_period * time_s / motion.period_s
+        return np.column_stack([yaw, np.zeros((len(time_s), 2))])
+
+    return Trajectory(position, angles)
+
+
+def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
+    """A monotone cubic through recorded positions, and the shortest turns between recorded attitudes."""
+    times = np.array(motion.times_s)
+    path = PchipInterpolator(times, np.array(motion.positions_m))
+    turns = Slerp(times, Rotation.from_quat(np.array(motion.quaternions)))
+    return Trajectory(
+        lambda t: np.asarray(path(np.clip(t, times[0], times[-1]))),
+        _level,
+        lambda t: np.asarray(turns(np.clip(t, times[0], times[-1])).as_quat()),
+    )
+
+
+def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Trajectory:
+    lo, hi = np.array(motion.box_min_m), np.array(motion.box_max_m)
+    # Two random points of a box lie about 0.38 of its diagonal apart.
+    leg_s = 0.38 * float(np.linalg.norm(hi - lo)) / motion.speed_mps
+    # One control point a leg. A B-spline stays in the convex hull of its control points, hence in
+    # the box, and a cubic one has continuous acceleration.
+    count = int(np.ceil(duration_s / leg_s)) + 8
+    knots = (np.arange(count + 4) - 5) * leg_s
+    path = BSpline(knots, draw("position").uniform(lo, hi, (count, 3)), 3)
+    turns = draw("yaw")
+    yaw = turns.uniform(-np.pi, np.pi) + np.cumsum(turns.normal(0, 0.8, count))
+    angles = BSpline(knots, np.column_stack([yaw, draw("tilt").normal(0, TILT_RAD, (count, 2))]), 3)
+    # A little after the end, where the last exchange may still be under way, the body holds its place.
+    last_s = duration_s + leg_s
+    return Trajectory(
+        lambda t: np.asarray(path(np.minimum(t, last_s))), lambda t: np.asarray(angles(np.minimum(t, last_s)))
+    )
+
+
+_MAKERS: Final[dict[type, Callable[[Any, float, Draw], Trajectory]]] = {
+    Static: _static,
+    Waypoints: _waypoints,
+    RandomFlight: _random_flight,
+    Figure: _figure,
+    Recorded: _recorded,
+}
