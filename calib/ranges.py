@@ -11,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import UnanswerableError
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, delay_weights, intervals, raw_range
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +47,7 @@ class Ranges:
         """Return the number of ranges."""
         return len(self.time_ns)
 
-    def __getitem__(self, rows: NDArray[np.bool_] | Ints | slice) -> Ranges:
+    def __getitem__(self, rows: Bools | Ints | slice) -> Ranges:
         """Return the chosen rows, in their order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from uwblink.arrays import Floats, Ints
 
 TICKS_PER_SECOND: Final = 128 * 499_200_000
 TICK_S: Final = 1.0 / TICKS_PER_SECOND
@@ -31,7 +33,7 @@ UUS_TICKS: Final = 65_536
 """Ticks in one UWB microsecond (512/499.2 us), the unit of the boards' response delay."""
 
 
-def elapsed(later: ArrayLike, earlier: ArrayLike, bits: int = REPORT_BITS) -> NDArray[np.int64]:
+def elapsed(later: ArrayLike, earlier: ArrayLike, bits: int = REPORT_BITS) -> Ints:
     """Ticks from `earlier` to `later` on one counter of `bits` bits, in [0, 2**bits).
 
     The only place where stamps are subtracted: correct as long as less than one wrap lies between.
@@ -41,6 +43,6 @@ def elapsed(later: ArrayLike, earlier: ArrayLike, bits: int = REPORT_BITS) -> ND
     return np.asarray(difference & mask, dtype=np.int64)
 
 
-def seconds(ticks: ArrayLike) -> NDArray[np.float64]:
+def seconds(ticks: ArrayLike) -> Floats:
     """Device ticks as seconds of the clock that counted them."""
     return np.asarray(ticks, dtype=np.float64) * TICK_S

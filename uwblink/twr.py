@@ -14,10 +14,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import METRES_PER_TICK, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 Role = Literal["initiator", "target"]
 
 STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -56,7 +55,7 @@ class Exchanges:
         """Return the number of exchanges."""
         return len(self.time_ns)
 
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | Ints) -> Exchanges:
+    def __getitem__(self, rows: slice | Bools | Ints) -> Exchanges:
         """Return the chosen rows, in their order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
 
@@ -278,12 +277,12 @@ def truncate4(values: Floats) -> Floats:
     return np.trunc(scaled + np.copysign(1e-6, scaled)) / 1e4
 
 
-def _rows_by_protocol(exchanges: Exchanges) -> list[tuple[str, NDArray[np.bool_]]]:
+def _rows_by_protocol(exchanges: Exchanges) -> list[tuple[str, Bools]]:
     found = [(name, exchanges.protocol == name) for name in PROTOCOLS]
     return [(name, rows) for name, rows in found if rows.any()]
 
 
-def _pick(spans: Intervals, rows: NDArray[np.bool_]) -> Intervals:
+def _pick(spans: Intervals, rows: Bools) -> Intervals:
     if rows.all():
         return spans
     return Intervals(*(getattr(spans, field.name)[rows] for field in fields(Intervals)))

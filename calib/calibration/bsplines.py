@@ -7,10 +7,8 @@ a fit needs of it, without the quarter of a second that importing `scipy.interpo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from uwblink.arrays import Floats, Ints
 
 
 def nonzero(x: Floats, knots: Floats, degree: int) -> tuple[Ints, list[Floats]]:

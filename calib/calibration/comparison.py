@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.model import Calibration
 from calib.errors import UnanswerableError
+from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 SIGNIFICANT: Final = 0.05
@@ -86,7 +86,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     )
 
 
-def _covariance_ns2(calibration: Calibration, tags: list[int]) -> NDArray[np.float64]:
+def _covariance_ns2(calibration: Calibration, tags: list[int]) -> Floats:
     """Covariance of some tags' delays: as fitted where it is known, else from the standard errors alone."""
     found = np.diag([calibration.delays_std_ns.get(tag, 0.0) ** 2 for tag in tags])
     known = calibration.uncertainty

@@ -11,15 +11,13 @@ from pathlib import Path
 from typing import Any, Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.json_format import Matrix, Reader
 from calib.calibration.power_curves import LIFTS, Curve, basis, lifted_power
 from calib.errors import BadInputError
 from calib.ranges import Ranges
+from uwblink.arrays import Bools, Floats
 from uwblink.recording.file import check_output
-
-Floats = NDArray[np.float64]
 
 SCHEMA_VERSION: Final = 1
 GROUPED_VERSION: Final = 2
@@ -38,7 +36,7 @@ class CorrectedRanges:
     corrected_m: Floats
     sigma_m: Floats
     lifted: Floats
-    clamped: NDArray[np.bool_]
+    clamped: Bools
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.bsplines import combination, derivative, matrix
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from uwblink.arrays import Bools, Floats, Ints
 
 ALPHA_DBM: Final = -82.0
 DEGREE: Final = 3
@@ -67,7 +64,7 @@ class Curve:
         knots, coefficients = np.array(self.knots), np.array(self.coefficients)
         return combination(np.clip(lifted, *self.range), knots, coefficients, self.degree)
 
-    def inside(self, lifted: Floats) -> NDArray[np.bool_]:
+    def inside(self, lifted: Floats) -> Bools:
         """Return which lifted powers (n,) the curve was fitted at."""
         return (lifted >= self.range[0]) & (lifted <= self.range[1])
 

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.twr import Exchanges
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 PLAUSIBLE_M: Final = 1000.0
 

@@ -8,16 +8,12 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.doctor.base import Finding, RecordingView, spread_m
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.time_offset import find_offset
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MUCH_BETTER: Final = 0.6
 """A suspected fault was there when undoing it shrinks the spread below this share of what it was."""

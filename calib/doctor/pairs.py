@@ -6,15 +6,11 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.doctor.base import Finding, RecordingView, pair_ids
 from calib.estimation.robust import determined
 from uwblink.recording.summary import failures_by_pair
 from uwblink.twr import delay_weights
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 STATIC: Final = "static data"
 

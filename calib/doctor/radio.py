@@ -6,17 +6,14 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.doctor.base import Finding, RecordingView, pair_ids, spread_m
 from calib.estimation.confounding import explained_by_distance
 from calib.estimation.error_mixture import fit_error_mixture
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import intervals
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CONFOUNDED: Final = "power confounded with distance"
 
@@ -76,13 +73,13 @@ def moved_delay(view: RecordingView) -> Iterator[Finding]:
         )
 
 
-def _in_all_pairs(values: Floats, mine: NDArray[np.bool_], pair: Ints, time: Floats, cut: float, step: float) -> bool:
+def _in_all_pairs(values: Floats, mine: Bools, pair: Ints, time: Floats, cut: float, step: float) -> bool:
     """Return whether every pair of a tag shifts alike: an antenna does that to all, a wall only to some."""
     steps = [_step(values, mine & (pair == p), time, cut) for p in np.unique(pair[mine])]
     return all(0.4 < one / step < 1.6 for one in steps if one)
 
 
-def _step(values: Floats, rows: NDArray[np.bool_], time: Floats, cut: float) -> float:
+def _step(values: Floats, rows: Bools, time: Floats, cut: float) -> float:
     before, after = values[rows & (time < cut)], values[rows & (time >= cut)]
     return float(np.median(after) - np.median(before)) if len(before) > 50 and len(after) > 50 else 0.0
 

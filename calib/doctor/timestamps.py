@@ -7,14 +7,10 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.doctor.base import PLAUSIBLE_M, Finding, RecordingView, pair_ids, plausible_share
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import SINGLE_SIDED, board_range, intervals, raw_range
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 VACUUM_OVER_AIR: Final = 299_792_458.0 / 299_702_547.0
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from uwblink.arrays import Floats
 
 FEWEST: Final = 300
 ENOUGH: Final = 5000

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 import uwblink
 from calib.calibration.json_format import Matrix
@@ -27,11 +26,11 @@ from calib.estimation.sigma_curve import fit_sigma
 from calib.estimation.solver import MIXTURE, Solved, solve
 from calib.estimation.warnings import warnings_of
 from calib.ranges import Ranges
+from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 __all__ = ["MIXTURE", "FitResult", "fit"]
 
-Floats = NDArray[np.float64]
 
 INLIER_SIGMAS: Final = 3.0
 
@@ -42,7 +41,7 @@ class FitResult:
 
     calibration: Calibration
     residuals_m: Floats
-    inliers: NDArray[np.bool_]
+    inliers: Bools
     success: bool
     message: str
     warnings: list[str]
@@ -165,7 +164,7 @@ def _rows(matrix: Floats) -> Matrix:
 
 def _provenance(
     ranges: Ranges,
-    inliers: NDArray[np.bool_],
+    inliers: Bools,
     fixed: dict[int, float],
     sequential: bool,
     problem: Problem,

@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.estimation.error_mixture import ErrorMixture, e_step, fit_error_mixture
 from calib.estimation.robust import summed_squares
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from uwblink.arrays import Floats, Ints
 
 ROUNDS: Final = 20
 STEPS_A_ROUND: Final = 2

@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lift
 from calib.estimation.error_mixture import fit_error_mixture
+from uwblink.arrays import Floats
 from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import THIRD_FROM_TARGET
-
-Floats = NDArray[np.float64]
 
 FEWEST: Final = 50
 PLAUSIBLE_NS: Final = 100.0

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.power_curves import (
     BIAS_SEGMENTS,
@@ -23,9 +22,7 @@ from calib.calibration.power_curves import (
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.robust import design, determined, undetermined
 from calib.ranges import Ranges
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from uwblink.arrays import Floats, Ints
 
 FEWEST: Final = 100
 BLOCK_S: Final = 2.0

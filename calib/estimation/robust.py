@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import UnanswerableError
 from calib.ranges import Ranges
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 Loss = Callable[[Floats], tuple[Floats, Floats]]
 """Maps residuals over scale (n,) to IRLS weights rho' and to the slope of the score, both (n,)."""

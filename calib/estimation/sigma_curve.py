@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.power_curves import (
     DEGREE,
@@ -21,9 +20,7 @@ from calib.calibration.power_curves import (
 from calib.errors import UnanswerableError
 from calib.estimation.error_mixture import ErrorMixture, fit_error_mixture
 from calib.estimation.problem import Problem
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from uwblink.arrays import Floats, Ints
 
 FEWEST: Final = 20
 """Ranges of a combination of groups from which a standard deviation is estimated."""

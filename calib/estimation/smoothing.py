@@ -11,11 +11,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.estimation.robust import QuadraticModel
-
-Floats = NDArray[np.float64]
+from uwblink.arrays import Floats
 
 FIRST: Final = 1e-6
 """Where the iteration begins: the penalty's trace over the data's."""

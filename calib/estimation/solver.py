@@ -6,15 +6,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.estimation.mixture_fit import refine
 from calib.estimation.problem import Problem
 from calib.estimation.robust import quadratic_model, robust_fit, scale_of
 from calib.estimation.smoothing import reml_penalty
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from uwblink.arrays import Floats
 
 MIXTURE: Final = "mixture"
 """The loss that is no loss of residuals: the likelihood of `calib.estimation.mixture_fit`, begun from a Cauchy fit."""

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.model import Calibration
 from calib.errors import UnanswerableError
 from calib.ranges import Flight
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 FILTERS: Final = ("raw", "calibrated", "variance")
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
@@ -58,7 +55,7 @@ class Track:
     std_m: Floats
     nis: Floats
     nees: Floats
-    accepted: NDArray[np.bool_]
+    accepted: Bools
 
     @property
     def rmse_m(self) -> float:

@@ -6,13 +6,11 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.calibration.model import Calibration, CorrectedRanges
 from calib.ranges import Ranges
+from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
-
-Floats = NDArray[np.float64]
 
 CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}
 CHI_SQUARE_95: Final = 3.841458820694124
@@ -150,7 +148,7 @@ def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
     return np.asarray(spline(np.clip(lifted, knots[degree], knots[-1 - degree])))
 
 
-def pair_rows(ranges: Ranges) -> dict[str, NDArray[np.bool_]]:
+def pair_rows(ranges: Ranges) -> dict[str, Bools]:
     """Return which ranges belong to each pair of tags, whoever initiated."""
     low = np.minimum(ranges.initiator, ranges.target)
     high = np.maximum(ranges.initiator, ranges.target)
@@ -176,7 +174,7 @@ def statistics(error_m: Floats) -> Stats:
     )
 
 
-def _group(ranges: Ranges, applied: CorrectedRanges, rows: NDArray[np.bool_]) -> ErrorStatistics:
+def _group(ranges: Ranges, applied: CorrectedRanges, rows: Bools) -> ErrorStatistics:
     truth = ranges.truth_m[rows]
     errors = {name: getattr(applied, field)[rows] - truth for name, field in CORRECTION_STAGES.items()}
     z = np.abs(errors["full"]) / applied.sigma_m[rows]

@@ -7,14 +7,12 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from calib.calibration.model import Calibration, CorrectedRanges
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
 from calib.ranges import Ranges
+from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
-
-Floats = NDArray[np.float64]
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 COLOURS: Final = {"raw": "#D55E00", "delays": "#E69F00", "full": "#0072B2", "planted": "#009E73"}

@@ -6,13 +6,10 @@ from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from calib.calibration.model import CorrectedRanges
 from calib.ranges import Ranges
 from calib.report.figures import COLOURS, label
-
-Floats = NDArray[np.float64]
 
 SIZE: Final = (8.0, 3.6)
 REACH: Final = 6.0

@@ -16,16 +16,13 @@ from pathlib import Path
 from typing import Final, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import LEVELS, POSITIONS, STAMP_UNITS, TIME_UNITS, ColumnMap
 from uwblink.recording.file import Recording, check_output
 from uwblink.recording.schema import Tag
 from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, raw_range
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 REQUIRED: Final = ("time_s", "from_id", "to_id", *STAMPS[:4])
 LARGEST_ID: Final = 65_535
@@ -181,7 +178,7 @@ class _Table:
         ends = np.array([self._numbers(name) for name in POSITIONS])
         return np.asarray(np.sqrt(((ends[3:] - ends[:3]) ** 2).sum(axis=0)))
 
-    def _reject(self, name: str, bad: NDArray[np.bool_], expected: str) -> None:
+    def _reject(self, name: str, bad: Bools, expected: str) -> None:
         if not bad.any():
             return
         row = int(np.argmax(bad))

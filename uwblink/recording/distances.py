@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses, Tag
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def distances_m(poses: Poses, tags: list[Tag], initiator: Ints, target: Ints, time_ns: Ints) -> Floats:

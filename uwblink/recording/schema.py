@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink import __version__
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import ANTENNA_DELAY_TICKS, REPORT_BITS, SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import COLUMNS
 
@@ -76,10 +77,10 @@ class Poses:
     `quaternion` (n, 4), order x y z w, rotates body vectors into the world frame.
     """
 
-    time_ns: NDArray[np.int64]
+    time_ns: Ints
     body: NDArray[np.str_]
-    position_m: NDArray[np.float64]
-    quaternion: NDArray[np.float64]
+    position_m: Floats
+    quaternion: Floats
 
     def __len__(self) -> int:
         """Return the number of poses."""

@@ -10,15 +10,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges, raw_range
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 STEP_S: Final = 0.1
 PARABOLA_S: Final = 0.02

@@ -10,15 +10,12 @@ import re
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import REPORT_BITS, TICK_S, elapsed
 from uwblink.twr import STAMPS, Exchanges
 from uwblink.wire.codec import Decoder, Event
 from uwblink.wire.messages import REPORTS, RangeReport
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _ID: Final = rb"(?:25[0-5]|2[0-4][0-9]|1[0-9][0-9]|[1-9]?[0-9])"
 _STAMP: Final = rb"(?:0|[1-9][0-9]{0,9}+)"

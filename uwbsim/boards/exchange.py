@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT
 from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, RangingProtocol, board_range
 from uwblink.wire.messages import Overheard, OverheardNothing, RangeReport, TargetRangeReport
@@ -22,9 +22,6 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
 from uwbsim.world.world import World
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 MASK: Final = (1 << REPORT_BITS) - 1
 SINGLE_SIDED_DELAY_UUS: Final = 1500
@@ -178,7 +175,7 @@ class Radios:
 class _Receptions:
     """One frame at several listeners, shape (n,): whether it came, its stamp, and what is printed of it."""
 
-    heard: NDArray[np.bool_]
+    heard: Bools
     stamps: Ints
     power_dbm: Floats
     skew_ppm: Floats

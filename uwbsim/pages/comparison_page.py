@@ -6,9 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from uwblink.arrays import Floats
 from uwblink.twr import PROTOCOLS
 from uwbsim.pages import protocol_figures as figures
 from uwbsim.pages.scenario_figures import png
@@ -16,8 +14,6 @@ from uwbsim.pages.scenario_page import STYLE, figure_html
 from uwbsim.protocols.comparison import ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.scenario.model import Scenario
-
-Floats = NDArray[np.float64]
 
 TABLE_STYLE = """
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .85rem; }

@@ -8,12 +8,10 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwbsim.protocols.comparison import ErrorCurve
 from uwbsim.protocols.reply_delay import Optimum
-
-Floats = NDArray[np.float64]
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 PALETTE: Final = ("#D55E00", "#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")

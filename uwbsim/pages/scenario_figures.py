@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from uwblink.ticks import TICK_S
 from uwblink.twr import PROTOCOLS, RangingProtocol
@@ -19,8 +18,6 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.timestamps import Draws, Stamped, draw_reply_s, stamp
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.world import World
-
-Floats = NDArray[np.float64]
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 PALETTE: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A6D3B", "#000000")

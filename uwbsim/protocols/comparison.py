@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
 from uwblink.twr import PROTOCOLS, RangingProtocol
 from uwbsim.errors import ScenarioError
@@ -18,8 +18,6 @@ from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, exchange_air_s, frame_s, message_bytes
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.air import RECEIVER_ON_S, TURNAROUND_S
-
-Floats = NDArray[np.float64]
 
 MOST: Final = 50_000_000
 """Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import before_marker_s
@@ -17,8 +17,6 @@ from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.radio import reception_bias_s, reception_noise_s
 from uwbsim.world.world import World
-
-Floats = NDArray[np.float64]
 
 STATES: Final = 16_384
 """So many states of the world are sampled; it is also the length of the pieces that fit into a core's cache."""
@@ -69,7 +67,7 @@ class Conditions:
         """Return the distances of the states."""
         return self.flight * SPEED_OF_LIGHT
 
-    def __getitem__(self, rows: slice | NDArray[np.int64]) -> Conditions:
+    def __getitem__(self, rows: slice | Ints) -> Conditions:
         """Return the chosen states."""
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in COLUMNS}
         return replace(self, **columns)

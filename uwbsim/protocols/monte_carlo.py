@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Intervals, ProtocolMessage, RangingProtocol
 from uwbsim.protocols.conditions import STATES, Conditions
 from uwbsim.random_streams import stream
-
-Floats = NDArray[np.float64]
 
 METRES: Final = TICK_S * SPEED_OF_LIGHT
 SIDES: Final = ("initiator", "target")

@@ -12,13 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Intervals, RangingProtocol
 from uwbsim.protocols.conditions import Conditions
-
-Floats = NDArray[np.float64]
 
 METRES: Final = TICK_S * SPEED_OF_LIGHT
 STEP: Final = 16.0

@@ -6,15 +6,13 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwblink.twr import RangingProtocol
 from uwbsim.protocols.comparison import calibrated, costs
 from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.model import Scenario
-
-Floats = NDArray[np.float64]
 
 SHORTEST_S: Final = 287e-6
 """280 UWB microseconds, below which the boards miss the time to send (firmware wire format)."""

@@ -13,10 +13,9 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numpy as np
 import simpy
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwblink.twr import RangingProtocol
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
@@ -33,7 +32,7 @@ TURNAROUND_S: Final = 0.5e-3
 WEAK, COLLIDED, BUSY, FOREIGN, LATE = "below sensitivity", "collision", "receiver busy", "another's frame", "too late"
 
 Steps = Generator[simpy.Event, Any, None]
-Powers = Callable[[int, int], NDArray[np.float64]]
+Powers = Callable[[int, int], Floats]
 """Returns the power (dBm) at every tag from a sender, at a true time in sub-ticks."""
 
 

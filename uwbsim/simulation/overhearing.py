@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.arrays import Ints
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT
 from uwblink.twr import Exchanges, RangingProtocol
 from uwbsim.random_streams import stream
@@ -16,9 +17,6 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.impulse_response import impulse_response
 from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
 from uwbsim.world.world import World
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 MASK: Final = (1 << REPORT_BITS) - 1
 CARRIED: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.ticks import REPORT_BITS, UUS_TICKS
@@ -26,9 +27,6 @@ from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Cl
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm
 from uwbsim.world.world import World
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +169,7 @@ def _rules(scenario: Scenario) -> air.Rules:
     return air.Rules(radio.sensitivity_dbm, radio.capture_db, radio.preamble_symbols)
 
 
-def _heard(scenario: Scenario, power_dbm: Floats, messages: int) -> NDArray[np.bool_]:
+def _heard(scenario: Scenario, power_dbm: Floats, messages: int) -> Bools:
     """Whether each message (messages, n) is received; a little fading makes the edge soft."""
     fading = stream(scenario.run.seed, "fading").normal(size=(messages, len(power_dbm)))
     level = power_dbm + fading * scenario.radio.power_noise_db

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import (
     ANTENNA_DELAY_TICKS,
     DELAYED_TX_GRID,
@@ -25,9 +25,6 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.propagation import Link
 from uwbsim.world.radio import reception_bias_s, reception_noise_s
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 GRID: Final = DELAYED_TX_GRID
 

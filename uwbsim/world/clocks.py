@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import COUNTER_BITS, TICKS_PER_SECOND
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 SUBTICKS: Final = 1024
 SUBTICKS_PER_SECOND: Final = SUBTICKS * TICKS_PER_SECOND

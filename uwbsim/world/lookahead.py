@@ -9,16 +9,13 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from uwblink.arrays import Floats, Ints
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.propagation import Link
 from uwbsim.world.radio import gain_db
 from uwbsim.world.world import World
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 STEP_S: Final = 0.005
 STEPS: Final = 200

@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uwblink.arrays import Floats, Ints
 from uwbsim.scenario.radio import Obstacle, Room, Shadow
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +27,7 @@ class Link:
     power_dbm: Floats
     total_dbm: Floats
 
-    def __getitem__(self, rows: NDArray[np.int64]) -> Link:
+    def __getitem__(self, rows: Ints) -> Link:
         """Return the chosen segments."""
         return Link(self.distance_m[rows], self.excess_m[rows], self.power_dbm[rows], self.total_dbm[rows])
 

@@ -7,16 +7,13 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, RegularGridInterpolator
 
+from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
 from uwbsim.random_streams import stream
 from uwbsim.scenario.radio import AntennaTable, BiasTable, Radio, SigmaSpline, Spline
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 ALPHA_DBM: Final = -82.0
 FPP_OFFSET_DB: Final = 121.74

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
+from uwblink.arrays import Floats
 from uwbsim.scenario.motion import Figure, RandomFlight, Recorded, Static, Waypoints
-
-Floats = NDArray[np.float64]
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body for a purpose."""

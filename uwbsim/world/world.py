@@ -7,9 +7,9 @@ from functools import partial
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
@@ -19,9 +19,6 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.propagation import Link, ellipsoid_chord_m, first_path, reflected_lengths_m, through
 from uwbsim.world.radio import gain_db, path_gain_db, shadowing_phases
 from uwbsim.world.trajectories import Trajectory, sample
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 SEPARATION_STEP_S: Final = 0.05
 TRIES: Final = 60
@@ -141,7 +138,7 @@ class World:
         order = np.argsort(times, kind="stable")
         return Poses(times[order], names[order], position[order], quaternion[order])
 
-    def _gaps(self, name: str, time_ns: Ints) -> NDArray[np.bool_]:
+    def _gaps(self, name: str, time_ns: Ints) -> Bools:
         """Which poses of a body are seen."""
         mocap = self.scenario.mocap
         seen = np.ones(len(time_ns), dtype=bool)
