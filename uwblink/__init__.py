@@ -1,3 +1,42 @@
 """The language of DWM1000 ranging boards: device time, wire messages, formulas, recordings."""
 
+from typing import TYPE_CHECKING, Final
+
+from uwblink.lazy import offer
+
+if TYPE_CHECKING:
+    from uwblink.boards.board import Board
+    from uwblink.errors import UwblinkError
+    from uwblink.recording.file import Recording
+    from uwblink.recording.schema import Poses, Tag
+    from uwblink.ticks import SPEED_OF_LIGHT
+    from uwblink.twr import PROTOCOLS, Exchanges, raw_range
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "PROTOCOLS",
+    "SPEED_OF_LIGHT",
+    "Board",
+    "Exchanges",
+    "Poses",
+    "Recording",
+    "Tag",
+    "UwblinkError",
+    "raw_range",
+]
+
+_HOMES: Final = {
+    "PROTOCOLS": "uwblink.twr",
+    "SPEED_OF_LIGHT": "uwblink.ticks",
+    "Board": "uwblink.boards.board",
+    "Exchanges": "uwblink.twr",
+    "Poses": "uwblink.recording.schema",
+    "Recording": "uwblink.recording.file",
+    "Tag": "uwblink.recording.schema",
+    "UwblinkError": "uwblink.errors",
+    "raw_range": "uwblink.twr",
+}
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = offer(__name__, _HOMES)
