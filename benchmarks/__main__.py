@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -123,10 +124,10 @@ def loading(folder: Path) -> float:
 
     rng = np.random.default_rng(1)
     n = 1_000_000
-    columns = {name: rng.integers(0, 2**32, n) for name in COLUMNS}
-    for name in columns:
-        if name.endswith(("_m", "_dbm", "_ppm")):
-            columns[name] = rng.normal(size=n)
+    columns: dict[str, Any] = {
+        name: rng.normal(size=n) if name.endswith(("_m", "_dbm", "_ppm")) else rng.integers(0, 2**32, n)
+        for name in COLUMNS
+    }
     columns |= {name: rng.integers(1, 7, n) for name in ("initiator", "target", "reporter")}
     columns |= {"time_ns": np.arange(n, dtype=np.int64), "protocol": np.full(n, "ds")}
     path = folder / "million.uwb"

@@ -135,7 +135,7 @@ def driver_share() -> None:
         import select
 
         while True:
-            select.select([terminal.fileno], [], [])
+            select.select([terminal.fileno or 0], [], [])
             if terminal.read():
                 terminal.write(line)
     try:

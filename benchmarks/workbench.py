@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -160,7 +161,7 @@ def memory(seeds: str) -> str:
     return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}"
 
 
-MEASURES = {
+MEASURES: dict[str, Callable[..., str]] = {
     "plain": plain, "full": full, "means": means, "variances": variances, "sweep": sweep, "dask": dask,
     "memory": memory,
 }  # fmt: skip

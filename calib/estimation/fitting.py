@@ -47,7 +47,7 @@ class FitResult:
     warnings: list[str]
 
 
-def fit(
+def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its default
     ranges: Ranges,
     *,
     loss: str = "cauchy",

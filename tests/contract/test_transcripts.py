@@ -16,7 +16,8 @@ MS = 1_000_000
 
 def scripts():
     """Pieces of the transcript that start with fresh boards: lists of (ms, board, direction, bytes)."""
-    pieces, current = [], []
+    pieces: list[list[tuple[float, int, str, bytes]]] = []
+    current: list[tuple[float, int, str, bytes]] = []
     for text in FILE.read_text().splitlines():
         if text.startswith(("====", "--")):
             pieces.append(current)
@@ -41,7 +42,7 @@ def shape(data):
 def test_answers_have_the_firmware_s_shapes_order_and_timing(script):
     ports = VirtualPorts(bench_scenario(rx_noise_ps=100.0))
     bench = ports.bench
-    captured = {k: [] for k in sorted({line[1] for line in script} | {1, 2})}
+    captured: dict[int, list[tuple[float, bytes]]] = {k: [] for k in sorted({line[1] for line in script} | {1, 2})}
     for absent in set(bench.boards) - set(captured):
         bench.boards[absent].power_off()
     for ms, board, direction, data in script:

@@ -49,7 +49,7 @@ def overhear(
     return {name: column[order] for name, column in columns.items()}
 
 
-def _heard_by(
+def _heard_by(  # noqa: PLR0913 - the columns of one flight
     scenario: Scenario,
     protocol: RangingProtocol,
     world: World,

@@ -99,7 +99,7 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
     return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * 1e-6)
 
 
-def stamp(
+def stamp(  # noqa: PLR0913 - the columns of one flight
     scenario: Scenario,
     protocol: RangingProtocol,
     world: Links,

@@ -17,7 +17,8 @@ def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
 
 
 def test_the_parts_come_out():
-    m = fit_error_mixture(*mixed(), 2)
+    error, bins = mixed()
+    m = fit_error_mixture(error, bins, 2)
     # 40 000 errors know the centre to 0.5 mm and a sigma to 0.5 %; four times that are allowed.
     assert m.location_m == pytest.approx(0.03, abs=0.002)
     np.testing.assert_allclose(m.sigma_m, [0.06, 0.12], rtol=0.02)
@@ -26,14 +27,16 @@ def test_the_parts_come_out():
 
 
 def test_stray_values_are_told_from_the_tail():
-    m = fit_error_mixture(*mixed(outlier=0.03), 2)
+    error, bins = mixed(outlier=0.03)
+    m = fit_error_mixture(error, bins, 2)
     assert m.location_m == pytest.approx(0.03, abs=0.002)
     assert m.outlier_share == pytest.approx(0.03, abs=0.006)
     np.testing.assert_allclose(m.sigma_m, [0.06, 0.12], rtol=0.03)
 
 
 def test_clean_errors_are_all_core():
-    m = fit_error_mixture(*mixed(share=0.0), 2)
+    error, bins = mixed(share=0.0)
+    m = fit_error_mixture(error, bins, 2)
     assert m.location_m == pytest.approx(0.03, abs=0.003)
     assert m.tail_share * m.tail_mean_m < 0.003
     np.testing.assert_allclose(m.sigma_m, [0.06, 0.12], rtol=0.02)

@@ -12,7 +12,8 @@ from uwblink.ticks import SPEED_OF_LIGHT
 def corrections(result):
     """Fitted total correction minus the planted one, by pair of equal tags, over power."""
     c = result.calibration
-    grid = np.linspace(*c.bias_curve.range, 200)
+    low, high = c.bias_curve.range
+    grid = np.linspace(low, high, 200)
     common = np.mean([c.delays_ns[t] - d for t, d in DELAYS_NS.items()]) * 1e-9 * SPEED_OF_LIGHT
     return c.bias_curve(grid) - common - bias_m(grid)
 
@@ -76,13 +77,13 @@ def test_what_cannot_be_answered_says_why():
 
 
 def test_the_mixture_knows_delays_better_than_a_loss_does():
-    errors = {"cauchy": [], "mixture": []}
+    errors: dict[str, list[float]] = {"cauchy": [], "mixture": []}
     for seed in range(8):
         r = ranges(6000, tail=0.3, seed=seed)
         for loss, found in errors.items():
             c = fit(r, loss=loss).calibration
             shift = np.mean([c.delays_ns[t] - d for t, d in DELAYS_NS.items()])
-            found += [c.delays_ns[t] - shift - d for t, d in DELAYS_NS.items()]
+            found += [float(c.delays_ns[t] - shift - d) for t, d in DELAYS_NS.items()]
     spread = {loss: np.std(found) for loss, found in errors.items()}
     assert spread["mixture"] < 0.9 * spread["cauchy"]
 

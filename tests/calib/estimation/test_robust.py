@@ -22,9 +22,16 @@ def test_same_optimum_as_scipy(loss, scale_ns):
     found = robust_fit(matrix, aim, loss, scale_ns * METRES_A_NS)
     # Three restarts: the oracle stops at its own tolerance, and each start after that refines it.
     x = found.parameters + 0.02
+
+    def residual(d):
+        return aim - matrix @ d
+
+    def slope(_):
+        return -matrix
+
     for _ in range(3):
         x = least_squares(
-            lambda d: aim - matrix @ d, x, jac=lambda _: -matrix, loss=loss, f_scale=scale_ns * METRES_A_NS,
+            residual, x, jac=slope, loss=loss, f_scale=scale_ns * METRES_A_NS,
             xtol=1e-15, ftol=1e-15, gtol=1e-15,
         ).x  # fmt: skip
     assert found.success

@@ -75,7 +75,7 @@ def test_the_joint_fit_is_better_where_power_goes_with_the_pair():
     r = ranges(12_000, bias=lambda lifted: slope * lifted)
     low = (r.initiator == 1) | (r.target == 1)
     fpp = [np.where(low, power - 6, power) for power in (r.fpp1_dbm, r.fpp2_dbm)]
-    before, after = (lifted_power(*p, "mean-of-lifted", -82.0) for p in ((r.fpp1_dbm, r.fpp2_dbm), fpp))
+    before, after = (lifted_power(one, two, "mean-of-lifted", -82.0) for one, two in ((r.fpp1_dbm, r.fpp2_dbm), fpp))
     r = replace(r, fpp1_dbm=fpp[0], fpp2_dbm=fpp[1], raw_m=r.raw_m + slope * (after - before))
     wrong = {}
     for sequential in (False, True):
@@ -158,9 +158,12 @@ def test_the_band_holds_the_curve():
     inside = []
     for seed in range(12):
         c = fit(ranges(4000, seed=seed)).calibration
-        grid = np.linspace(*c.bias_curve.range, 50)
+        low, high = c.bias_curve.range
+        grid = np.linspace(low, high, 50)
         wrong = c.bias_curve(grid) - bias_m(grid)
-        inside.append(np.abs(wrong - wrong.mean()) < 1.96 * c.band(grid, "bias"))
+        band = c.band(grid, "bias")
+        assert band is not None
+        inside.append(np.abs(wrong - wrong.mean()) < 1.96 * band)
     # 600 points, of which some eight a curve are independent: 95 % to within 2 % either side, and the tail of
     # reflections that a Cauchy loss lets through takes a little more.
     assert np.mean(inside) > 0.88

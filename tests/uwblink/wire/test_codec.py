@@ -1,22 +1,17 @@
 """The codec against captured bytes, and against arbitrary ones."""
 
-import importlib.util
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.uwblink.wire import transcripts
 from uwblink.errors import FrameError
 from uwblink.twr import Exchanges, board_range, raw_range
 from uwblink.wire import messages as m
 from uwblink.wire.codec import Decoder, encode
-
-SPEC = importlib.util.spec_from_file_location("transcripts", Path(__file__).with_name("transcripts.py"))
-transcripts = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(transcripts)
 
 REPORTED = [data for _, data in transcripts.captured("->host")]
 COMMANDED = [data for _, data in transcripts.captured("<-host")]

@@ -44,7 +44,7 @@ def test_the_command_can_do_without_contention(tmp_path):
 
     found = []
     for option in ("--contention", "--no-contention"):
-        words = [Path(sys.executable).parent / "uwbsim", "run", SCENARIOS / "noiseless.toml", option]
+        words: list[str | Path] = [Path(sys.executable).parent / "uwbsim", "run", SCENARIOS / "noiseless.toml", option]
         words += ["-o", tmp_path / f"{option}.uwb", "--set", "run.duration_s=3", "--set", "ranging.rate_hz=100"]
         subprocess.run(words, check=True, capture_output=True)
         with Recording.open(tmp_path / f"{option}.uwb") as recording:

@@ -174,7 +174,12 @@ def test_a_dask_cluster_survives_the_death_of_a_worker(tmp_path):
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
     ) as cluster:
         victim = next(iter(cluster.workers.values())).pid
-        killer = threading.Thread(target=lambda: (done.wait(60), os.kill(victim, signal.SIGKILL)))
+
+        def kill():
+            done.wait(60)
+            os.kill(victim, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill)
         killer.start()
         summary = run_sweep(p, tmp_path / "out", scheduler=cluster.scheduler_address, progress=watch)
         killer.join()

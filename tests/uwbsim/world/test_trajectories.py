@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwbsim.random_streams import stream
-from uwbsim.scenario.model import RandomFlight, Static, Waypoints
+from uwbsim.scenario.motion import RandomFlight, Static, Waypoints
 from uwbsim.world.trajectories import sample
 
 
