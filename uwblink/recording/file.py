@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 HEADER_BYTES: Final = 3 * 4096
 BLOCK_BYTES: Final = 16_384
 """Smallest block of a DuckDB file; every larger one is a multiple of it."""
+
+ROWS_AT_A_TIME: Final = 100_000
+"""Rows that a copy holds in memory at once; of impulse responses, which are the largest, 0.2 GB."""
 
 
 class Recording:
@@ -212,6 +215,40 @@ class Recording:
                 self._db.execute("DELETE FROM tags")
                 self.append_tags(tags)
 
+    def copy(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        replacing: Mapping[str, Any] | None = None,
+        meta: Mapping[str, Any] | None = None,
+        force: bool = False,
+    ) -> None:
+        """Write this recording again at `path`: every row of every table, in its order, except what is replaced.
+
+        `replacing` maps names of `TABLES` to what stands there instead: what the method of that name returns
+        (`{"exchanges": corrected}`; an empty list empties a table of rows). `meta` adds entries, or replaces those
+        with the same keys. Raises what `create` raises, and `RecordingError` for a table that recordings do not have.
+        """
+        instead = dict(replacing or {})
+        _known_tables(instead)
+        entries = instead.pop("meta", None)
+        entries = self.meta() if entries is None else entries
+        with type(self).create(path, meta=entries | dict(meta or {}), force=force) as written:
+            for table in TABLES:
+                if table in instead:
+                    _APPENDERS[table](written, instead[table])
+                elif table != "meta":
+                    written._take(self, table)
+
+    def _take(self, source: Recording, table: str) -> None:
+        """Add all rows of another recording's table, missing values included, some at a time."""
+        names = ", ".join(f'"{name}"' for name in TABLES[table])
+        (last,) = source._read(f"SELECT max(rowid) AS last FROM {table}")["last"]  # noqa: S608 - a key of TABLES
+        for start in range(0, 0 if last is np.ma.masked else int(last) + 1, ROWS_AT_A_TIME):
+            piece = f"rowid >= {start} AND rowid < {start + ROWS_AT_A_TIME} ORDER BY rowid"
+            columns = source._read(f"SELECT {names} FROM {table} WHERE {piece}")  # noqa: S608 - keys of TABLES
+            self._insert(table, columns)
+
     def frames(self) -> list[tuple[int, str, str, bytes]]:
         """Return all raw bytes in order of time, as `append_frames` takes them."""
         r = self._read("SELECT * FROM frames ORDER BY time_ns, rowid")
@@ -234,8 +271,7 @@ class Recording:
 
     def count(self, table: str) -> int:
         """Return the number of rows of one of `TABLES`."""
-        if table not in TABLES:
-            raise RecordingError(f"no table {table!r} in a recording; there are {', '.join(TABLES)}")
+        _known_tables([table])
         return int(self._read(f"SELECT count(*) AS n FROM {table}")["n"][0])  # noqa: S608 - a key of TABLES
 
     def exchanges(self) -> Exchanges:
@@ -254,8 +290,12 @@ class Recording:
         return Exchanges(protocol=protocol, bits=int(bits), **columns)
 
     def overheard(self) -> dict[str, NDArray[Any]]:
-        """Return the passively heard exchanges as columns of the table `overheard`, in order of time."""
-        return self._read(f"SELECT {', '.join(TABLES['overheard'])} FROM overheard ORDER BY time_ns")  # noqa: S608
+        """Return the passively heard exchanges as columns of the table `overheard`, in order of time.
+
+        Integers are int64, everything else is float64: NaN where there was nothing.
+        """
+        rows = self._read(f"SELECT {', '.join(TABLES['overheard'])} FROM overheard ORDER BY time_ns")  # noqa: S608
+        return {name: _filled(column) for name, column in rows.items()}
 
     def poses(self) -> Poses:
         """Return all poses in order of time."""
@@ -274,12 +314,20 @@ class Recording:
         return [Fault(int(t), str(b), str(k), str(d)) for t, b, k, d in rows]
 
     def _insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
-        if not len(columns["time_ns"]):
+        """Add rows from columns; what is masked in them is missing in the table."""
+        if not len(next(iter(columns.values()))):
             return
-        batch = {name: np.ascontiguousarray(column) for name, column in columns.items()}
-        names = ", ".join(f'"{name}"' for name in TABLES[table])
+        batch: dict[str, NDArray[Any]] = {}
+        values = []
+        for name in TABLES[table]:
+            column = columns[name]
+            batch[name] = np.ascontiguousarray(np.ma.getdata(column))
+            values.append(f'"{name}"')
+            if np.ma.is_masked(column):
+                batch[f"no_{name}"] = np.ma.getmaskarray(column)
+                values[-1] = f'CASE WHEN "no_{name}" THEN NULL ELSE "{name}" END'
         self._db.register("batch", batch)
-        self._db.execute(f"INSERT INTO {table} SELECT {names} FROM batch")  # noqa: S608 - keys of TABLES
+        self._db.execute(f"INSERT INTO {table} SELECT {', '.join(values)} FROM batch")  # noqa: S608 - keys of TABLES
         self._db.unregister("batch")
 
     def _read(self, query: str) -> dict[str, NDArray[Any]]:
@@ -311,6 +359,23 @@ class Recording:
             missing = sorted(set(columns) - found.get(table, set()))
             if missing:
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
+
+
+_APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
+    "tags": Recording.append_tags,
+    "poses": Recording.append_poses,
+    "exchanges": Recording.append_exchanges,
+    "overheard": lambda recording, columns: recording.append_columns("overheard", columns),
+    "cirs": Recording.append_cirs,
+    "frames": Recording.append_frames,
+    "faults": Recording.append_faults,
+}
+
+
+def _known_tables(names: Iterable[str]) -> None:
+    for name in names:
+        if name not in TABLES:
+            raise RecordingError(f"no table {name!r} in a recording; there are {', '.join(TABLES)}")
 
 
 def check_output(path: Path, *, force: bool) -> None:

@@ -1,0 +1,113 @@
+"""A copy holds every row of every table, except what was put in its place."""
+
+from dataclasses import replace
+
+import duckdb
+import numpy as np
+import pytest
+
+from tests.uwblink.recording.test_file import random_exchanges
+from uwblink.errors import RecordingError, RecordingExistsError
+from uwblink.recording import file
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import TABLES, Fault, Poses, Tag
+
+HEARD = {name: 7.5 if kind == "DOUBLE" else 3 for name, kind in TABLES["overheard"].items()}
+CIRS = [(5, 1, 1, 2, 3.25, (0, 65535, 7)), (4, 1, 1, 2, 3.5, (1, 2, 3)), (6, 2, 2, 1, 0.0, ())]
+INSTEAD = {
+    "tags": [Tag(9, "z", (0.0, 0.0, 1.0))],
+    "poses": Poses(np.array([1]), np.array(["z"]), np.zeros((1, 3)), np.ones((1, 4))),
+    "exchanges": random_exchanges(3, seed=2),
+    "overheard": {name: np.array([value, value]) for name, value in HEARD.items()},
+    "cirs": CIRS[:1],
+    "frames": [(1, "1", "in", b"R01|1\r\n")],
+    "faults": [],
+}
+
+
+@pytest.fixture
+def full(tmp_path):
+    """A recording with rows in every table, not in order of time, and missing values where a stranger left them."""
+    path = tmp_path / "full.uwb"
+    with Recording.create(path, meta={"seed": 7, "planted": {"a": [1.5]}}) as r:
+        r.append_exchanges(random_exchanges())
+        r.append_tags([Tag(3, "b", (0.1, 0.2, 0.3)), Tag(1, "a", (0, 0, 0))])
+        r.append_poses(Poses(np.array([6, 5]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
+        r.append_overheard([HEARD, HEARD | {"time_ns": 1, "fpp3_dbm": np.nan, "skew3_ppm": np.nan}])
+        r.append_cirs(CIRS)
+        r.append_frames([(9, "1", "in", bytes(range(256))), (8, "2", "out", b"C01\r")])
+        r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "garbage", "é")])
+    with duckdb.connect(str(path)) as db:
+        db.execute("INSERT INTO exchanges (time_ns, initiator, target, protocol) VALUES (1, 2, 3, 'ds')")
+        db.execute("DELETE FROM exchanges WHERE rowid = 5")
+        db.execute("INSERT INTO cirs VALUES (9, 1, 1, 2, NULL, NULL)")
+        db.execute("INSERT INTO faults VALUES (9, NULL, 'power', NULL)")
+    return path
+
+
+def rows(path):
+    with duckdb.connect(str(path), read_only=True) as db:
+        # As text, so that NaN is not different from itself.
+        return {
+            table: [str(row) for row in db.execute(f"SELECT {', '.join(columns)} FROM {table}").fetchall()]
+            for table, columns in TABLES.items()
+        }
+
+
+@pytest.mark.parametrize("at_a_time", [1_000_000, 7])
+def test_a_copy_has_every_row_of_every_table(full, tmp_path, monkeypatch, at_a_time):
+    monkeypatch.setattr(file, "ROWS_AT_A_TIME", at_a_time)
+    with Recording.open(full) as source:
+        source.copy(tmp_path / "copy.uwb")
+    before, after = rows(full), rows(tmp_path / "copy.uwb")
+    before["meta"].sort(), after["meta"].sort()
+    assert all(before.values()), "the test needs rows in every table"
+    assert after == before
+
+
+@pytest.mark.parametrize("table", [name for name in TABLES if name != "meta"])
+def test_only_what_is_replaced_differs(full, tmp_path, table):
+    with Recording.open(full) as source:
+        source.copy(tmp_path / "copy.uwb", replacing={table: INSTEAD[table]})
+    expected, found = rows(full), rows(tmp_path / "copy.uwb")
+    assert found[table] != expected[table]
+    assert len(found.pop(table)) == len(INSTEAD[table]["time_ns"] if table == "overheard" else INSTEAD[table])
+    del expected[table]
+    assert found | {"meta": sorted(found["meta"])} == expected | {"meta": sorted(expected["meta"])}
+
+
+@pytest.mark.parametrize("table", ["exchanges", "overheard", "poses", "tags", "faults", "frames"])
+def test_what_a_recording_returns_can_replace(full, tmp_path, table):
+    with Recording.open(full) as source:
+        source.copy(tmp_path / "copy.uwb", replacing={table: getattr(source, table)()})
+    before, after = rows(full), rows(tmp_path / "copy.uwb")
+    assert len(before[table]) == len(after[table])
+
+
+def test_entries_of_meta_are_added_or_replaced(full, tmp_path):
+    with Recording.open(full) as source:
+        source.copy(tmp_path / "more.uwb", meta={"seed": 8, "calibration": {"x": 1}})
+        source.copy(tmp_path / "other.uwb", replacing={"meta": {"note": "bare"}})
+        before = source.meta()
+    with Recording.open(tmp_path / "more.uwb") as r:
+        assert r.meta() == before | {"seed": 8, "calibration": {"x": 1}}
+    with Recording.open(tmp_path / "other.uwb") as r:
+        assert r.meta()["note"] == "bare"
+        assert not {"seed", "planted"} & set(r.meta())
+
+
+def test_a_replaced_column_is_in_the_file(full, tmp_path):
+    with Recording.open(full) as source:
+        corrected = replace(source.exchanges(), range_m=np.arange(50.0))
+        source.copy(tmp_path / "copy.uwb", replacing={"exchanges": corrected})
+    with Recording.open(tmp_path / "copy.uwb") as r:
+        assert r.exchanges().range_m.tolist() == list(range(50))
+
+
+def test_mistakes_are_one_line_and_leave_nothing(full, tmp_path):
+    with Recording.open(full) as source:
+        with pytest.raises(RecordingError, match="no table 'ranges' in a recording; there are meta, tags"):
+            source.copy(tmp_path / "copy.uwb", replacing={"ranges": []})
+        with pytest.raises(RecordingExistsError):
+            source.copy(full)
+    assert [p.name for p in tmp_path.iterdir()] == ["full.uwb"]
