@@ -16,11 +16,12 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Final, Self, TypeVar
 
-from uwblink.boards.connection import ANSWER_S, FENCE, Dialogue
+from uwblink.boards.connection import ANSWER_S, FENCE, Connection
 from uwblink.boards.ports import SerialPort, Transport
 from uwblink.errors import BoardError, NoAnswerError, RefusedError
 from uwblink.wire.codec import Event
 from uwblink.wire.messages import (
+    Bootloader,
     Broadcast,
     Cir,
     DoTests,
@@ -40,16 +41,21 @@ CIR_S: Final = 0.2
 PROTOCOL_FLAGS: Final = {"ss": False, "ds": True}
 """The protocols of the boards, and their flag in C05."""
 
+ONCE: Final = (Broadcast, Bootloader)
+"""What is not said a second time when no answer came: it may have been done."""
+
 Reply = TypeVar("Reply", bound=Message)
 
 
 class Board:
     """One board. Not for use from several threads at once; one board a thread is fine."""
 
-    def __init__(self, transport: Transport, answer_s: float = ANSWER_S) -> None:
-        """Talk over an open transport; `open` is for a port by name."""
+    def __init__(
+        self, transport: Transport, *, answer_s: float = ANSWER_S, connection: Connection | None = None
+    ) -> None:
+        """Talk over an open transport, or go on with its `connection`; `open` is for a port by name."""
         self._transport = transport
-        self._dialogue = Dialogue(transport.name, answer_s)
+        self._connection = connection or Connection(transport.name, answer_s)
         self._reports: deque[Event] = deque(maxlen=KEPT_REPORTS)
         self._id: int | None = None
 
@@ -87,12 +93,19 @@ class Board:
     def request(self, command: Message) -> Message:
         """Send a command and return its reply.
 
-        Raises `RefusedError` (nothing was sent), `NoAnswerError`, `RangingFailedError` with the board's own line,
-        or `PortLostError`. Other reports that come meanwhile are kept for `reports`.
+        A board that does not answer is given a second to come back, and is then asked once more. Raises `RefusedError`
+        (nothing was sent), `NoAnswerError`, `RangingFailedError` with the board's own line, or `PortLostError`. Other
+        reports that come meanwhile are kept for `reports`.
         """
-        self._wait(self._dialogue.ready_s(self._transport.now_s()))
-        if self._dialogue.doubtful:
+        self._wait(self._connection.ready_s(self._transport.now_s()))
+        if self._connection.doubtful:
             self._exchange(FENCE)
+        try:
+            return self._exchange(command)
+        except NoAnswerError as error:
+            self._revive(error)
+            if isinstance(command, ONCE):
+                raise
         return self._exchange(command)
 
     def range(
@@ -144,6 +157,13 @@ class Board:
             if not self._listen(timeout_s):
                 return
 
+    def _revive(self, error: NoAnswerError) -> None:
+        """Ask a silent board once more, with patience: firmware that listens in vain is deaf for a while, not dead."""
+        try:
+            self._exchange(FENCE)
+        except NoAnswerError as still:
+            raise NoAnswerError(f"{error}; then {str(still).removeprefix(f'{self.name}: ')}") from still
+
     def _ask(self, command: Message, kind: type[Reply]) -> Reply:
         reply = self.request(command)
         if not isinstance(reply, kind):
@@ -151,14 +171,14 @@ class Board:
         return reply
 
     def _exchange(self, command: Message) -> Message:
-        transport, dialogue = self._transport, self._dialogue
-        transport.write(dialogue.send(command, transport.now_s()))
+        transport, connection = self._transport, self._connection
+        transport.write(connection.send(command, transport.now_s()))
         while True:
-            until_s = dialogue.deadline_s() or 0.0
+            until_s = connection.deadline_s() or 0.0
             data = transport.read(max(until_s - transport.now_s(), 0.0))
             now_s = transport.now_s()
-            events, outcome = dialogue.receive(data, now_s)
-            outcome = outcome or dialogue.expire(now_s)
+            events, outcome = connection.receive(data, now_s)
+            outcome = outcome or connection.expire(now_s)
             self._keep(events, outcome.reply if outcome else None)
             if outcome and outcome.error:
                 raise outcome.error
@@ -172,7 +192,7 @@ class Board:
         """Wait for the next report; False when none came in time."""
         until_s = self._transport.now_s() + timeout_s
         while (left_s := until_s - self._transport.now_s()) > 0:
-            events, _ = self._dialogue.receive(self._transport.read(left_s), self._transport.now_s())
+            events, _ = self._connection.receive(self._transport.read(left_s), self._transport.now_s())
             self._keep(events, None)
             if self._reports:
                 return True
@@ -181,5 +201,5 @@ class Board:
     def _wait(self, seconds: float) -> None:
         until_s = self._transport.now_s() + seconds
         while (left_s := until_s - self._transport.now_s()) > 0:
-            events, _ = self._dialogue.receive(self._transport.read(left_s), self._transport.now_s())
+            events, _ = self._connection.receive(self._transport.read(left_s), self._transport.now_s())
             self._keep(events, None)

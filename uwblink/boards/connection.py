@@ -30,11 +30,15 @@ from uwblink.wire.messages import (
 ANSWER_S: Final = 0.15
 """Longest wait for a reply: six failing tries take 50 ms, and the rest is USB and the host."""
 
+PATIENT_S: Final = 1.0
+"""How long a board that has not answered is given to answer a fence, before it is called dead."""
+
 QUIET_AFTER_CIR_S: Final = 0.030
 SHORTEST_SETTABLE_DELAY_UUS: Final = 280
 LONGEST_SETTABLE_DELAY_UUS: Final = 6500
 FAILURES: Final = ("COMMANDED TASK FAILED", "TWR FAIL", "ERROR: Requested to send message")
 HEARD_BYTES: Final = 60
+DEAD: Final = "is this a ranging board, and has it power? A board that hangs must be unplugged"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +54,12 @@ class CommandOutcome:
 class _Pending:
     command: Message
     until_s: float
+    answer_s: float
     lines: list[str]
     heard: bytes = b""
 
 
-class Dialogue:
+class Connection:
     """The conversation with the board at one port. Bytes and times go in, bytes, events and outcomes come out."""
 
     def __init__(self, name: str, answer_s: float = ANSWER_S) -> None:
@@ -91,7 +96,8 @@ class Dialogue:
         if self._pending:
             raise RefusedError(f"{self.name}: {self._pending.command.KEY.decode()} is still waiting for its answer")
         data = checked(command)
-        self._pending = _Pending(command, now_s + self._answer_s, [])
+        answer_s = max(PATIENT_S, self._answer_s) if command is FENCE and self._doubtful else self._answer_s
+        self._pending = _Pending(command, now_s + answer_s, answer_s, [])
         return data
 
     def receive(self, data: bytes, now_s: float) -> tuple[list[Event], CommandOutcome | None]:
@@ -117,9 +123,9 @@ class Dialogue:
         self._pending, self._doubtful = None, True
         heard = repr(pending.heard)[1:] if pending.heard else "nothing"
         sent = encode(pending.command)
-        text = f"{self.name}: no answer to {sent!r} within {self._answer_s * 1e3:.0f} ms; heard {heard}"
-        if not pending.heard:
-            text += "; is this a ranging board, and has it power? A board that hangs must be unplugged"
+        text = f"{self.name}: no answer to {sent!r} within {pending.answer_s * 1e3:.0f} ms; heard {heard}"
+        if not pending.heard and pending.answer_s >= PATIENT_S:
+            text += f"; {DEAD}"
         return CommandOutcome(pending.command, None, NoAnswerError(text))
 
     def settled(self) -> None:

@@ -9,7 +9,9 @@ import contextlib
 import errno
 import os
 import select
+import selectors
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -26,6 +28,8 @@ BAUD: Final = 19_200
 """Ignored by the boards, but a serial port wants one."""
 
 READ_BYTES: Final = 65_536
+POLL_S: Final = 0.002
+"""How often ports without a descriptor are asked."""
 
 
 class Transport(Protocol):
@@ -47,6 +51,34 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Give the port back."""
+        ...
+
+
+class Ports(Protocol):
+    """What a recorder needs of ports together; `uwbsim.VirtualPorts` are ones whose time is virtual."""
+
+    def open(self, name: str) -> Transport:
+        """Open a port and watch it; raises one of the `PortError`s."""
+        ...
+
+    def close(self, port: Transport) -> None:
+        """Close a port that was opened here."""
+        ...
+
+    def wait(self, timeout_s: float) -> Sequence[Transport]:
+        """Return ports at which bytes may be waiting, none when the time is over."""
+        ...
+
+    def now_s(self) -> float:
+        """Return a time that never goes back, in seconds; that of the ports."""
+        ...
+
+    def host_ns(self) -> int:
+        """Return the same time as nanoseconds since the Unix epoch."""
+        ...
+
+    def moved(self, name: str, number: str | None) -> str | None:
+        """Return what a port is called now whose device has the USB serial number `number`, None while it is away."""
         ...
 
 
@@ -142,6 +174,53 @@ class SerialPort:
     def _lost(self, error: Exception) -> PortLostError:
         reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
         return PortLostError(f"{self.name}: the port is gone ({reason}); plug the board in again")
+
+
+class SerialPorts:
+    """The serial ports of this computer."""
+
+    def __init__(self) -> None:
+        """Watch none yet."""
+        self._selector = selectors.SelectSelector()
+        self._pyserial: list[SerialPort] = []
+        # No change of the wall clock moves the times of a recording.
+        self._epoch_ns = time.time_ns() - time.monotonic_ns()
+
+    def open(self, name: str) -> SerialPort:
+        """Open a port and watch it; raises one of the `PortError`s."""
+        port = SerialPort(name)
+        if port.fileno is None:
+            self._pyserial.append(port)
+        else:
+            self._selector.register(port.fileno, selectors.EVENT_READ, port)
+        return port
+
+    def close(self, port: Transport) -> None:
+        """Close a port that was opened here."""
+        if isinstance(port, SerialPort) and port.fileno is not None:
+            self._selector.unregister(port.fileno)
+        self._pyserial = [p for p in self._pyserial if p is not port]
+        port.close()
+
+    def wait(self, timeout_s: float) -> Sequence[SerialPort]:
+        """Return ports at which bytes may be waiting; those without a descriptor must be asked again and again."""
+        if self._pyserial:
+            timeout_s = min(timeout_s, POLL_S)
+        return [key.data for key, _ in self._selector.select(max(timeout_s, 0.0))] + self._pyserial
+
+    def now_s(self) -> float:
+        """Return the monotonic clock in seconds."""
+        return time.monotonic()
+
+    def host_ns(self) -> int:
+        """Return host time in nanoseconds since the Unix epoch."""
+        return self._epoch_ns + time.monotonic_ns()
+
+    def moved(self, name: str, number: str | None) -> str | None:
+        """Return what a port is called now: the old name, or another of the board with this USB serial number."""
+        if "://" in name or os.path.exists(name):
+            return name
+        return next((p.device for p in boards_ports() if number and p.serial_number == number), None)
 
 
 def _opened(name: str) -> Any:

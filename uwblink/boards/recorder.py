@@ -1,4 +1,4 @@
-"""The recorder: plays a ranging plan on boards and writes everything that was said, by either side.
+"""The recorder: plays a ranging plan on boards and tells its listeners everything that was said, by either side.
 
 One loop waits for bytes from all ports and for the next turn of the plan; exchanges take turns, because two at once
 would collide on the air. A board that is unplugged leaves the others running and is taken back when it returns.
@@ -7,97 +7,35 @@ would collide on the air. A board that is unplugged leaves the others running an
 from __future__ import annotations
 
 import os
-import selectors
-import time
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from uwblink.boards.board import PROTOCOL_FLAGS, Board
-from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, CommandOutcome, Dialogue
-from uwblink.boards.ports import SerialPort, boards_ports, serial_number
+from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, CommandOutcome
+from uwblink.boards.listeners import Heard, Listener, Pair, Turn, as_listeners
+from uwblink.boards.ports import Ports, SerialPorts
+from uwblink.boards.progress import PairState, Progress
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.writer import Sink
+from uwblink.boards.station import Station
+from uwblink.boards.writer import RecordingWriter
 from uwblink.errors import BoardError, PlanError, PortError, PortLostError
 from uwblink.recording.file import Recording, check_output
 from uwblink.recording.schema import Fault, Tag
-from uwblink.wire.messages import (
-    Cir,
-    GetId,
-    IdReport,
-    Message,
-    Overheard,
-    RangeCommand,
-    RangeReport,
-    SetPassive,
-    Skipped,
-    TargetRangeReport,
-    TextLine,
-)
+from uwblink.wire.codec import Event
+from uwblink.wire.messages import IdReport, Message, RangeCommand, RangeReport, Skipped, TextLine
 
 LONGEST_WAIT_S: Final = 0.05
-REOPEN_S: Final = 0.2
-SILENT_PAUSE_S: Final = 1.0
+NOBODY_READY_S: Final = 0.005
+WATCH_EVERY_S: Final = 0.25
 MOST_FAULT_TEXT: Final = 200
+EXPECTED_TEXTS: Final = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
+"""Lines that every ranging brings; any other one is noted as a fault."""
 
 
-@dataclass(slots=True)
-class PairState:
-    """How a pair has done so far."""
-
-    tried: int = 0
-    good: int = 0
-    range_m: float = float("nan")
-    fpp_dbm: float = float("nan")
-    recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
-
-
-@dataclass(slots=True)
-class Progress:
-    """What a recorder has done so far, for whoever watches. Times in seconds since the start."""
-
-    time_s: float = 0.0
-    pairs: dict[tuple[int, int], PairState] = field(default_factory=dict)
-    faults: dict[str, int] = field(default_factory=dict)
-    last_fault: str = ""
-    boards: dict[int, str] = field(default_factory=dict)
-    overheard: int = 0
-    cirs: int = 0
-
-    @property
-    def exchanges(self) -> int:
-        """Exchanges that succeeded."""
-        return sum(p.good for p in self.pairs.values())
-
-    @property
-    def tried(self) -> int:
-        """Exchanges that were begun and ended."""
-        return sum(p.tried for p in self.pairs.values())
-
-
-@dataclass(slots=True)
-class _Station:
-    """A board's port, plugged in or not, and the conversation there."""
-
-    name: str
-    board: int
-    serial_number: str | None
-    dialogue: Dialogue
-    port: SerialPort | None = None
-    todo: deque[Message] = field(default_factory=deque)
-    retry_s: float = 0.0
-    pause_until_s: float = 0.0
-
-    @property
-    def idle(self) -> bool:
-        return self.port is not None and not self.dialogue.busy and not self.todo
-
-
-def record(
-    ports: list[str],
+def record(  # noqa: PLR0913 - the settings of a recording, by keyword
+    ports: Iterable[str],
     output: str | os.PathLike[str],
     plan: RangingPlan,
     *,
@@ -106,18 +44,37 @@ def record(
     force: bool = False,
     stop: Callable[[], bool] = lambda: False,
     watch: Callable[[Progress], None] | None = None,
+    listeners: Iterable[Listener | Callable[[Heard], object]] = (),
+    using: Ports | None = None,
 ) -> Progress:
     """Record from boards until `stop` says so or the time is over; returns what was done.
 
-    `ports` are names or pyserial URLs, `watch` is called a few times a second. `KeyboardInterrupt` ends a recording
-    like `stop`, with everything in the file. Raises the errors of `Board.open`, `PlanError` (a tag of the plan is
-    absent, two boards have one id), and `RecordingError` (cannot be written, disk full); the file stays readable.
+    `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are told what the file gets
+    (see `uwblink.boards.listeners`), and `using` are other ports than this computer's serial ones (`VirtualPorts`).
+    `KeyboardInterrupt` ends a recording like `stop`, with everything in the file. Raises the errors of `Board.open`,
+    `PlanError` (a tag of the plan is absent, two boards have one id, a duration that is none), and `RecordingError`
+    (cannot be written, disk full); the file stays readable.
     """
-    path = Path(output)
+    if not duration_s > 0:
+        raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
+    path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
     check_output(path, force=force)
-    found = identify(ports)
+    found = identify(ports, using)
     turns = plan.turns(sorted(found))
-    meta = {
+    with Recording.create(path, meta=_meta(found, plan, turns, passive), force=force, live=True) as recording:
+        seats = {tag.tag: tag for tag in plan.tags}
+        recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
+        with RecordingWriter(recording) as writer:
+            recorder = Recorder(found, plan, turns, [writer, *others], passive=passive, ports=using)
+            try:
+                recorder.run(duration_s, stop, watch)
+            finally:
+                recorder.close()
+    return recorder.progress
+
+
+def _meta(found: dict[int, str], plan: RangingPlan, turns: Iterable[Pair], passive: bool) -> dict[str, Any]:
+    return {
         "source": "boards",
         "ports": {str(board): name for board, name in sorted(found.items())},
         "plan": {
@@ -129,23 +86,18 @@ def record(
             "passive": passive,
         },
     }
-    with Recording.create(path, meta=meta, force=force, live=True) as recording:
-        seats = {tag.tag: tag for tag in plan.tags}
-        recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
-        recorder = Recorder(found, Sink(recording), plan, turns, passive=passive)
-        try:
-            recorder.run(duration_s, stop, watch)
-        finally:
-            recorder.close()
-    return recorder.progress
 
 
-def identify(ports: list[str]) -> dict[int, str]:
-    """Return which board is at each port; raises `PlanError` when two have one id."""
+def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]:
+    """Return which board is at each port; raises `PlanError` when two have one id, and what `Board.open` raises."""
+    using = ports or SerialPorts()
     found: dict[int, str] = {}
-    for name in ports:
-        with Board.open(name) as board:
-            number = board.id
+    for name in names:
+        port = using.open(name)
+        try:
+            number = Board(port).id
+        finally:
+            using.close(port)
         if number in found:
             raise PlanError(f"{found[number]} and {name} both say they are board {number}; ids must differ")
         found[number] = name
@@ -153,249 +105,207 @@ def identify(ports: list[str]) -> dict[int, str]:
 
 
 class Recorder:
-    """The loop of `record`."""
+    """The loop of `record`: `boards` maps ids to ports, `turns` are the pairs that take turns."""
 
     def __init__(
         self,
         boards: dict[int, str],
-        sink: Sink,
         plan: RangingPlan,
-        turns: tuple[tuple[int, int], ...],
+        turns: Iterable[Pair],
+        listeners: Iterable[Listener],
         *,
-        passive: bool,
+        passive: bool = False,
+        ports: Ports | None = None,
     ) -> None:
         """Open the ports of boards; raises `PortError`."""
-        self._sink, self._plan, self._turns, self._passive = sink, plan, turns, passive
-        self._selector = selectors.SelectSelector()
-        self._start_s, self._epoch_ns = time.monotonic(), time.time_ns()
+        self._ports = ports or SerialPorts()
+        self._plan, self._turns, self._passive = plan, tuple(turns), passive
+        self._start_s = self._ports.now_s()
         self._turn, self._next_s = 0, self._start_s
-        self._active: tuple[_Station, tuple[int, int]] | None = None
-        self.progress = Progress(pairs={pair: PairState() for pair in turns})
-        self._stations = {b: _Station(n, b, serial_number(n), Dialogue(n)) for b, n in boards.items()}
+        self._active: tuple[Station, Pair] | None = None
+        self.progress = Progress(self._ports.host_ns(), pairs={pair: PairState() for pair in self._turns})
+        self._listeners = [self.progress, *listeners]
+        self._stations: dict[int, Station] = {}
         try:
-            for station in self._stations.values():
-                self._connect(station)
-                if passive:
-                    station.todo.append(SetPassive(True))
+            for board, name in boards.items():
+                self._stations[board] = Station(board, name, self._ports, passive=passive)
         except PortError:
             self.close()
             raise
+        self._by_port = {id(s.port): s for s in self._stations.values()}
 
-    def run(self, duration_s: float, stop: Callable[[], bool], watch: Callable[[Progress], None] | None) -> None:
+    def run(
+        self,
+        duration_s: float = float("inf"),
+        stop: Callable[[], bool] = lambda: False,
+        watch: Callable[[Progress], None] | None = None,
+    ) -> None:
         """Play the plan until it is time to stop, then let the last exchange end."""
         end_s = self._start_s + duration_s
-        shown_s = self._start_s
+        watched_s = self._start_s
         try:
-            while (now_s := time.monotonic()) < end_s and not stop():
+            while (now_s := self._ports.now_s()) < end_s and not stop():
                 self._step(end_s)
-                if watch and now_s - shown_s > 0.25:
-                    shown_s = now_s
+                if watch and now_s - watched_s > WATCH_EVERY_S:
+                    watched_s = now_s
                     self.progress.time_s = now_s - self._start_s
                     watch(self.progress)
         except KeyboardInterrupt:
             pass
         self._turns = ()
         while self._active:
-            self._step(time.monotonic() + LONGEST_WAIT_S)
-        self.progress.time_s = time.monotonic() - self._start_s
+            self._step(self._ports.now_s() + LONGEST_WAIT_S)
+        self.progress.time_s = self._ports.now_s() - self._start_s
 
     def close(self) -> None:
-        """Stop the boards' listening, close the ports, and have everything written; raises `RecordingError`."""
+        """Stop the boards' listening and close the ports; the listeners are their owner's to close."""
         for station in self._stations.values():
-            if station.port is not None:
-                if self._passive:
-                    with suppress(BoardError, PortError):
-                        Board(station.port).set_passive(False)
-                station.port.close()
-        self._selector.close()
-        self._sink.close()
+            if station.port is None:
+                continue
+            if self._passive:
+                with suppress(BoardError, PortError):
+                    Board(station.port, connection=station.connection).set_passive(False)
+            with suppress(PortError):
+                self._ports.close(station.port)
 
     def _step(self, end_s: float) -> None:
         """Wait for what comes first, and deal with it."""
-        self._sink.check()
+        for listener in self._listeners:
+            listener.check()
         self._begin()
-        for key, _ in self._selector.select(self._wait_s(end_s)):
-            self._hear(key.data)
-        now_s = time.monotonic()
+        for port in self._ports.wait(self._wait_s(end_s)):
+            self._hear(self._by_port[id(port)])
+        now_s = self._ports.now_s()
         for station in self._stations.values():
-            if station.port is not None and station.port.fileno is None:
-                self._hear(station)
-            outcome = station.dialogue.expire(now_s) if station.port is not None else None
-            if outcome:
+            if station.port is None:
+                self._take_back(station, now_s)
+                continue
+            if outcome := station.connection.expire(now_s):
                 self._ended(station, outcome)
-            if station.port is None and now_s >= station.retry_s:
-                self._reconnect(station)
+            if damage := station.damage([], now_s):
+                self._fault(station, "garbage", damage)
 
     def _wait_s(self, end_s: float) -> float:
-        now_s = time.monotonic()
+        now_s = self._ports.now_s()
         ends = [now_s + LONGEST_WAIT_S, end_s]
         if self._active is None and self._turns:
             ends.append(self._next_s)
-        ends += [s.dialogue.deadline_s() or now_s + LONGEST_WAIT_S for s in self._stations.values()]
-        if any(s.port is not None and s.port.fileno is None for s in self._stations.values()):
-            ends.append(now_s + 0.002)
+        ends += [s.connection.deadline_s() or now_s + LONGEST_WAIT_S for s in self._stations.values()]
         return max(min(ends) - now_s, 0.0)
 
     def _begin(self) -> None:
         """Ask whoever has something to be asked: set-up first, then the next turn of the plan."""
-        now_s = time.monotonic()
         for station in self._stations.values():
-            if station.port is not None and station.todo and not station.dialogue.busy:
-                self._say(station, station.todo.popleft(), now_s)
+            if command := station.next_command():
+                self._say(station, command)
+        now_s = self._ports.now_s()
         if self._active or not self._turns or now_s < self._next_s:
             return
+        found = self._next_turn(now_s)
+        if found is None:
+            self._next_s = now_s + NOBODY_READY_S
+        elif found[0].connection.doubtful:
+            self._turn -= 1
+            self._say(found[0], FENCE)
+        else:
+            self._play(*found, now_s)
+
+    def _next_turn(self, now_s: float) -> tuple[Station, Pair] | None:
+        """Return the next pair of the plan that can range, passing over those of which a board is busy or away."""
         for _ in range(len(self._turns)):
             pair = self._turns[self._turn % len(self._turns)]
             self._turn += 1
-            station = self._stations[pair[0]]
-            can = station.idle and now_s >= station.pause_until_s and not station.dialogue.ready_s(now_s)
-            if can and self._stations[pair[1]].port is not None:
-                break
-        else:
-            self._next_s = now_s + 0.005
-            return
-        if station.dialogue.doubtful:
-            self._turn -= 1
-            self._say(station, FENCE, now_s)
-            return
-        period_s = 1 / self._plan.rate_hz if self._plan.rate_hz else 0.0
+            if self._stations[pair[0]].ready(now_s) and self._stations[pair[1]].port is not None:
+                return self._stations[pair[0]], pair
+        return None
+
+    def _play(self, station: Station, pair: Pair, now_s: float) -> None:
+        plan = self._plan
+        period_s = 1 / plan.rate_hz if plan.rate_hz else 0.0
         # A turn that comes late does not make the next ones come in a burst.
         self._next_s = max(self._next_s + period_s, now_s)
         self._active = station, pair
-        plan = self._plan
-        command = RangeCommand(pair[1], plan.target_reports, PROTOCOL_FLAGS[plan.protocol], plan.get_cir)
-        self._say(station, command, now_s)
+        self._say(station, RangeCommand(pair[1], plan.target_reports, PROTOCOL_FLAGS[plan.protocol], plan.get_cir))
 
-    def _say(self, station: _Station, command: Message, now_s: float) -> None:
-        data = station.dialogue.send(command, now_s)
-        self._sink.put(frames=(self._host_ns(), station.name, "out", data))
+    def _say(self, station: Station, command: Message) -> None:
+        data = station.connection.send(command, self._ports.now_s())
+        self._tell_bytes(station, "out", data)
         try:
             if station.port is not None:
                 station.port.write(data)
         except PortLostError as error:
             self._lost(station, error)
 
-    def _hear(self, station: _Station) -> None:
-        if station.port is None:
-            return
+    def _hear(self, station: Station) -> None:
         try:
-            data = station.port.read_ready()
+            data = station.read()
         except PortLostError as error:
             self._lost(station, error)
             return
         if not data:
             return
-        time_ns = self._host_ns()
-        self._sink.put(frames=(time_ns, station.name, "in", data))
-        events, outcome = station.dialogue.receive(data, time.monotonic())
+        time_ns, now_s = self._tell_bytes(station, "in", data), self._ports.now_s()
+        events, outcome = station.connection.receive(data, now_s)
+        if damage := station.damage(events, now_s):
+            self._fault(station, "garbage", damage)
         for event in events:
-            _KEEP.get(type(event), _ignore)(self, station, time_ns, event)
+            self._tell(station, time_ns, event)
         if outcome:
             self._ended(station, outcome)
 
-    def _keep_range(self, station: _Station, time_ns: int, report: RangeReport) -> None:
-        self._sink.put(exchanges=(time_ns, station.board, report))
+    def _tell_bytes(self, station: Station, direction: str, data: bytes) -> int:
+        time_ns = self._ports.host_ns()
+        for listener in self._listeners:
+            listener.on_bytes(time_ns, station.name, direction, data)
+        return time_ns
 
-    def _keep_overheard(self, station: _Station, time_ns: int, heard: Overheard) -> None:
-        self.progress.overheard += 1
-        self._sink.put(overheard=(time_ns, station.board, heard))
+    def _tell(self, station: Station, time_ns: int, event: Event) -> None:
+        if isinstance(event, Skipped):
+            return
+        if isinstance(event, TextLine) and not event.text.startswith(EXPECTED_TEXTS):
+            self._fault(station, "text", event.text.strip())
+        heard = Heard(time_ns, station.board, event)
+        for listener in self._listeners:
+            listener.on_message(heard)
 
-    def _keep_cir(self, station: _Station, time_ns: int, cir: Cir) -> None:
-        self.progress.cirs += 1
-        self._sink.put(cirs=(time_ns, station.board, cir))
-
-    def _keep_skipped(self, station: _Station, _time_ns: int, skipped: Skipped) -> None:
-        self._fault(station, "garbage", f"{len(skipped.data)} bytes: {skipped.data[:60]!r}")
-
-    def _keep_text(self, station: _Station, _time_ns: int, line: TextLine) -> None:
-        if not line.text.startswith(("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")):
-            self._fault(station, "text", line.text.strip())
-
-    def _ended(self, station: _Station, outcome: CommandOutcome) -> None:
-        now_s = time.monotonic()
+    def _ended(self, station: Station, outcome: CommandOutcome) -> None:
+        now_s = self._ports.now_s()
         if outcome.error:
             kind = "time-out" if isinstance(outcome.error, TimeoutError) else "failed exchange"
             self._fault(station, kind, str(outcome.error))
-            if kind == "time-out":
-                station.pause_until_s = now_s + (SILENT_PAUSE_S if outcome.command is FENCE else 0.0)
+            station.rest_after(outcome, now_s)
         if isinstance(outcome.reply, IdReport) and outcome.reply.board != station.board:
             self._fault(station, "wrong board", f"board {outcome.reply.board} where {station.board} was")
-            self._drop(station, now_s)
+            self._drop(station)
         if self._active and self._active[0] is station and isinstance(outcome.command, RangeCommand):
-            pair = self._active[1]
-            self._active = None
-            state = self.progress.pairs[pair]
-            state.tried += 1
-            if isinstance(outcome.reply, RangeReport):
-                state.good += 1
-                state.range_m, state.fpp_dbm = outcome.reply.range_m, outcome.reply.fpp1_dbm
-                state.recent_s.append(now_s - self._start_s)
+            self._end_turn(outcome.reply if isinstance(outcome.reply, RangeReport) else None)
             if self._plan.get_cir:
                 self._next_s = max(self._next_s, now_s + QUIET_AFTER_CIR_S)
 
-    def _lost(self, station: _Station, error: PortLostError) -> None:
-        self._fault(station, "unplugged", str(error))
-        self._drop(station, time.monotonic())
-        if self._active and self._active[0] is station:
-            self.progress.pairs[self._active[1]].tried += 1
-            self._active = None
-
-    def _drop(self, station: _Station, now_s: float) -> None:
-        port, station.port = station.port, None
-        if port is not None:
-            if port.fileno is not None:
-                self._selector.unregister(port.fileno)
-            port.close()
-        station.retry_s = now_s + REOPEN_S
-
-    def _connect(self, station: _Station) -> None:
-        station.port = SerialPort(station.name)
-        station.dialogue = Dialogue(station.name)
-        if station.port.fileno is not None:
-            self._selector.register(station.port.fileno, selectors.EVENT_READ, station)
-        self.progress.boards[station.board] = station.name
-
-    def _reconnect(self, station: _Station) -> None:
-        """Try to take a board back; its power was gone, so it must be told again what it was told before."""
-        station.retry_s = time.monotonic() + REOPEN_S
-        if "://" not in station.name and not os.path.exists(station.name):
-            back = [
-                p.device for p in boards_ports() if station.serial_number and p.serial_number == station.serial_number
-            ]
-            if not back:
-                return
-            station.name = back[0]
-        try:
-            self._connect(station)
-        except PortError:
+    def _end_turn(self, report: RangeReport | None) -> None:
+        if self._active is None:
             return
-        self._fault(station, "replugged", f"{station.name}: board {station.board} is back")
-        station.todo.clear()
-        station.todo.append(GetId())
-        if self._passive:
-            station.todo.append(SetPassive(True))
+        turn = Turn(self._ports.host_ns(), self._active[1], report)
+        self._active = None
+        for listener in self._listeners:
+            listener.on_turn(turn)
 
-    def _fault(self, station: _Station, kind: str, detail: str) -> None:
-        faults = self.progress.faults
-        faults[kind] = faults.get(kind, 0) + 1
-        self.progress.last_fault = f"{kind}: {detail}"[:MOST_FAULT_TEXT]
-        self._sink.put(faults=Fault(self._host_ns(), str(station.board), kind, detail[:MOST_FAULT_TEXT]))
+    def _lost(self, station: Station, error: PortLostError) -> None:
+        self._fault(station, "unplugged", str(error))
+        self._drop(station)
+        if self._active and self._active[0] is station:
+            self._end_turn(None)
 
-    def _host_ns(self) -> int:
-        """Host time in nanoseconds since the Unix epoch, which no change of the wall clock moves."""
-        return self._epoch_ns + round((time.monotonic() - self._start_s) * 1e9)
+    def _drop(self, station: Station) -> None:
+        self._by_port.pop(id(station.port), None)
+        station.unplug(self._ports.now_s())
 
+    def _take_back(self, station: Station, now_s: float) -> None:
+        if station.plug_again(now_s):
+            self._by_port[id(station.port)] = station
+            self._fault(station, "replugged", f"{station.name}: board {station.board} is back")
 
-def _ignore(_recorder: Recorder, _station: _Station, _time_ns: int, _event: Any) -> None:
-    """Replies that belong to no table are in the bytes."""
-
-
-_KEEP: Final[dict[type, Callable[[Recorder, _Station, int, Any], None]]] = {
-    RangeReport: Recorder._keep_range,
-    TargetRangeReport: Recorder._keep_range,
-    Overheard: Recorder._keep_overheard,
-    Cir: Recorder._keep_cir,
-    Skipped: Recorder._keep_skipped,
-    TextLine: Recorder._keep_text,
-}
-"""What becomes of each kind of event."""
+    def _fault(self, station: Station, kind: str, detail: str) -> None:
+        fault = Fault(self._ports.host_ns(), str(station.board), kind, detail[:MOST_FAULT_TEXT])
+        for listener in self._listeners:
+            listener.on_fault(fault)

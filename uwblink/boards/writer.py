@@ -1,4 +1,4 @@
-"""What a recorder has heard, on its way to the file: collected by the loop, written by a thread of its own.
+"""The file writer of a recorder: what was heard, collected by the loop, written by a thread of its own.
 
 The thread commits every `FLUSH_S`, so that a slow disk never makes the loop miss bytes, and nothing that was handed
 over is longer out of the file than that and the commit itself.
@@ -9,10 +9,12 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
-from typing import Final
+from types import TracebackType
+from typing import Final, Self
 
 import numpy as np
 
+from uwblink.boards.listeners import Heard, Listener
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault
@@ -37,6 +39,16 @@ class Batch:
         """Whether there is anything to write."""
         return bool(self.frames or self.exchanges or self.overheard or self.cirs or self.faults)
 
+    def add(self, heard: Heard) -> None:
+        """Put a message into the list of its table; what belongs to none is in the bytes."""
+        row = heard.time_ns, heard.board
+        if isinstance(heard.message, RangeReport):
+            self.exchanges.append((*row, heard.message))
+        elif isinstance(heard.message, Overheard):
+            self.overheard.append((*row, heard.message))
+        elif isinstance(heard.message, Cir):
+            self.cirs.append((*row, heard.message))
+
     def write(self, recording: Recording) -> None:
         """Append everything in one transaction; raises `RecordingError`."""
         with recording.transaction():
@@ -50,34 +62,66 @@ class Batch:
             recording.append_faults(self.faults)
 
 
-class Sink:
-    """Takes rows from the loop and has them written. Use as a context manager around the loop."""
+class RecordingWriter(Listener):
+    """A listener that writes a live recording. A context manager: leaving it writes what is left."""
 
     def __init__(self, recording: Recording) -> None:
-        """Begin writing to a live recording."""
+        """Begin writing."""
         self._recording = recording
         self._batch = Batch()
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._written_s = time.monotonic()
         self._error: RecordingError | None = None
-        self._thread = threading.Thread(target=self._work, name="uwblink sink", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
         self._thread.start()
 
-    def put(self, **rows: object) -> None:
-        """Hand over one row of each of the named lists of a `Batch`."""
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what is left; raises what `check` raises, unless something else is already on its way up."""
+        try:
+            self.close()
+        except RecordingError:
+            if kind is None:
+                raise
+
+    def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
+        """Keep bytes."""
         with self._lock:
-            for name, row in rows.items():
-                getattr(self._batch, name).append(row)
+            self._batch.frames.append((time_ns, port, direction, data))
+
+    def on_message(self, heard: Heard) -> None:
+        """Keep a message in the table of its kind."""
+        with self._lock:
+            self._batch.add(heard)
+
+    def on_fault(self, fault: Fault) -> None:
+        """Keep a fault."""
+        with self._lock:
+            self._batch.faults.append(fault)
+
+    @property
+    def waiting(self) -> int:
+        """How many pieces of bytes wait to be written."""
+        return len(self._batch.frames)
+
+    @property
+    def behind_s(self) -> float:
+        """How long ago the last commit ended, in seconds."""
+        return time.monotonic() - self._written_s
 
     def check(self) -> None:
         """Raise `RecordingError` when nothing can be written any more, or the disk cannot keep up."""
         if self._error:
             raise self._error
-        behind_s = time.monotonic() - self._written_s
-        if behind_s > LONGEST_BACKLOG_S:
+        if self.behind_s > LONGEST_BACKLOG_S:
             raise RecordingError(
-                f"{self._recording.path}: the disk is {behind_s:.0f} s behind; record to a faster one. "
+                f"{self._recording.path}: the disk is {self.behind_s:.0f} s behind; record to a faster one. "
                 "What was written before is kept"
             )
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from uwblink.boards.recorder import Progress
+    from uwblink.boards.progress import Progress
 
 LINE_EVERY_S = 2.0
 

@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from uwblink.boards.recorder import Progress
+    from uwblink.boards.progress import Progress
 
-RATE_WINDOW_S = 2.0
 _FAILED = re.compile(r"ranged with (\d+): message|ranging with (\d+) failed")
 
 
@@ -99,10 +98,9 @@ def progress_table(progress: Progress) -> Table:
     for name in ("pair", "rate (Hz)", "success", "range (m)", "FPP (dBm)"):
         table.add_column(name, justify="right")
     for (initiator, target), pair in progress.pairs.items():
-        recent = sum(t > progress.time_s - RATE_WINDOW_S for t in pair.recent_s)
         table.add_row(
             f"{initiator} -> {target}",
-            f"{recent / min(RATE_WINDOW_S, max(progress.time_s, 0.1)):.1f}",
+            f"{pair.rate_hz(progress.time_s):.1f}",
             f"{100 * pair.good / pair.tried:.0f} %" if pair.tried else "",
             f"{pair.range_m:.3f}" if pair.good else "",
             f"{pair.fpp_dbm:.1f}" if pair.good else "",

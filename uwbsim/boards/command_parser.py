@@ -9,57 +9,43 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import Any, Final
+
+from uwblink.wire.fields import BOOL, BROADCAST, BYTES, ID, INT, RAW_FLOAT, STAMP, TEXT, Kind
+from uwblink.wire.messages import COMMANDS, Message
 
 NO_KEY: Final = b"No next key character found."
 NO_END: Final = b"Failed to detect USB command terminator char! Trying my best"
 
-_NUMBER: Final = re.compile(rb"\s*([+-]?\d+)")
+_NUMBER: Final = re.compile(rb"\s*([+-]?)0*(\d+)")
+LARGEST: Final = 2**31 - 1
+MOST_DIGITS: Final = 11
 
 
 def atoi(text: bytes) -> int:
-    """Return the number at the start of a text, 0 where there is none, as C's function does, in 32 bits."""
+    """Return the number at the start of a text, 0 where there is none, as C's function does; a larger one saturates."""
     found = _NUMBER.match(text)
-    value = int(found[1]) if found else 0
-    return (value + 2**31) % 2**32 - 2**31
-
-
-def _number(text: bytes) -> int:
-    return atoi(text)
+    # Eleven digits are beyond the largest number already, and how many more there are does not matter.
+    return max(-LARGEST - 1, min(int(found[1] + found[2][:MOST_DIGITS]), LARGEST)) if found else 0
 
 
 def _flag(text: bytes) -> bool:
     return atoi(text) != 0
 
 
-def _string(text: bytes) -> bytes:
-    return text
-
-
-_UNTIL_BAR: Final[dict[str, Callable[[bytes], Any]]] = {"int": _number, "bool": _flag, "str": _string}
-
-FIELDS: Final[tuple[tuple[str, ...], ...]] = (
-    (),
-    (),
-    (),
-    ("int", "str", "bool", "float", "bytes"),
-    ("bool",),
-    ("int", "bool", "int", "bool"),
-    ("bytes",),
-    (),
-    ("int",),
-    (),
-)
-"""The kinds of the fields of C00 to C09."""
+_UNTIL_BAR: Final[dict[Kind, Callable[[bytes], Any]]] = {INT: atoi, ID: atoi, STAMP: atoi, BOOL: _flag, TEXT: bytes}
+_COUNTED: Final = (BYTES, BROADCAST)
+READABLE: Final = (*_UNTIL_BAR, *_COUNTED, RAW_FLOAT)
+"""The kinds of fields that a command can have."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command as the board understood it."""
+    """A command as the board understood it: which, and the values of its fields in their order."""
 
-    number: int
+    kind: type[Message]
     values: tuple[Any, ...]
 
 
@@ -82,12 +68,12 @@ class _Unended(Exception):  # noqa: N818 - a signal of the parser, not an error 
     pass
 
 
-def read(buffer: bytes) -> Reading:
-    """Take every command out of a buffer; the board executes only the last of them."""
+def read(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
+    """Take every command out of a buffer; the board executes only the last of them. `known` are the keys it knows."""
     commands: list[Command] = []
     while (at := buffer.find(b"C")) >= 0:
         try:
-            command, end = _command(buffer, at)
+            command, end = _command(buffer, at, known)
         except _Missing as missing:
             # What the firmware does next depends on link addresses; the boards seen survived with an empty buffer.
             return Reading(tuple(commands), (NO_KEY,) * missing.fields + (NO_END,), b"", alive=True)
@@ -98,35 +84,34 @@ def read(buffer: bytes) -> Reading:
     return Reading(tuple(commands), (), buffer, alive=True)
 
 
-def _command(buffer: bytes, at: int) -> tuple[Command, int]:
-    number = atoi(buffer[at + 1 : at + 3])
-    if not 0 <= number < len(FIELDS):
+def _command(buffer: bytes, at: int, known: Container[bytes]) -> tuple[Command, int]:
+    key = b"C%02d" % atoi(buffer[at + 1 : at + 3])
+    if key not in known or key not in COMMANDS:
         raise _Unended  # an index out of bounds in the firmware; a dead board is the mildest of its ends
-    values, at = [], at + 3
-    kinds = FIELDS[number]
-    for k, kind in enumerate(kinds):
+    kind, values, at = COMMANDS[key], [], at + 3
+    for k, field in enumerate(kind.FIELDS.values()):
         bar = buffer.find(b"|", at)
         if bar < 0:
-            raise _Missing(len(kinds) - k)
-        value, at = _value(kind, buffer, bar + 1)
+            raise _Missing(len(kind.FIELDS) - k)
+        value, at = _value(field, buffer, bar + 1)
         values.append(value)
     end = buffer.find(b"\r", at)
     if end < 0:
         raise _Unended
-    return Command(number, tuple(values)), end + 1
+    return Command(kind, tuple(values)), end + 1
 
 
-def _value(kind: str, buffer: bytes, at: int) -> tuple[Any, int]:
-    if kind == "float":
+def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
+    if field == RAW_FLOAT:
         raw = buffer[at : at + 4]
         if len(raw) < 4:
             raise _Unended
         return struct.unpack("<f", raw)[0], at + 4
-    if kind == "bytes":
+    if field in _COUNTED:
         length = int.from_bytes(buffer[at : at + 2], "little")
         if at + 2 + length > len(buffer):
             raise _Unended
         return buffer[at + 2 : at + 2 + length], at + 2 + length
     ends = [end for end in (buffer.find(b"|", at), buffer.find(b"\r", at)) if end >= 0]
     end = min(ends, default=len(buffer))
-    return _UNTIL_BAR[kind](buffer[at:end]), end
+    return _UNTIL_BAR[field](buffer[at:end]), end

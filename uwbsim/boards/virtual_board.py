@@ -15,21 +15,9 @@ from typing import Any, Final
 import simpy
 
 from uwblink.wire.codec import encode
-from uwblink.wire.fields import LONGEST_BROADCAST, write_printed
-from uwblink.wire.messages import (
-    BroadcastReceived,
-    BroadcastSent,
-    Cir,
-    EnteringBootloader,
-    IdleSet,
-    IdReport,
-    MaxFrameReport,
-    Message,
-    PassiveSet,
-    ResetDone,
-    ResponseDelaySet,
-)
+from uwblink.wire.messages import Cir, Message
 from uwbsim.boards import command_parser as firmware
+from uwbsim.boards.commands import ANSWER, EXECUTORS, Attempt
 from uwbsim.boards.exchange import ExchangeResult, Radios, as_target
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
@@ -47,9 +35,6 @@ POLL_PERIOD: Final = MS
 LONGEST_QUEUE: Final = 8
 LONGEST_BUFFER: Final = 8000
 
-ANSWER: Final = 195 * US
-"""From the poll of the USB buffer that found a command to its answer on the bus."""
-
 TO_POLL: Final = 330 * US
 """From that poll to the time stamp of the ranging poll: radio set-up and half a preamble."""
 
@@ -65,11 +50,9 @@ DEFAULT_DELAY_UUS: Final = 1500
 SHORTEST_WORKING_DELAY_UUS: Final = 265
 """Below this many the delayed transmission would start in the past (firmware wire format, 3.6)."""
 LONGEST_ACCEPTED_DELAY_UUS: Final = 32_767
-BOOTLOADER_AFTER: Final = 103 * MS
 
 FAILED: Final = b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n"
 OWN_ID: Final = b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n"
-TOO_LONG: Final = b"ERROR: Requested to send message over UWB that is too long."
 FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 WARNING_B: Final = b"WARNING 0xB: TWR message is firing an interrupt when it shouldn't be.\r\n"
 WARNING_C: Final = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
@@ -78,7 +61,6 @@ WARNINGS: Final = {2: (WARNING_C,), 3: (WARNING_B, WARNING_C)}
 """What a bystander prints of the frames after the poll, by the number of messages."""
 
 Steps = Generator[simpy.Event, Any, None]
-Attempt = Generator[simpy.Event, Any, bool]
 Listener = Callable[[int, int, bytes], None]
 """Called with time (ns), board and the bytes of one USB transfer."""
 
@@ -184,7 +166,7 @@ class VirtualBoard:
             if self.life != life or not self.alive:
                 return
             if len(self._packets) >= LONGEST_QUEUE:
-                self._say(FULL)
+                self.say(FULL)
                 return
             self._packets.append(piece)
             if not self._arrived.triggered:
@@ -192,7 +174,8 @@ class VirtualBoard:
 
         self.bench.env.timeout(delay).callbacks.append(receive)
 
-    def _say(self, data: bytes | Message, delay: int = 0) -> None:
+    def say(self, data: bytes | Message, delay: int = 0) -> None:
+        """Print something after a delay (ns)."""
         self.bench.later(delay, self, data if isinstance(data, bytes) else encode(data))
 
     def _until_next_poll(self) -> simpy.Event:
@@ -220,14 +203,14 @@ class VirtualBoard:
         self._buffer += b"".join(self._packets)
         self._packets.clear()
         if len(self._buffer) > LONGEST_BUFFER:
-            self._say(FULL)
+            self.say(FULL)
             self._buffer = self._buffer[:LONGEST_BUFFER]
-        reading = firmware.read(self._buffer)
+        reading = firmware.read(self._buffer, EXECUTORS)
         self._buffer = reading.rest
         for number, complaint in enumerate(reading.complaints):
             if number:
                 yield self.bench.env.timeout(MS)
-            self._say(complaint, 118 * US)
+            self.say(complaint, 118 * US)
         if not reading.alive:
             self.hang()
         if reading.commands:
@@ -236,13 +219,14 @@ class VirtualBoard:
 
     def _try(self) -> Steps:
         if self._task.tries > LAST_RETRY:
-            self._say(FAILED, ANSWER)
+            self.say(FAILED, ANSWER)
             self._task = _Task()
             return
         command = self._task.command
         assert command is not None  # noqa: S101 - _usb_task calls only with a command
         life = self.life
-        done = yield from _EXECUTE[command.number](self, *command.values)
+        answer = EXECUTORS[command.kind.KEY](self, *command.values)
+        done = yield from self.answer(answer) if isinstance(answer, Message | bytes) else answer
         if self.life != life:
             return
         if done:
@@ -250,52 +234,16 @@ class VirtualBoard:
         else:
             self._task.tries += 1
 
-    def _answer(self, message: Message | bytes) -> Attempt:
-        self._say(message, ANSWER)
+    def answer(self, reply: Message | bytes) -> Attempt:
+        """Print a reply, which takes the time it takes; the command is done."""
+        self.say(reply, ANSWER)
         yield self.bench.env.timeout(ANSWER)
         return True
 
-    def _set_idle(self) -> Attempt:
-        return self._answer(IdleSet())
-
-    def _get_id(self) -> Attempt:
-        return self._answer(IdReport(self.id))
-
-    def _reset(self) -> Attempt:
-        return self._answer(ResetDone())
-
-    def _do_tests(self, number: int, text: bytes, flag: bool, real: float, data: bytes) -> Attempt:
-        parts = (b"R03", b"0", b"%d" % number, text, b"%d" % flag, write_printed(real))
-        return self._answer(b"|".join(parts) + b"|" + len(data).to_bytes(2, "little") + data + b"\r\n")
-
-    def _set_passive(self, on: bool) -> Attempt:
-        self.passive = on
-        return self._answer(PassiveSet())
-
-    def _max_frame(self) -> Attempt:
-        return self._answer(MaxFrameReport(100))
-
-    def _set_delay(self, delay_uus: int) -> Attempt:
-        self.delay_uus = delay_uus % 65_536
-        return self._answer(ResponseDelaySet())
-
-    def _bootloader(self) -> Attempt:
-        yield from self._answer(EnteringBootloader())
-        yield self.bench.env.timeout(BOOTLOADER_AFTER)
-        self.power_off()
-        return True
-
-    def _broadcast(self, data: bytes) -> Attempt:
-        if len(data) > LONGEST_BROADCAST:
-            self._say(TOO_LONG, ANSWER)
-            yield self.bench.env.timeout(MS)
-            return False
-        yield self.bench.env.timeout(TO_POLL)
+    def send_to_all(self, message: Message) -> None:
+        """Have every other board in range print a message that came by air."""
         for other in self._in_range(self._others(), self.bench.subticks()):
-            other._say(BroadcastReceived(data), 230 * US)
-        yield self.bench.env.timeout(790 * US)
-        self._say(BroadcastSent())
-        return True
+            other.say(message, 230 * US)
 
     def _in_range(self, others: list[VirtualBoard], time: int) -> list[VirtualBoard]:
         tags = set(self.bench.radios.hearers(self.id, [other.id for other in others], time))
@@ -304,10 +252,10 @@ class VirtualBoard:
     def _others(self) -> list[VirtualBoard]:
         return [b for b in self.bench.boards.values() if b is not self and b.on_air]
 
-    def _range(self, target_id: int, target_reports: bool, double_sided: int, get_cir: bool) -> Attempt:
-        target_id %= 256
+    def range_with(self, target_id: int, target_reports: bool, double_sided: bool, get_cir: bool) -> Attempt:
+        """Range with another board."""
         if target_id == self.id:
-            return (yield from self._answer(OWN_ID))
+            return (yield from self.answer(OWN_ID))
         env, bench = self.bench.env, self.bench
         yield env.timeout(TO_POLL)
         start = bench.subticks()
@@ -330,7 +278,7 @@ class VirtualBoard:
             for other in self._in_range(others, start):
                 for delay, warning in list(zip(lasts[1:], WARNINGS[len(lasts)], strict=True))[: sent - 1]:
                     if not other.passive:
-                        other._say(warning, delay + TO_POLL)
+                        other.say(warning, delay + TO_POLL)
             yield env.timeout(lasts[min(sent, 2) - 1])
             return (yield from self._give_up())
         end = lasts[-1] + TO_REPORT
@@ -340,8 +288,8 @@ class VirtualBoard:
         if target.powered and target_reports:
             later = target._print_cir(self.id, target_id, TARGET_LATER, met.report.rx1) if get_cir else TARGET_LATER
             target.busy_until = int(env.now) + later
-            target._say(as_target(met.report, self.id), later)
-        self._say(met.report)
+            target.say(as_target(met.report, self.id), later)
+        self.say(met.report)
         if get_cir:
             last = met.report.rx3 or met.report.rx2
             echoes = bench.radios.echoes(target_id, self.id, met.departures[-1])
@@ -364,7 +312,7 @@ class VirtualBoard:
         for other in in_range:
             if not other.passive:
                 for delay, warning in zip(ends, warnings, strict=True):
-                    other._say(warning, delay)
+                    other.say(warning, delay)
         listeners = {other.id: other for other in in_range if other.passive}
         if not listeners:
             return
@@ -375,7 +323,7 @@ class VirtualBoard:
                 delay = end + (LISTENER_LATER if target_reports else LISTENER_AT_ONCE)
                 if get_cir:
                     delay = other._print_cir(self.id, met.report.neighbour, delay, None)
-                other._say(heard[tag], delay)
+                other.say(heard[tag], delay)
 
     def _print_cir(
         self, initiator: int, target: int, delay: int, stamp: int | None, echoes: list[Echo] | None = None
@@ -383,21 +331,6 @@ class VirtualBoard:
         """Print a channel impulse response, a piece a millisecond; returns when it is over."""
         index, taps = impulse_response(self._chance, stamp, echoes)
         for piece in in_transfers(encode(Cir(initiator, target, index, taps))):
-            self._say(piece, delay)
+            self.say(piece, delay)
             delay += MS + int(self._chance.integers(0, 120 * US))
         return delay
-
-
-_EXECUTE: Final[tuple[Callable[..., Attempt], ...]] = (
-    VirtualBoard._set_idle,
-    VirtualBoard._get_id,
-    VirtualBoard._reset,
-    VirtualBoard._do_tests,
-    VirtualBoard._set_passive,
-    VirtualBoard._range,
-    VirtualBoard._broadcast,
-    VirtualBoard._max_frame,
-    VirtualBoard._set_delay,
-    VirtualBoard._bootloader,
-)
-"""What C00 to C09 do."""

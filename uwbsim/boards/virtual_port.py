@@ -1,33 +1,89 @@
 """Virtual boards as ports of the driver, in virtual time: no wall clock, no pseudo-terminal, the same every run.
 
+For tests of one's own code: whatever takes a `uwblink.Board` or the ports of a recorder takes these.
+
 ```python
-ports = VirtualPorts(scenario)
-board = uwblink.boards.board.Board(ports.port(10))
-print(board.range(20).range_m)
+ports = uwbsim.VirtualPorts(scenario)
+print(uwblink.Board(ports.port(10)).range(20).range_m)
+uwblink.record(ports.names.values(), "flight.uwb", uwblink.RangingPlan(), duration_s=60.0, using=ports)
 ```
+
+The minute of the recording passes in the time that its computation takes.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+from uwblink.boards.ports import Transport
+from uwblink.errors import PortLostError, PortMissingError
 from uwbsim.boards.virtual_board import NS_PER_S, Bench
 from uwbsim.scenario.model import Scenario
 
 
 class VirtualPorts:
-    """The ports of a scenario's boards. Time passes only while somebody reads."""
+    """The ports of a scenario's boards. Time passes only while somebody reads or waits.
 
-    def __init__(self, scenario: Scenario, lost_share: float = 0.0) -> None:
-        """Power all boards at time zero."""
+    `names` are what `open` takes, by tag; `lost_share` of all frames on the air are lost besides the weak ones.
+    """
+
+    def __init__(self, scenario: Scenario, lost_share: float = 0.0, *, epoch_ns: int = 0) -> None:
+        """Power all boards at virtual time zero, which is `epoch_ns` in the host times of a recording."""
         self.bench = Bench(scenario, self._arrived, lost_share)
+        self._epoch_ns = epoch_ns
         self._ports: dict[int, VirtualPort] = {}
+        self._opened: list[VirtualPort] = []
+        self.names = {tag.id: f"virtual board {tag.id}" for tag in scenario.tags}
         self.transfers: list[tuple[int, int, bytes]] = []
         """Everything that boards sent: time (ns), board, bytes of one USB transfer."""
 
     def port(self, tag: int) -> VirtualPort:
-        """Return the port of a board, a `uwblink.boards.ports.Transport`."""
+        """Return the port of a board; raises `PortMissingError` where the scenario has no such tag."""
+        if tag not in self.names:
+            raise PortMissingError(f"no virtual board {tag}; the tags are {', '.join(map(str, self.names))}")
         return self._ports.setdefault(tag, VirtualPort(self, tag))
+
+    def open(self, name: str) -> VirtualPort:
+        """Return the port with one of `names`, empty; raises `PortMissingError` for another or an unplugged one."""
+        tag = next((tag for tag, known in self.names.items() if known == name), None)
+        if tag is None or not self.bench.boards[tag].powered:
+            raise PortMissingError(f"{name}: no such port; there are {', '.join(self.names.values())}")
+        port = self.port(tag)
+        port.waiting = b""
+        self._opened.append(port)
+        return port
+
+    def close(self, port: Transport) -> None:
+        """Close a port."""
+        port.close()
+        self._opened = [p for p in self._opened if p is not port]
+
+    def wait(self, timeout_s: float) -> Sequence[VirtualPort]:
+        """Let time pass until bytes wait at an open port, or the time is over; returns ports to read from."""
+        until_ns = self.now_ns() + math.ceil(timeout_s * NS_PER_S)
+        while not (ready := [p for p in self._opened if p.waiting or not self.bench.boards[p.tag].powered]):
+            if self.bench.next_ns() > until_ns:
+                self.bench.advance(until_ns)
+                break
+            self.bench.advance(int(self.bench.next_ns()) + 1)
+        return ready
+
+    def now_ns(self) -> int:
+        """Return the virtual time in nanoseconds."""
+        return int(self.bench.env.now)
+
+    def now_s(self) -> float:
+        """Return the virtual time in seconds."""
+        return self.now_ns() / NS_PER_S
+
+    def host_ns(self) -> int:
+        """Return the host time that belongs to the virtual time."""
+        return self._epoch_ns + self.now_ns()
+
+    def moved(self, name: str, number: str | None) -> str | None:
+        """Return the name of a port that is plugged in, None for another one."""
+        return name if any(known == name and self.bench.boards[t].powered for t, known in self.names.items()) else None
 
     def _arrived(self, time_ns: int, tag: int, data: bytes) -> None:
         self.transfers.append((time_ns, tag, data))
@@ -35,32 +91,39 @@ class VirtualPorts:
 
 
 class VirtualPort:
-    """One board's port."""
+    """One board's port, a `uwblink.boards.ports.Transport`."""
 
     def __init__(self, ports: VirtualPorts, tag: int) -> None:
         """Belong to a set of ports."""
-        self._bench, self._tag = ports.bench, tag
-        self.name = f"virtual board {tag}"
+        self._ports, self.tag = ports, tag
+        self.name = ports.names[tag]
         self.waiting = b""
 
     def read(self, timeout_s: float) -> bytes:
-        """Let time pass until something comes, or the time is over."""
-        until_ns = int(self._bench.env.now) + math.ceil(timeout_s * NS_PER_S)
-        while not self.waiting and self._bench.next_ns() <= until_ns:
-            self._bench.advance(int(self._bench.next_ns()) + 1)
+        """Let time pass until something comes, or the time is over; raises `PortLostError` at an unplugged board."""
+        bench = self._ports.bench
+        until_ns = self._ports.now_ns() + math.ceil(timeout_s * NS_PER_S)
+        while not self.waiting and bench.next_ns() <= until_ns:
+            bench.advance(int(bench.next_ns()) + 1)
         if not self.waiting:
-            self._bench.advance(until_ns)
+            self._check()
+            bench.advance(until_ns)
         data, self.waiting = self.waiting, b""
         return data
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the board."""
-        self._bench.boards[self._tag].write(data)
+        """Send bytes to the board; raises `PortLostError` at an unplugged one."""
+        self._check()
+        self._ports.bench.boards[self.tag].write(data)
 
     def now_s(self) -> float:
         """Return the virtual time in seconds."""
-        return int(self._bench.env.now) / NS_PER_S
+        return self._ports.now_s()
 
     def close(self) -> None:
         """Forget what was not read."""
         self.waiting = b""
+
+    def _check(self) -> None:
+        if not self._ports.bench.boards[self.tag].powered:
+            raise PortLostError(f"{self.name}: the port is gone (unplugged); plug the board in again")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from uwblink.boards.connection import FENCE, Dialogue
+from uwblink.boards.connection import FENCE, Connection
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
@@ -15,19 +15,19 @@ OTHER = REPORT.replace(b"R05|2|", b"R05|3|")
 
 
 def asked(command=None):
-    dialogue = Dialogue("port")
-    assert dialogue.send(command or m.RangeCommand(2), 0.0) == encode(command or m.RangeCommand(2))
-    return dialogue
+    connection = Connection("port")
+    assert connection.send(command or m.RangeCommand(2), 0.0) == encode(command or m.RangeCommand(2))
+    return connection
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_a_reply_in_any_pieces_ends_the_command(size):
-    dialogue, outcome = asked(), None
+    connection, outcome = asked(), None
     for k in range(0, len(REPORT), size):
         assert outcome is None
-        _, outcome = dialogue.receive(REPORT[k : k + size], 0.003)
+        _, outcome = connection.receive(REPORT[k : k + size], 0.003)
     assert outcome.reply.neighbour == 2
-    assert not dialogue.busy
+    assert not connection.busy
 
 
 def test_only_one_command_is_outstanding():
@@ -36,25 +36,25 @@ def test_only_one_command_is_outstanding():
 
 
 def test_lines_of_bystanders_and_other_reports_do_not_end_it():
-    dialogue = asked()
+    connection = asked()
     noise = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\nR01|7\r\nS06|\x02\x00hi\r\n"
-    events, outcome = dialogue.receive(noise, 0.001)
+    events, outcome = connection.receive(noise, 0.001)
     assert len(events) == 3
     assert outcome is None
-    assert dialogue.receive(REPORT, 0.003)[1].reply is not None
+    assert connection.receive(REPORT, 0.003)[1].reply is not None
 
 
 def test_a_report_of_another_target_is_late_and_not_taken():
-    dialogue = asked()
-    assert dialogue.receive(OTHER, 0.001)[1] is None
-    assert dialogue.late == 1
-    assert dialogue.receive(REPORT, 0.003)[1].reply.neighbour == 2
+    connection = asked()
+    assert connection.receive(OTHER, 0.001)[1] is None
+    assert connection.late == 1
+    assert connection.receive(REPORT, 0.003)[1].reply.neighbour == 2
 
 
 def test_a_single_sided_report_does_not_answer_a_double_sided_command():
     single = b"R05|2|3.8601|2795254324|1672694065|1771014196|2893576102|0|0|-87.6187|-88.0293|-3.5203|3.5054\r\n"
-    dialogue = asked()
-    assert dialogue.receive(single, 0.001)[1] is None
+    connection = asked()
+    assert connection.receive(single, 0.001)[1] is None
 
 
 def test_the_board_s_line_of_failure_is_quoted():
@@ -64,30 +64,30 @@ def test_the_board_s_line_of_failure_is_quoted():
 
 
 def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
-    dialogue = asked(m.GetId())
-    assert dialogue.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.001)[1] is None
-    assert dialogue.receive(b"R01|4\r\n", 0.002)[1].reply == m.IdReport(4)
+    connection = asked(m.GetId())
+    assert connection.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.001)[1] is None
+    assert connection.receive(b"R01|4\r\n", 0.002)[1].reply == m.IdReport(4)
 
 
 def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
-    dialogue = asked()
-    dialogue.receive(b"junk", 0.01)
-    assert dialogue.expire(0.1499) is None
-    outcome = dialogue.expire(0.15)
+    connection = asked()
+    connection.receive(b"junk", 0.01)
+    assert connection.expire(0.1499) is None
+    outcome = connection.expire(0.15)
     assert isinstance(outcome.error, NoAnswerError)
     assert "b'C05|2|0|1|0\\r'" in str(outcome.error)
     assert "'junk'" in str(outcome.error)
-    assert dialogue.doubtful
-    dialogue.send(FENCE, 0.2)
+    assert connection.doubtful
+    connection.send(FENCE, 0.2)
     # The late reply comes before the fence's and is nobody's.
-    events, outcome = dialogue.receive(b"\r\n" + REPORT + b"R00\r\n", 0.21)
+    events, outcome = connection.receive(b"\r\n" + REPORT + b"R00\r\n", 0.21)
     assert outcome.reply == m.IdleSet()
     assert any(isinstance(e, m.RangeReport) for e in events)
-    assert not dialogue.doubtful
+    assert not connection.doubtful
 
 
 def test_a_board_is_left_alone_after_an_impulse_response_was_asked_for():
-    dialogue = asked(m.RangeCommand(2, get_cir=True))
-    dialogue.receive(REPORT, 1.0)
-    assert dialogue.ready_s(1.0) == pytest.approx(0.030)
-    assert dialogue.ready_s(1.05) == 0
+    connection = asked(m.RangeCommand(2, get_cir=True))
+    connection.receive(REPORT, 1.0)
+    assert connection.ready_s(1.0) == pytest.approx(0.030)
+    assert connection.ready_s(1.05) == 0

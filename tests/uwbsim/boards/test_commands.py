@@ -1,0 +1,133 @@
+"""What boards read and do: C's numbers, floats that are none, and commands that a stranger adds."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import ClassVar
+
+import pytest
+
+from tests.boards import bench_scenario
+from uwblink.boards.board import Board
+from uwblink.wire import messages as m
+from uwblink.wire.fields import INT, PRINTED, TEXT
+from uwbsim.boards.command_parser import atoi, read
+from uwbsim.boards.commands import EXECUTORS, MS, register_command
+from uwbsim.boards.printing import printed_float
+from uwbsim.boards.virtual_port import VirtualPorts
+from uwbsim.errors import UwbsimError
+
+
+@dataclass(frozen=True, slots=True)
+class GetVoltage(m.Message):
+    """C10: ask for a supply voltage, times a factor."""
+
+    KEY: ClassVar = b"C10"
+    FIELDS: ClassVar = {"factor": INT, "name": TEXT}
+    factor: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Voltage(m.Message):
+    """R10: the answer."""
+
+    KEY: ClassVar = b"R10"
+    FIELDS: ClassVar = {"board": INT, "volts": PRINTED, "name": TEXT}
+    board: int
+    volts: float
+    name: str
+
+
+@pytest.fixture
+def voltage(monkeypatch):
+    """The new command in all three tables, taken out again afterwards."""
+    monkeypatch.setitem(m.COMMANDS, b"C10", GetVoltage)
+    monkeypatch.setitem(m.REPORTS, b"R10", Voltage)
+    monkeypatch.setitem(EXECUTORS, b"C10", EXECUTORS[b"C00"])
+
+
+def test_a_new_command_is_one_message_class_and_one_executor(voltage):
+    register_command(GetVoltage, lambda board, factor, name: Voltage(board.id, 3.25 * factor, name.decode()))
+    ports = VirtualPorts(bench_scenario())
+    assert Board(ports.port(2)).request(GetVoltage(2, "core")) == Voltage(2, 6.5, "core")
+    assert Board(ports.port(1)).request(m.GetId()) == m.IdReport(1)
+
+
+def test_an_executor_may_take_its_time_and_may_fail(voltage):
+    def slowly(board, factor, name):
+        tries.append(int(board.bench.env.now))
+        yield board.bench.env.timeout(3 * MS)
+        if len(tries) <= factor:
+            return False
+        yield from board.answer(Voltage(board.id, 1.0, name.decode()))
+        return True
+
+    register_command(GetVoltage, slowly)
+    board = Board(VirtualPorts(bench_scenario()).port(1))
+    tries: list[int] = []
+    assert board.request(GetVoltage(2, "slow")) == Voltage(1, 1.0, "slow")
+    # Tried at the polls of the USB buffer, one each millisecond.
+    assert [(b - a) / MS for a, b in pairwise(tries)] == [4.0, 4.0]
+    tries.clear()
+    assert board.request(GetVoltage(5, "last")) == Voltage(1, 1.0, "last")
+
+
+def test_commands_that_cannot_be_registered():
+    with pytest.raises(UwbsimError, match="GetVoltage: not a command that uwblink knows"):
+        register_command(GetVoltage, lambda board: m.IdleSet())
+
+
+def test_fields_that_boards_cannot_read_are_refused(monkeypatch):
+    monkeypatch.setitem(m.COMMANDS, b"R10", Voltage)
+    with pytest.raises(UwbsimError, match=r"Voltage\.volts: boards read no printed number from the host; they read"):
+        register_command(Voltage, lambda board: m.IdleSet())
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        (b"12", 12),
+        (b" -7x", -7),
+        (b"+0003", 3),
+        (b"maybe", 0),
+        (b"", 0),
+        (b"2147483648", 2**31 - 1),
+        (b"-99999999999999999999", -(2**31)),
+        (b"9" * 6000, 2**31 - 1),
+        (b"0" * 6000 + b"5", 5),
+    ],
+)
+def test_numbers_are_read_as_c_reads_them(text, number):
+    assert atoi(text) == number
+
+
+def test_the_last_command_of_a_buffer_keeps_its_values():
+    reading = read(b"C01\rC05|258|1|2|0|more\rjunk")
+    assert [c.kind for c in reading.commands] == [m.GetId, m.RangeCommand]
+    assert reading.commands[1].values == (258, True, True, False)
+    assert (reading.rest, reading.alive) == (b"junk", True)
+
+
+@pytest.mark.parametrize(
+    ("value", "printed"),
+    [
+        (float("nan"), b"0.0000"),
+        (float("inf"), b"2147483647.0000"),
+        (-float("inf"), b"-2147483648.0000"),
+        (3e38, b"2147483647.0000"),
+        (1e10, b"2147483647.0000"),
+        (1.25, b"1.2500"),
+        (-0.00001, b"-0.0000"),
+    ],
+)
+def test_floats_that_are_none_are_printed_as_the_processor_prints_them(value, printed):
+    assert printed_float(value) == printed
+
+
+@pytest.mark.parametrize("raw", [b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\x00\x00\x80\xff", b"\xff\xff\x7f\x7f"])
+def test_a_number_that_is_none_does_not_stop_the_bench(raw):
+    ports = VirtualPorts(bench_scenario())
+    ports.bench.boards[1].write(b"C03|1|a|1|" + raw + b"|\x01\x00x\r")
+    ports.bench.advance(5 * MS)
+    assert ports.transfers[0][2].startswith(b"R03|0|1|a|1|")
+    assert Board(ports.port(2)).id == 2

@@ -1,0 +1,93 @@
+"""Listeners: the one way out of a recorder. The file writer, the live table and the user's callback are all listeners.
+
+```python
+import uwblink
+
+def print_range(heard: uwblink.Heard) -> None:
+    print(heard.board, heard.message)
+
+uwblink.record(["/dev/ttyACM0", "/dev/ttyACM1"], "flight.uwb", uwblink.RangingPlan(), listeners=[print_range])
+```
+
+A listener is a function of one `Heard`, or an object of a class derived from `Listener`. They are called in the
+recorder's own loop, in their order, so they must be quick: 0.1 ms a message is plenty, and what takes longer belongs
+into a thread of the listener's own, as the file writer's does. What one raises ends the recording, with everything
+that came before in the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from uwblink.recording.schema import Fault
+from uwblink.wire.codec import Event
+from uwblink.wire.messages import RangeReport
+
+Pair = tuple[int, int]
+"""Initiator and target."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A message or a line of text that a board sent, the id of the board, and when it came (host time, Unix epoch)."""
+
+    time_ns: int
+    board: int
+    message: Event
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn of the plan: who was to range with whom, the report (None: it failed), and when it ended."""
+
+    time_ns: int
+    pair: Pair
+    report: RangeReport | None
+
+
+class Listener:
+    """What a recorder tells. Override what you want to know; as they are, the methods do nothing."""
+
+    def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
+        """Note bytes that came "in" from a port or went "out" to it."""
+
+    def on_message(self, heard: Heard) -> None:
+        """Note a message or a line of text of a board."""
+
+    def on_turn(self, turn: Turn) -> None:
+        """Note that a turn of the plan has ended."""
+
+    def on_fault(self, fault: Fault) -> None:
+        """Note that something went wrong."""
+
+    def check(self) -> None:
+        """Raise if there is no point in going on; called often."""
+
+    def close(self) -> None:
+        """End: nothing more will come."""
+
+
+class CallbackListener(Listener):
+    """Calls a function with everything that boards say."""
+
+    def __init__(self, callback: Callable[[Heard], object]) -> None:
+        """Call `callback` with each `Heard`."""
+        self._callback = callback
+
+    def on_message(self, heard: Heard) -> None:
+        """Call the function."""
+        self._callback(heard)
+
+
+def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> list[Listener]:
+    """Return listeners, functions made into some; raises `TypeError` for what is neither."""
+    found: list[Listener] = []
+    for listener in listeners:
+        if isinstance(listener, Listener):
+            found.append(listener)
+        elif callable(listener):
+            found.append(CallbackListener(listener))
+        else:
+            raise TypeError(f"listeners: found {listener!r}, expected a Listener or a function of one Heard")
+    return found
