@@ -5,6 +5,14 @@ class UwblinkError(Exception):
     """Base of the errors of this package; the text says what, where and what to do."""
 
 
+class ArgumentError(UwblinkError, ValueError):
+    """An argument that cannot be used; names the parameter, what was found, and what is expected."""
+
+
+class PluginWarning(UserWarning):
+    """A plug-in of another distribution that was left out, and why."""
+
+
 class FrameError(UwblinkError, ValueError):
     """A message whose fields do not fit the wire format."""
 

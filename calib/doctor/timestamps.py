@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.doctor.base import PLAUSIBLE_M, Finding, RecordingView, pair_ids, plausible_share
 from uwblink.ticks import TICKS_PER_SECOND
-from uwblink.twr import SINGLE_SIDED, board_range, intervals, raw_range
+from uwblink.twr import board_range, intervals, raw_range, single_sided
 
 VACUUM_OVER_AIR: Final = 299_792_458.0 / 299_702_547.0
 
@@ -53,7 +53,7 @@ def width(view: RecordingView) -> Iterator[Finding]:
 def single_as_double(view: RecordingView) -> Iterator[Finding]:
     """Double-sided exchanges without a third message."""
     e = view.exchanges
-    empty = ~np.isin(e.protocol, SINGLE_SIDED) & (e.tx3 == 0) & (e.rx3 == 0)
+    empty = ~np.isin(e.protocol, single_sided()) & (e.tx3 == 0) & (e.rx3 == 0)
     if empty.mean() > 0.5:
         yield Finding(
             "single-sided data taken for double-sided",

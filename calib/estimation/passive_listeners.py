@@ -26,7 +26,7 @@ from uwblink.arrays import Floats
 from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
-from uwblink.twr import THIRD_FROM_TARGET
+from uwblink.twr import third_from_target
 
 FEWEST: Final = 50
 PLAUSIBLE_NS: Final = 100.0
@@ -50,7 +50,7 @@ def heard_delays(path: str | os.PathLike[str], calibration: Calibration) -> dict
     with Recording.open(path) as recording:
         heard, poses, tags = recording.overheard(), recording.poses(), recording.tags()
         protocols = set(np.unique(recording.exchanges().protocol).tolist())
-    if not len(heard["time_ns"]) or not len(poses) or not protocols <= set(THIRD_FROM_TARGET):
+    if not len(heard["time_ns"]) or not len(poses) or not protocols <= set(third_from_target()):
         return {}
     sides = [("initiator", "target"), ("target", "listener"), ("initiator", "listener")]
     near, away, across = (distances_m(poses, tags, heard[a], heard[b], heard["time_ns"]) for a, b in sides)

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from uwblink.ticks import METRES_PER_TICK, TICK_S, elapsed
 from uwblink.twr import PROTOCOLS, Exchanges, delay_weights, time_of_flight, truncate4
 
-INITIATOR_STAMPS = {
-    "ss": ("tx1", "rx2"), "ss-cfo": ("tx1", "rx2"), "ds": ("tx1", "rx2", "rx3"), "ds-alt": ("tx1", "rx2", "tx3"),
-    "ds-sym": ("tx1", "rx2", "tx3"),
-}  # fmt: skip
+
+def initiator_stamps(protocol):
+    """The stamps of the initiator's clock: it stamps what it sends and what it receives."""
+    senders = [message.sender for message in PROTOCOLS[protocol].messages]
+    return tuple(f"{'tx' if sender == 'initiator' else 'rx'}{k}" for k, sender in enumerate(senders, start=1))
 
 
 def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32):
@@ -24,7 +25,7 @@ def exchange(protocol, flight, reply, third, gamma_i, gamma_j, start=0, bits=32)
     if len(PROTOCOLS[protocol].messages) == 3:
         left = true["tx2" if sender == "target" else "rx2"] + third
         true |= {"tx3": left, "rx3": left + flight}
-    own = INITIATOR_STAMPS[protocol]
+    own = initiator_stamps(protocol)
     stamps = {}
     for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3"):
         if name not in true:
@@ -94,7 +95,7 @@ def test_the_carrier_takes_the_skew_out():
 def test_a_delay_on_one_side_only_is_taken_out_by_its_weight(protocol, side, kind):
     clean = exchange(protocol, 1000, 20_000_000, 98_320_384, 3, -2)
     d = 4000
-    own = INITIATOR_STAMPS[protocol]
+    own = initiator_stamps(protocol)
     touched = {
         name: getattr(clean, name) + d
         for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -114,3 +115,10 @@ def test_truncation_is_towards_zero_and_keeps_what_has_four_decimals():
 
 def test_a_tick_is_4_69_mm():
     assert pytest.approx(4.690357e-3, rel=1e-6) == METRES_PER_TICK
+
+
+def test_stamps_belong_to_the_clocks_of_the_paper():
+    # ICRA 2023, fig. 2, and the course in which the initiator sends the third message.
+    assert initiator_stamps("ss") == initiator_stamps("ss-cfo") == ("tx1", "rx2")
+    assert initiator_stamps("ds") == ("tx1", "rx2", "rx3")
+    assert initiator_stamps("ds-alt") == initiator_stamps("ds-sym") == ("tx1", "rx2", "tx3")

@@ -14,8 +14,7 @@ from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
 if TYPE_CHECKING:
     from uwbsim.protocols.comparison import ProtocolErrors
 
-Protocols = Annotated[str, typer.Option(help="Names, separated by commas.")]
-ALL = "ss,ss-cfo,ds,ds-alt,ds-sym"
+Protocols = Annotated[str, typer.Option(help="Names, separated by commas, or all.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -27,7 +26,7 @@ def add_to(app: typer.Typer) -> None:
 def compare(
     scenario: ScenarioFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, .csv and .parquet.")],
-    protocols: Protocols = ALL,
+    protocols: Protocols = "all",
     count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
     settings: Settings = None,
     as_json: AsJson = False,
@@ -42,7 +41,7 @@ def compare(
     from uwbsim.scenario.loading import load
     from uwbsim.sweep.results import write_csv, write_parquet
 
-    rows = chosen([name.strip() for name in protocols.split(",") if name.strip()])
+    rows = chosen(_names(protocols))
     loaded = load(scenario, settings or ())
     check_folder(output)
     files = {kind: output / f"compare.{kind}" for kind in ("html", "csv", "parquet")}
@@ -65,6 +64,12 @@ def compare(
     typer.echo(f"{files['html']}, {files['csv'].name}, {files['parquet'].name}")
 
 
+def _names(protocols: str) -> list[str]:
+    from uwblink.twr import PROTOCOLS
+
+    return list(PROTOCOLS) if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()]
+
+
 def _print_outcomes(outcomes: list[ProtocolErrors]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -82,7 +87,7 @@ def _print_outcomes(outcomes: list[ProtocolErrors]) -> None:
 
 
 def predict(
-    protocol: Annotated[str, typer.Option(help="ss, ss-cfo, ds, ds-alt or ds-sym.")] = "ds",
+    protocol: Annotated[str, typer.Option(help="ss, ss-cfo, ds, ds-alt, ds-sym, or a registered one.")] = "ds",
     skew_ppm: Annotated[float, typer.Option(help="How much faster the initiator's clock runs.")] = 0.0,
     reply_delay_us: Annotated[float, typer.Option(min=0.0, help="The target's reply, dt32.")] = 300.0,
     final_delay_us: Annotated[float, typer.Option(min=0.0, help="The third message's delay, dt53.")] = 1538.7,
@@ -131,7 +136,7 @@ def predict(
 
 def optimum(
     scenario: ScenarioFile,
-    protocols: Protocols = ALL,
+    protocols: Protocols = "all",
     overhead_us: Annotated[float, typer.Option(min=0.0, help="What an exchange takes besides.")] = 0.0,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for pictures of the curves (.png).")
@@ -149,7 +154,7 @@ def optimum(
     from uwbsim.protocols.reply_delay import optimum as run
     from uwbsim.scenario.loading import load
 
-    rows = chosen([name.strip() for name in protocols.split(",") if name.strip()])
+    rows = chosen(_names(protocols))
     loaded = load(scenario, settings or ())
     if output:
         check_folder(output)

@@ -56,6 +56,7 @@ def predict_state(q: State) -> dict[str, Any]:
     timings = [message.timing for message in protocol.messages]
     target_waits = timings[1] == "scheduled"
     scheduled = q.reply_delay_us if target_waits else q.final_delay_us
+    at_once = q.final_delay_us if timings[1:] == ["scheduled", "at once"] else q.reply_delay_us
     conditions = Conditions.single(
         flight=q.distance_m / SPEED_OF_LIGHT,
         flight_rate=q.speed_mps / SPEED_OF_LIGHT,
@@ -69,7 +70,7 @@ def predict_state(q: State) -> dict[str, Any]:
         rx_delay_initiator=-0.56e-9 * q.delay_initiator_ns,
         tx_delay_target=0.44e-9 * q.delay_target_ns,
         rx_delay_target=-0.56e-9 * q.delay_target_ns,
-        at_once=q.reply_delay_us * 1e-6,
+        at_once=at_once * 1e-6,
         scheduled=scheduled * 1e-6,
         carrier_bias_ppm=q.carrier_bias_ppm,
         carrier_std_ppm=q.carrier_noise_ppm,

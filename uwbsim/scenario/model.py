@@ -18,7 +18,7 @@ from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints
 from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline
 
-ProtocolName = Annotated[str, Field(json_schema_extra={"enum": sorted(PROTOCOLS)})]
+ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
 PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
 
 OVERHEAD_S: Final = 0.0015

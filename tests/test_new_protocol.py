@@ -1,0 +1,120 @@
+"""A protocol registered at run time goes through every command, and is exact where there is no noise."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import calib.cli
+import uwblink.cli
+import uwbsim.cli
+from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
+from uwblink.recording.file import Recording
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.twr import PROTOCOLS, delay_weights, raw_range, register_protocol
+from uwbsim.protocols.conditions import Conditions
+from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.prediction import predict
+from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.run import simulate
+
+SCENARIO = "scenarios/noiseless.toml"
+MAINS = {"uwblink": uwblink.cli.main, "uwbsim": uwbsim.cli.main, "calib": calib.cli.main}
+
+
+@pytest.fixture(params=[SYMMETRIC, TARGETS], ids=lambda row: row.name)
+def row(request):
+    register_protocol(request.param)
+    yield request.param
+    PROTOCOLS.remove(request.param.name)
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Runs a command in this process, which alone knows the protocol; returns what it prints."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+        with pytest.raises(SystemExit) as end:
+            MAINS[words[0]]()
+        out, err = capsys.readouterr()
+        assert end.value.code in (0, None), err
+        return out
+
+    return run
+
+
+def bench(row, skews, delays):
+    """Two tags 3.1234 m apart that do not move, without noise, bias or grids in their stamps."""
+    radio = {"rx_noise_ps": 0.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0, "quantize": False}
+    places = (0, 0, 1), (3.1234, 0, 1)
+    return Scenario.model_validate(
+        {
+            "run": {"seed": 3, "duration_s": 2.0},
+            "ranging": {"protocol": row.name, "rate_hz": 50.0},
+            "radio": radio,
+            "bodies": [{"name": "ab"[k], "motion": {"model": "static", "position_m": places[k]}} for k in (0, 1)],
+            "tags": [{"id": k + 1, "body": "ab"[k], "skew_ppm": skews[k], "delay_ns": delays[k]} for k in (0, 1)],
+        }
+    )
+
+
+@pytest.mark.parametrize("delays", [(0.0, 0.0), (0.8, 0.0), (0.0, -0.5)])
+def test_simulated_ranges_are_exact_up_to_skew_and_planted_delays(row, delays):
+    result = simulate(bench(row, (5.0, -5.0), delays))
+    weights = delay_weights(result.exchanges)
+    calibrated = raw_range(result.exchanges) + SPEED_OF_LIGHT * 1e-9 * (weights[0] * delays[0] + weights[1] * delays[1])
+    assert len(result.exchanges) == 100
+    # Whole ticks of 4.7 mm, weighted by up to 1.2 and averaged in part; a flight of 10 ns is 5e-14 s long by its skew.
+    assert np.abs(calibrated - result.truth_m).max() < 0.012
+    assert abs(np.mean(calibrated - result.truth_m)) < 0.0015
+
+
+def test_prediction_and_monte_carlo_agree_with_each_other_and_with_the_formula(row):
+    one = Conditions.single(
+        flight=5 / SPEED_OF_LIGHT, rate_initiator=5e-6, rate_target=-5e-6, at_once=305e-6, scheduled=1538.7e-6,
+        quantize=False,
+    )  # fmt: skip
+    quiet = predict(row, one)
+    assert abs(quiet.mean_m[0]) < 5e-5
+    assert range_errors_m(row, one, 1, 1)[0] == pytest.approx(quiet.mean_m[0], abs=1e-6)
+    noisy = one.with_columns(rx_std=150e-12)[np.zeros(16_384, dtype=np.int64)]
+    errors = range_errors_m(row, noisy, 2, 200_000)
+    # 200 000 errors know their standard deviation to 0.16 %.
+    assert errors.std() == pytest.approx(np.sqrt(predict(row, noisy).variance_m2[0]), rel=0.01)
+
+
+def test_run_show_and_fit(row, command, tmp_path):
+    flight, fitted = tmp_path / "flight.uwb", tmp_path / "c.json"
+    settings = ["--set", f"ranging.protocol={row.name}", "--set", "run.duration_s=60"]
+    command("uwbsim", "run", SCENARIO, "-o", flight, *settings)
+    shown = json.loads(command("uwblink", "show", flight, "--json"))
+    assert set(shown["protocols"]) == {row.name}
+    command("calib", "fit", flight, "-o", fitted)
+    with Recording.open(flight) as recording:
+        planted = {int(k): v for k, v in recording.meta()["planted"]["delays_ns"].items()}
+        assert set(recording.exchanges().protocol.tolist()) == {row.name}
+    found = {int(k): v for k, v in json.loads(fitted.read_text())["delays_ns"].items()}
+    # The scenario has no bias; 60 s of noiseless stamps leave a picosecond, and the spline's wiggle.
+    assert found == pytest.approx(planted, abs=5e-3)
+
+
+def test_compare_optimum_and_predict_know_it_without_being_told(row, command, tmp_path):
+    compared = json.loads(command("uwbsim", "compare", SCENARIO, "-o", tmp_path / "out", "-n", 4096, "--json"))
+    assert [line["protocol"] for line in compared["protocols"]] == list(PROTOCOLS)
+    assert (
+        row.title in (tmp_path / "out" / "compare.html").read_text()
+        or row.name in (tmp_path / "out" / "compare.html").read_text()
+    )
+    best = json.loads(command("uwbsim", "optimum", SCENARIO, "--json"))
+    assert [line["protocol"] for line in best] == list(PROTOCOLS)
+    said = json.loads(command("uwbsim", "predict", "--protocol", row.name, "--json"))
+    assert said["title"] == row.title
+    assert said["std_m"] > 0
+
+
+def test_schema_and_summary_know_it(row, command):
+    assert row.name in json.loads(command("uwbsim", "schema"))["$defs"]["Ranging"]["properties"]["protocol"]["enum"]
+    said = command("uwbsim", "validate", SCENARIO, "--set", f"ranging.protocol={row.name}")
+    assert row.title in said

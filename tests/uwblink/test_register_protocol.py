@@ -1,0 +1,180 @@
+"""A protocol that somebody adds at run time: what is taken, what is refused, and why."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwblink.test_twr import exchange
+from uwblink.errors import ArgumentError
+from uwblink.formulas import half_delays
+from uwblink.ticks import TICK_S
+from uwblink.twr import (
+    PROTOCOLS,
+    ProtocolMessage,
+    RangingProtocol,
+    check_protocol,
+    delay_weights,
+    intervals,
+    raw_range,
+    register_protocol,
+    single_sided,
+    third_from_target,
+    time_of_flight,
+)
+
+POLL = ProtocolMessage("initiator", "", "at once")
+REPLY = ProtocolMessage("target", "rx1", "scheduled")
+
+
+def mean_of_trips(t):
+    """Half of what is left of both round trips, on average: exact where both replies are equal."""
+    return (t.dt41 - t.dt32 + t.dt64 - t.dt53) / 4
+
+
+def in_targets_clock(t):
+    """ICRA 2023, eq. (2), with the round trip rescaled in place of the reply."""
+    return (t.dt41 * t.dt53 / t.dt64 - t.dt32) / 2
+
+
+def in_targets_clock_delays(t):
+    return t.dt53 / t.dt64 / 2, np.full_like(t.dt41, 0.5)
+
+
+SYMMETRIC = RangingProtocol(
+    "mean-of-trips",
+    "DS-TWR, mean of two single-sided trips",
+    (POLL, REPLY, ProtocolMessage("initiator", "rx2", "scheduled")),
+    mean_of_trips,
+    half_delays,
+)
+TARGETS = RangingProtocol(
+    "targets-clock",
+    "DS-TWR in the target's clock",
+    (POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("target", "tx2", "scheduled")),
+    in_targets_clock,
+    in_targets_clock_delays,
+)
+
+
+@pytest.fixture(params=[SYMMETRIC, TARGETS], ids=lambda row: row.name)
+def registered(request):
+    register_protocol(request.param)
+    yield request.param
+    PROTOCOLS.remove(request.param.name)
+
+
+@pytest.mark.parametrize("name", list(PROTOCOLS))
+def test_the_projects_own_rows_pass_their_own_check(name):
+    check_protocol(PROTOCOLS[name])
+
+
+def test_ranges_of_a_registered_protocol_are_exact(registered):
+    # Equal clocks and replies: nothing but the flight is left, whatever the formula. 1000 ticks are 4.69 m.
+    e = exchange(registered.name, 1000, 98_304_000, 98_304_000, 0, 0, start=2**32 - 5000)
+    assert time_of_flight(e)[0] == pytest.approx(1000 * TICK_S, abs=1e-9 * TICK_S)
+    assert raw_range(e)[0] == pytest.approx(4.69036, abs=1e-5)
+
+
+def test_skew_and_delays_go_through_the_registered_formula():
+    register_protocol(TARGETS)
+    try:
+        e = exchange("targets-clock", 1000, 20_000_000, 98_320_384, 7, -4)
+        # Six stamps cut to whole ticks, weighted by up to 1.2, halved.
+        assert time_of_flight(e)[0] / TICK_S == pytest.approx(1000, abs=2.5)
+        late = replace(e, rx1=e.rx1 + 4000)
+        moved = (time_of_flight(late) - time_of_flight(e))[0] / TICK_S
+        assert moved == pytest.approx(4000 * delay_weights(e)[1][0], abs=1e-3)
+    finally:
+        PROTOCOLS.remove("targets-clock")
+
+
+def test_roles_follow_from_the_row(registered):
+    from_target = registered.messages[2].sender == "target"
+    assert (registered.name in third_from_target()) == from_target
+    assert registered.name not in single_sided()
+    e = exchange(registered.name, 1000, 20_000_000, 98_320_384, 0, 0)
+    # dt64 is the initiator's from rx2 on, or the target's from tx2 on: longer by two flights.
+    assert intervals(e).dt64[0] - intervals(e).dt53[0] == (0 if from_target else 2000)
+
+
+def test_a_mixture_of_protocols_keeps_each_to_its_own_formula(registered):
+    names = [registered.name, "ds", "ss", registered.name]
+    parts = [exchange(name, 1000 + k, 98_304_000, 98_304_000, 0, 0) for k, name in enumerate(names)]
+    columns = {f: np.concatenate([getattr(p, f) for p in parts]) for f in parts[0].__slots__ if f != "bits"}
+    np.testing.assert_allclose(time_of_flight(replace(parts[0], **columns)) / TICK_S, [1000, 1001, 1002, 1003])
+
+
+def test_exchanges_of_an_unknown_protocol_are_refused_by_name():
+    unknown = replace(exchange("ds", 1000, 20_000_000, 98_320_384, 0, 0), protocol=np.array(["tdoa"]))
+    for function in (raw_range, delay_weights, intervals):
+        with pytest.raises(ArgumentError, match=r"protocol: found 'tdoa', allowed: ss, "):
+            function(unknown)
+
+
+def test_names_are_taken_once(registered):
+    with pytest.raises(ArgumentError, match=r"registered already; choose another name, or replace=True"):
+        register_protocol(registered)
+    better = replace(registered, title="better")
+    register_protocol(better, replace=True)
+    assert PROTOCOLS[registered.name].title == "better"
+    with pytest.raises(ArgumentError, match="'ds': is one of the project's own"):
+        register_protocol(replace(registered, name="ds"), replace=True)
+    with pytest.raises(ArgumentError, match="'ss': was not registered"):
+        PROTOCOLS.remove("ss")
+
+
+FOURTH = ProtocolMessage("target", "rx3", "at once")
+
+
+def doubled(t):
+    return 2 * mean_of_trips(t)
+
+
+def collapsed(t):
+    return float(np.mean(mean_of_trips(t)))
+
+
+def failing(_t):
+    raise KeyError("dt99")
+
+
+def backwards(t):
+    weights = half_delays(t)
+    return -weights[0], weights[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"name": "two words"}, r"name: found 'two words', expected a word such as 'ds-alt'"),
+        ({"name": ""}, "name: found ''"),
+        ({"title": ""}, "title: found ''"),
+        ({"messages": [POLL, REPLY]}, "expected a tuple of ProtocolMessage"),
+        ({"messages": (POLL,)}, "found 1, expected 2 or 3: an exchange is recorded with the six stamps"),
+        ({"messages": (*SYMMETRIC.messages, FOURTH)}, "found 4, expected 2 or 3: an exchange is recorded"),
+        ({"messages": (REPLY, POLL)}, "1 is from the target after rx1, expected from the initiator after nothing"),
+        ({"messages": (POLL, ProtocolMessage("initiator", "tx1", "at once"))}, "2 is from the initiator after tx1"),
+        (
+            {"messages": (POLL, REPLY, ProtocolMessage("target", "rx1", "at once"))},
+            "3 is from the target after rx1, expected from the target after tx2 or from the initiator after rx2",
+        ),
+        ({"messages": (POLL, replace(REPLY, timing="soon"))}, "2: timing: found 'soon', allowed: at once, scheduled"),
+        ({"flight_ticks": "(dt41 - dt32) / 2"}, "flight_ticks: found '.*', expected a function"),
+        ({"delay_weights": None}, "delay_weights: found None, expected a function"),
+        ({"flight_ticks": doubled}, r"flight_ticks finds 2000 ticks where an exchange without noise took 1000$"),
+        ({"flight_ticks": collapsed}, r"return shapes \(\) and \(2, 2\) for two exchanges"),
+        ({"flight_ticks": failing}, r"fail on an exchange without noise: KeyError\('dt99'\)"),
+        ({"delay_weights": backwards}, "delay_weights leave 936 ticks .* antenna delays of 64 and 0"),
+    ],
+)  # fmt: skip
+def test_what_cannot_work_is_refused_in_one_line(change, expected):
+    with pytest.raises(ArgumentError, match=expected) as caught:
+        register_protocol(replace(SYMMETRIC, **change))
+    assert "\n" not in str(caught.value)
+    assert SYMMETRIC.name not in PROTOCOLS
+
+
+def test_what_is_no_protocol_is_refused():
+    with pytest.raises(ArgumentError, match="found 'ds', expected a RangingProtocol"):
+        register_protocol("ds")

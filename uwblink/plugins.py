@@ -1,0 +1,113 @@
+"""Tables that strangers add rows to: at run time, or from another distribution by an entry point.
+
+An entry point of the table's group names one row, or a list of rows:
+
+```toml
+[project.entry-points."uwbcal.protocols"]
+my-protocol = "my_package.ranging:MY_PROTOCOL"
+```
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Generic, Protocol, TypeVar
+
+from uwblink.errors import ArgumentError, PluginWarning
+
+
+class Named(Protocol):
+    """What a row of a table needs: the name that people choose it by."""
+
+    @property
+    def name(self) -> str:
+        """The name."""
+        ...
+
+
+Row = TypeVar("Row", bound=Named)
+
+
+class Registry(Mapping[str, Row], Generic[Row]):
+    """Rows by name: the project's own, those a program adds, and those of installed distributions.
+
+    Entry points of `group` are loaded once, when a name is not among the rows so far or all rows are asked for. One
+    that cannot be loaded is left out with a `PluginWarning`. `check` raises for a row that cannot be used.
+    """
+
+    def __init__(self, kind: str, group: str, rows: Iterable[Row], check: Callable[[Any], None]) -> None:
+        """Hold the project's own `rows`; `kind` is what a row is called in messages."""
+        self._kind, self._group, self._check = kind, group, check
+        self._rows = {row.name: row for row in rows}
+        self._own = frozenset(self._rows)
+        self._loaded = False
+
+    def register(self, row: Row, *, replace: bool = False) -> None:
+        """Add a row; `replace` allows one that was added before to be put in its place.
+
+        Raises `ArgumentError` for a row that cannot be used, a name that is taken, and for every name of the project.
+        """
+        self._check(row)
+        if row.name in self._own:
+            raise ArgumentError(f"{self._kind} {row.name!r}: is one of the project's own; choose another name")
+        if row.name in self._rows and not replace:
+            raise ArgumentError(
+                f"{self._kind} {row.name!r}: is registered already; choose another name, or replace=True"
+            )
+        self._rows[row.name] = row
+
+    def remove(self, name: str) -> None:
+        """Take out a row that was added; raises `ArgumentError` for any other name."""
+        if name in self._own or name not in self._rows:
+            raise ArgumentError(f"{self._kind} {name!r}: was not registered, so it cannot be removed")
+        del self._rows[name]
+
+    def known(self) -> list[Row]:
+        """Return the rows so far, without looking for those of other distributions."""
+        return list(self._rows.values())
+
+    def __getitem__(self, name: str) -> Row:
+        """Return a row by its name; raises `KeyError`."""
+        if name not in self._rows:
+            self._load()
+        return self._rows[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over all names, the project's own first."""
+        self._load()
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        self._load()
+        return len(self._rows)
+
+    def __repr__(self) -> str:
+        """Return the names."""
+        return f"<{self._kind}s: {', '.join(self)}>"
+
+    def _load(self) -> None:
+        if self._loaded:
+            return
+        # Before the work, so that a plug-in which asks for the table while it is loaded finds it as it is.
+        self._loaded = True
+        from importlib.metadata import entry_points
+
+        for entry in sorted(entry_points(group=self._group), key=lambda e: e.name):
+            try:
+                found = entry.load()
+                for row in found if isinstance(found, list | tuple) else (found,):
+                    self.register(row)
+            except Exception as error:  # whatever a stranger's module raises is no reason to stop the project's own
+                origin = entry.dist.name if entry.dist else "an unnamed distribution"
+                warnings.warn(
+                    f"plug-in {entry.name!r} of {origin} (group {self._group}) is left out: {_line(error)}",
+                    PluginWarning,
+                    stacklevel=4,
+                )
+
+
+def _line(error: Exception) -> str:
+    text = " ".join(str(error).split()) or "no reason given"
+    return text if isinstance(error, ArgumentError) else f"{type(error).__name__}: {text}"
