@@ -58,7 +58,7 @@ def kills(folder: Path) -> bool:
         killed_ns = time.time_ns()
         process.wait()
         with Recording.open(folder / "f.uwb") as recording:
-            ages.append((killed_ns - max(f[0] for f in recording.frames())) * 1e-9)
+            ages.append((killed_ns - max(f.time_ns for f in recording.frames())) * 1e-9)
     print(f"{KILLS} kills: every file opens; its last bytes are {max(ages):.3f} s old at most", flush=True)
     return max(ages) < PROMISED_S + 0.02
 

@@ -22,7 +22,7 @@ CONFINED = {
     ),
     "fpdf": lambda path: path == "calib/report/pdf.py",
     "typer": lambda path: "/cli/" in path,
-    "rich": lambda path: "/cli/" in path or path == "uwblink/recording/summary.py",
+    "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path == "uwbsim/sweep/results.py",
     "pydantic": lambda path: path.startswith("uwbsim/"),
     "rosbags": lambda path: path == "uwblink/importers/poses.py",

@@ -272,7 +272,8 @@ class Recorder:
         now_s = self._ports.now_s()
         if outcome.error:
             kind = "time-out" if isinstance(outcome.error, TimeoutError) else "failed exchange"
-            self._fault(station, kind, str(outcome.error))
+            ranged = outcome.command if isinstance(outcome.command, RangeCommand) else None
+            self._fault(station, kind, str(outcome.error), ranged)
             station.rest_after(outcome, now_s)
         if isinstance(outcome.reply, IdReport) and outcome.reply.board != station.board:
             self._fault(station, "wrong board", f"board {outcome.reply.board} where {station.board} was")
@@ -305,7 +306,8 @@ class Recorder:
             self._by_port[id(station.port)] = station
             self._fault(station, "replugged", f"{station.name}: board {station.board} is back")
 
-    def _fault(self, station: Station, kind: str, detail: str) -> None:
-        fault = Fault(self._ports.host_ns(), str(station.board), kind, detail[:MOST_FAULT_TEXT])
+    def _fault(self, station: Station, kind: str, detail: str, failed: RangeCommand | None = None) -> None:
+        ends = (station.board, failed.target) if failed else (None, None)
+        fault = Fault(self._ports.host_ns(), str(station.board), kind, detail[:MOST_FAULT_TEXT], *ends)
         for listener in self._listeners:
             listener.on_fault(fault)

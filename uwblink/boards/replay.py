@@ -14,6 +14,7 @@ from uwblink.boards.pseudo_terminals import Terminal
 from uwblink.boards.writer import overheard_row
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
+from uwblink.recording.schema import CirRow
 from uwblink.twr import COLUMNS, Exchanges
 from uwblink.wire.bulk import ColumnDecoder
 from uwblink.wire.messages import Cir, Overheard, TextLine
@@ -25,7 +26,7 @@ class Decoded:
 
     exchanges: Exchanges
     overheard: list[dict[str, float]]
-    cirs: list[tuple[int, int, int, int, float, tuple[int, ...]]]
+    cirs: list[CirRow]
     texts: int
     skipped_bytes: int
     messages: int
@@ -33,30 +34,31 @@ class Decoded:
 
 def decode_again(recording: Recording) -> Decoded:
     """Decode every byte that came from a board; raises `RecordingError` when the recording holds none."""
-    frames = [frame for frame in recording.frames() if frame[2] == "in"]
+    frames = [frame for frame in recording.frames() if frame.direction == "in"]
     if not frames:
         raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
     ids = board_ids(recording)
     decoders: dict[str, ColumnDecoder] = {}
-    for time_ns, name, _, data in frames:
+    for frame in frames:
+        name = frame.board
         if name not in decoders:
             decoders[name] = ColumnDecoder(ids.get(name, len(decoders)))
-        decoders[name].feed(data, time_ns)
+        decoders[name].feed(frame.data, frame.time_ns)
     overheard, cirs, texts = [], [], 0
     for name, decoder in decoders.items():
-        decoder.finish(frames[-1][0])
+        decoder.finish(frames[-1].time_ns)
         board = ids.get(name, 0)
         for time_ns, event in decoder.events:
             if isinstance(event, Overheard):
                 overheard.append(overheard_row(time_ns, board, event))
             elif isinstance(event, Cir):
                 index = event.first_path_milli / 1000
-                cirs.append((time_ns, board, event.initiator, event.target, index, event.magnitudes))
+                cirs.append(CirRow(time_ns, board, event.initiator, event.target, index, event.magnitudes))
             texts += isinstance(event, TextLine)
     return Decoded(
         _in_order([d.exchanges() for d in decoders.values()]),
         sorted(overheard, key=lambda row: row["time_ns"]),
-        sorted(cirs, key=lambda row: row[0]),
+        sorted(cirs, key=lambda row: row.time_ns),
         texts,
         sum(d.decoder.skipped_bytes for d in decoders.values()),
         sum(d.decoder.messages for d in decoders.values()),
@@ -94,21 +96,21 @@ def play(
     `ready` is told what each board's port is now called, before the first byte. Raises `RecordingError` when the
     recording holds no bytes.
     """
-    frames = [frame for frame in recording.frames() if frame[2] == "in"]
+    frames = [frame for frame in recording.frames() if frame.direction == "in"]
     if not frames:
         raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
     ids = board_ids(recording)
-    names = sorted({frame[1] for frame in frames})
+    names = sorted({frame.board for frame in frames})
     terminals = {n: Terminal(link_dir / f"tag{ids.get(n, k)}" if link_dir else None) for k, n in enumerate(names)}
     try:
         ready({name: terminal.name for name, terminal in terminals.items()})
-        start_s, first_ns = time.monotonic(), frames[0][0]
-        for count, (time_ns, name, _, data) in enumerate(frames):
-            while (wait_s := start_s + (time_ns - first_ns) * 1e-9 / speed - time.monotonic()) > 0:
+        start_s, first_ns = time.monotonic(), frames[0].time_ns
+        for count, frame in enumerate(frames):
+            while (wait_s := start_s + (frame.time_ns - first_ns) * 1e-9 / speed - time.monotonic()) > 0:
                 if stop():
                     return count
                 time.sleep(min(wait_s, 0.1))
-            terminals[name].write(data)
+            terminals[frame.board].write(frame.data)
         return len(frames)
     finally:
         for terminal in terminals.values():

@@ -17,7 +17,7 @@ import numpy as np
 from uwblink.boards.listeners import Heard, Listener
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault
+from uwblink.recording.schema import CirRow, Fault, FrameRow
 from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import Cir, Overheard, RangeReport
 
@@ -29,7 +29,7 @@ LONGEST_BACKLOG_S: Final = 20.0
 class Batch:
     """Rows that wait to be written, in the order in which they came."""
 
-    frames: list[tuple[int, str, str, bytes]] = field(default_factory=list)
+    frames: list[FrameRow] = field(default_factory=list)
     exchanges: list[tuple[int, int, RangeReport]] = field(default_factory=list)
     overheard: list[tuple[int, int, Overheard]] = field(default_factory=list)
     cirs: list[tuple[int, int, Cir]] = field(default_factory=list)
@@ -57,7 +57,8 @@ class Batch:
                 recording.append_exchanges(exchanges_of(self.exchanges))
             recording.append_overheard(overheard_row(*row) for row in self.overheard)
             recording.append_cirs(
-                (t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes) for t, board, c in self.cirs
+                CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
+                for t, board, c in self.cirs
             )
             recording.append_faults(self.faults)
 
@@ -93,7 +94,7 @@ class RecordingWriter(Listener):
     def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
         """Keep bytes."""
         with self._lock:
-            self._batch.frames.append((time_ns, port, direction, data))
+            self._batch.frames.append(FrameRow(time_ns, port, direction, data))
 
     def on_message(self, heard: Heard) -> None:
         """Keep a message in the table of its kind."""

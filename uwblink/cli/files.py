@@ -27,14 +27,15 @@ def show(
 ) -> None:
     """Print what a recording holds."""
     from uwblink.recording.file import Recording
-    from uwblink.recording.summary import print_summary, summarize
 
     with Recording.open(recording) as opened:
-        summary = summarize(opened)
+        summary = opened.show()
     if as_json:
-        typer.echo(json.dumps(summary, indent=1))
+        typer.echo(json.dumps(summary.to_dict(), indent=1))
         return
     from rich.console import Console
+
+    from uwblink.cli.tables import print_summary
 
     print_summary(summary, Console(highlight=False))
 

@@ -92,7 +92,7 @@ def _watcher() -> Iterator[Callable[[Progress], None]]:
     from rich.console import Console
     from rich.live import Live
 
-    from uwblink.recording.summary import progress_table
+    from uwblink.cli.tables import progress_table
 
     with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
         yield lambda progress: live.update(progress_table(progress), refresh=True)

@@ -56,8 +56,15 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         "magnitudes": "USMALLINT[]",
     },
     "frames": {"time_ns": "BIGINT", "board": "VARCHAR", "direction": "VARCHAR", "bytes": "BLOB"},
-    "faults": {"time_ns": "BIGINT", "board": "VARCHAR", "kind": "VARCHAR", "detail": "VARCHAR"},
+    "faults": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("board", "kind", "detail"), "VARCHAR"),
+        **dict.fromkeys(("initiator", "target"), "USMALLINT"),
+    },
 }
+
+ADDED_LATER: Final = {"faults": frozenset({"initiator", "target"})}
+"""Columns that a recording may lack, because it is older than they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,12 +96,42 @@ class Poses:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that went wrong while recording: a time-out, garbage, a failed exchange."""
+    """Something that went wrong while recording: a time-out, garbage, a failed exchange.
+
+    `initiator` and `target` say which exchange failed; None where it was none.
+    """
 
     time_ns: int
     board: str
     kind: str
     detail: str
+    initiator: int | None = None
+    target: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CirRow:
+    """A channel impulse response that a board printed.
+
+    `first_path_index` counts taps of 1.0016 ns, with a fraction; `magnitudes` are the taps' (1016 of a board).
+    """
+
+    time_ns: int
+    board: int
+    initiator: int
+    target: int
+    first_path_index: float
+    magnitudes: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRow:
+    """Bytes at a port: `board` is the port's name, `direction` is "in" from the board or "out" to it."""
+
+    time_ns: int
+    board: str
+    direction: str
+    data: bytes
 
 
 def standard_meta() -> dict[str, Any]:

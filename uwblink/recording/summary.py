@@ -1,120 +1,130 @@
-"""What a recording holds, for people and as JSON."""
+"""What a recording holds: a summary that prints itself, and as JSON."""
 
 from __future__ import annotations
 
-import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, Fault
+from uwblink.display import as_html, cut, first_few, printable
+from uwblink.recording.schema import TABLES, Fault, Tag
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-    from uwblink.boards.progress import Progress
-
-_FAILED = re.compile(r"ranged with (\d+): message|ranging with (\d+) failed")
+    from uwblink.recording.file import Recording
 
 
-def summarize(recording: Recording) -> dict[str, Any]:
-    """Return tags, pairs, counts, rates, time span, protocols, faults and provenance, JSON-ready."""
-    exchanges, poses, meta = recording.exchanges(), recording.poses(), recording.meta()
+@dataclass(frozen=True, slots=True)
+class PairSummary:
+    """Exchanges of one pair: how many were recorded and failed, and how many a second (None: all at once)."""
+
+    initiator: int
+    target: int
+    exchanges: int
+    failed: int
+    rate_hz: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """What a recording holds: rows by table, tags, pairs, exchanges by protocol, faults by kind, poses by body.
+
+    `span_s` is the time from the first to the last exchange; `provenance` is what `meta` says of where it comes from,
+    without the scenario and what was planted.
+    """
+
+    file: str
+    span_s: float
+    counts: dict[str, int]
+    tags: tuple[Tag, ...]
+    pairs: tuple[PairSummary, ...]
+    protocols: dict[str, int]
+    faults: dict[str, int]
+    poses: dict[str, int]
+    provenance: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `uwblink show --json` prints."""
+        tags = [asdict(tag) | {"lever_arm_m": list(tag.lever_arm_m)} for tag in self.tags]
+        return asdict(self) | {"tags": tags, "pairs": [asdict(pair) for pair in self.pairs]}
+
+    def headline(self) -> str:
+        """Return file, number of exchanges, span and protocols in one line."""
+        return (
+            f"{printable(self.file)}: {self.counts['exchanges']} exchanges in {self.span_s:.1f} s, "
+            f"protocols {counted(self.protocols)}"
+        )
+
+    def __str__(self) -> str:
+        """Return at most 24 lines of 79 characters."""
+        shown = self.pairs[:12]
+        pairs = [f"  {p.initiator:>5} -> {p.target:<5} {p.exchanges:>9} exchanges{_rate(p)}" for p in shown]
+        more = [f"  and {len(self.pairs) - len(shown)} pairs more"] if len(self.pairs) > len(shown) else []
+        return "\n".join(map(cut, [self.headline(), *self._lines(), *pairs, *more]))
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook."""
+        names = ["initiator", "target", "exchanges", "failed", "rate (Hz)"]
+        rows = [[str(p.initiator), str(p.target), str(p.exchanges), str(p.failed), _hertz(p)] for p in self.pairs]
+        return as_html("; ".join([self.headline(), *(line.strip() for line in self._lines())]), [names, *rows])
+
+    def _lines(self) -> list[str]:
+        rows = {
+            name: n for name, n in self.counts.items() if n and name not in ("exchanges", "tags", "poses", "faults")
+        }
+        return [
+            f"  tags: {first_few(f'{tag.tag} on {printable(tag.body)}' for tag in self.tags)}",
+            f"  poses: {counted(self.poses)}",
+            f"  faults: {counted(self.faults)}",
+            *([f"  also: {counted(rows)}"] if rows else []),
+        ]
+
+
+def summarize(recording: Recording) -> Summary:
+    """Return what a recording holds; raises what its readers raise."""
+    exchanges, poses, faults = recording.exchanges(), recording.poses(), recording.faults()
     span_s = float(np.ptp(exchanges.time_ns)) * 1e-9 if len(exchanges) else 0.0
-    ends = np.column_stack([exchanges.initiator, exchanges.target])
-    pairs, counts = np.unique(ends, axis=0, return_counts=True)
-    failed = failures_by_pair(recording.faults())
-    ends = np.vstack([ends, np.array(sorted(failed), dtype=np.int64).reshape(-1, 2)])
-    pairs, counts = np.unique(ends, axis=0, return_counts=True)
-    counts -= np.array([tuple(pair) in failed for pair in pairs.tolist()], dtype=counts.dtype)
-    names, rows = np.unique(exchanges.protocol, return_counts=True)
-    kinds, faults = np.unique([f.kind for f in recording.faults()], return_counts=True)
-    bodies, seen = np.unique(poses.body, return_counts=True)
-    return {
-        "file": recording.path.name,
-        "span_s": span_s,
-        "counts": {table: recording.count(table) for table in TABLES if table != "meta"},
-        "tags": [{"tag": t.tag, "body": t.body, "lever_arm_m": list(t.lever_arm_m)} for t in recording.tags()],
-        "pairs": [
-            {
-                "initiator": int(i),
-                "target": int(j),
-                "exchanges": int(n),
-                "failed": failed.get((int(i), int(j)), 0),
-                "rate_hz": n / span_s if span_s else None,
-            }
-            for (i, j), n in zip(pairs, counts, strict=True)
-        ],
-        "protocols": dict(zip(names.tolist(), rows.tolist(), strict=True)),
-        "faults": dict(zip(kinds.tolist(), faults.tolist(), strict=True)),
-        "poses": dict(zip(bodies.tolist(), seen.tolist(), strict=True)),
-        "provenance": {k: v for k, v in meta.items() if k not in {"scenario", "planted"}},
-    }
+    done = Counter(zip(exchanges.initiator.tolist(), exchanges.target.tolist(), strict=True))
+    failed = failures_by_pair(faults)
+    return Summary(
+        file=recording.path.name,
+        span_s=span_s,
+        counts={table: recording.count(table) for table in TABLES if table != "meta"},
+        tags=tuple(recording.tags()),
+        pairs=tuple(
+            PairSummary(*pair, done[pair], failed.get(pair, 0), done[pair] / span_s if span_s else None)
+            for pair in sorted({*done, *failed})
+        ),
+        protocols=_by_name(exchanges.protocol.tolist()),
+        faults=_by_name(fault.kind for fault in faults),
+        poses=_by_name(poses.body.tolist()),
+        provenance={k: v for k, v in recording.meta().items() if k not in {"scenario", "planted"}},
+    )
 
 
 def failures_by_pair(faults: list[Fault]) -> dict[tuple[int, int], int]:
-    """Count failed exchanges by (initiator, target), from the faults that simulator and recorder write."""
-    counts: dict[tuple[int, int], int] = {}
-    for fault in faults:
-        found = _FAILED.search(fault.detail)
-        if found and fault.board.isdecimal():
-            pair = int(fault.board), int(found[1] or found[2])
-            counts[pair] = counts.get(pair, 0) + 1
-    return counts
+    """Count failed exchanges by (initiator, target)."""
+    ends = ((fault.initiator, fault.target) for fault in faults)
+    return dict(Counter((i, j) for i, j in ends if i is not None and j is not None))
 
 
-def print_summary(summary: dict[str, Any], console: Console) -> None:
-    """Print a summary; text from the file is escaped, since it may come from anyone."""
-    from rich.table import Table
-
-    console.print(
-        f"{_plain(summary['file'])}: {summary['counts']['exchanges']} exchanges in {summary['span_s']:.1f} s, "
-        f"protocols {_counted(summary['protocols'])}"
-    )
-    tags = Table("tag", "body", "lever arm (m)")
-    for tag in summary["tags"]:
-        tags.add_row(str(tag["tag"]), _plain(tag["body"]), " ".join(f"{v:+.3f}" for v in tag["lever_arm_m"]))
-    pairs = Table("initiator", "target", "exchanges", "rate (Hz)", "success")
-    for pair in summary["pairs"]:
-        rate = "" if pair["rate_hz"] is None else f"{pair['rate_hz']:.1f}"
-        tried = pair["exchanges"] + pair["failed"]
-        success = f"{100 * pair['exchanges'] / tried:.1f} %" if tried else ""
-        pairs.add_row(str(pair["initiator"]), str(pair["target"]), str(pair["exchanges"]), rate, success)
-    for table in (tags, pairs):
-        console.print(table)
-    console.print(f"poses: {_counted(summary['poses'])}")
-    console.print(f"faults: {_counted(summary['faults'])}")
-    for key, value in summary["provenance"].items():
-        console.print(f"  {_plain(key)}: {_plain(value)}")
+def counted(counts: Mapping[str, int]) -> str:
+    """Return names with their numbers, or `none`."""
+    return ", ".join(f"{printable(name)} {count}" for name, count in counts.items()) or "none"
 
 
-def progress_table(progress: Progress) -> Table:
-    """Return a recorder's progress as a table: rate and success of each pair, last range and power, faults."""
-    from rich.table import Table
-
-    table = Table(title=f"{progress.time_s:.1f} s, {progress.exchanges} of {progress.tried} exchanges")
-    for name in ("pair", "rate (Hz)", "success", "range (m)", "FPP (dBm)"):
-        table.add_column(name, justify="right")
-    for (initiator, target), pair in progress.pairs.items():
-        table.add_row(
-            f"{initiator} -> {target}",
-            f"{pair.rate_hz(progress.time_s):.1f}",
-            f"{100 * pair.good / pair.tried:.0f} %" if pair.tried else "",
-            f"{pair.range_m:.3f}" if pair.good else "",
-            f"{pair.fpp_dbm:.1f}" if pair.good else "",
-        )
-    last = f"\n{_plain(progress.last_fault)}" if progress.last_fault else ""
-    table.caption = f"faults: {_counted(progress.faults)}{last}"
-    return table
+def _by_name(names: Any) -> dict[str, int]:
+    return dict(sorted(Counter(names).items()))
 
 
-def _counted(counts: dict[str, int]) -> str:
-    return ", ".join(f"{_plain(name)} {count}" for name, count in counts.items()) or "none"
+def _hertz(pair: PairSummary) -> str:
+    return "" if pair.rate_hz is None else f"{pair.rate_hz:.1f}"
 
 
-def _plain(value: Any) -> str:
-    from rich.markup import escape
-
-    return escape("".join(c if c.isprintable() else "�" for c in str(value)))
+def _rate(pair: PairSummary) -> str:
+    rate = "" if pair.rate_hz is None else f", {_hertz(pair)} Hz"
+    return f"{rate}, {pair.failed} failed" if pair.failed else rate

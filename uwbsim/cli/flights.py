@@ -7,11 +7,14 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
+
+if TYPE_CHECKING:
+    from uwblink.recording.schema import FrameRow
 
 
 def add_to(app: typer.Typer) -> None:
@@ -44,7 +47,7 @@ def run(
     loaded = load(scenario, settings or (), seed)
     with progress(loaded.run.name) as report:
         simulated = simulate(loaded, report, contention=contention)
-    frames: list[tuple[int, str, str, bytes]] = []
+    frames: list[FrameRow] = []
     if wire:
         simulated, frames = through_wire(simulated)
     write(simulated, output, frames=frames, force=force)

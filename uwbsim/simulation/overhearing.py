@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Ints
+from uwblink.recording.schema import CirRow
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT
 from uwblink.twr import Exchanges, RangingProtocol
 from uwbsim.random_streams import stream
@@ -99,7 +100,7 @@ def _heard_by(  # noqa: PLR0913 - the columns of one flight
 
 def responses(
     scenario: Scenario, world: World, protocol: RangingProtocol, exchanges: Exchanges, stamped: Stamped
-) -> list[tuple[int, int, int, int, float, tuple[int, ...]]]:
+) -> list[CirRow]:
     """Return the initiators' impulse responses: of the last frame each received, as the boards print them.
 
     The fraction of the first path's index is that of the stamp: 64 ticks are a tap (the chip interpolates both).
@@ -113,5 +114,5 @@ def responses(
     for time_ns, initiator, target, rx, departure in zip(*(c.tolist() for c in columns), strict=True):
         echoes = world.echoes(place[target], place[initiator], departure)
         index, taps = impulse_response(rng, rx, echoes)
-        rows.append((time_ns, initiator, initiator, target, index / 1000, taps))
+        rows.append(CirRow(time_ns, initiator, initiator, target, index / 1000, taps))
     return rows

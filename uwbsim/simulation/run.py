@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
 from uwblink.ticks import REPORT_BITS, UUS_TICKS
 from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, RangingProtocol, board_range, raw_range
 from uwbsim.errors import ScenarioError
@@ -38,7 +38,7 @@ class Simulated:
     tags: list[Tag]
     faults: list[Fault]
     overheard: dict[str, NDArray[Any]]
-    cirs: list[tuple[int, int, int, int, float, tuple[int, ...]]]
+    cirs: list[CirRow]
     truth_m: Floats
     meta: dict[str, Any]
 
@@ -97,7 +97,7 @@ def write(
     simulated: Simulated,
     path: str | os.PathLike[str],
     *,
-    frames: Sequence[tuple[int, str, str, bytes]] = (),
+    frames: Sequence[FrameRow] = (),
     force: bool = False,
 ) -> None:
     """Write the recording, with the bytes of boards where there are any; raises what `Recording.create` raises."""
@@ -232,6 +232,8 @@ def _faults(run: _Run, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> l
                 str(a),
                 "lost frame" if reason == air.WEAK else reason,
                 f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {reason}",
+                a,
+                b,
             )
         )
     return faults

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from uwblink.recording.schema import FrameRow
 from uwblink.ticks import TICK_S, elapsed
 from uwblink.twr import COLUMNS, ON_BOARDS
 from uwblink.wire.bulk import ColumnDecoder
@@ -15,10 +16,8 @@ from uwblink.wire.messages import RangeReport
 from uwbsim.errors import ScenarioError
 from uwbsim.simulation.run import Simulated
 
-Frame = tuple[int, str, str, bytes]
 
-
-def frames_of(simulated: Simulated) -> list[Frame]:
+def frames_of(simulated: Simulated) -> list[FrameRow]:
     """Return the bytes that the boards would have sent, as a recorder stores them.
 
     Raises `ScenarioError` for a protocol that the boards do not know.
@@ -35,17 +34,17 @@ def frames_of(simulated: Simulated) -> list[Frame]:
     columns = [e.target.tolist(), *(getattr(e, name).tolist() for name in names)]
     reports = (encode(RangeReport(*row)) for row in zip(*columns, strict=True))
     return [
-        (t, f"board {i}", "in", data)
+        FrameRow(t, f"board {i}", "in", data)
         for t, i, data in zip(time_ns.tolist(), e.initiator.tolist(), reports, strict=True)
     ]
 
 
-def through_wire(simulated: Simulated) -> tuple[Simulated, list[Frame]]:
+def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
     """Return a flight whose exchanges were decoded from the boards' bytes, and those bytes."""
     frames = frames_of(simulated)
     decoders = {f"board {i}": ColumnDecoder(int(i)) for i in np.unique(simulated.exchanges.initiator)}
-    for time_ns, name, _, data in frames:
-        decoders[name].feed(data, time_ns)
+    for frame in frames:
+        decoders[frame.board].feed(frame.data, frame.time_ns)
     parts = [d.exchanges() for d in decoders.values()]
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
     order = np.argsort(columns["time_ns"], kind="stable")

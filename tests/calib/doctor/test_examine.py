@@ -109,7 +109,7 @@ def dead(f):
     e = f.exchanges
     keep = (e.initiator != 6) & (e.target != 6)
     failed = [
-        Fault(int(t), "1", "lost frame", "1 ranged with 6: message 1 below sensitivity") for t in e.time_ns[~keep]
+        Fault(int(t), "1", "lost frame", "message 1 below sensitivity", initiator=1, target=6) for t in e.time_ns[~keep]
     ]
     return replace(f, exchanges=e[keep], faults=failed)
 

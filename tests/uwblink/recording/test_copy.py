@@ -8,19 +8,23 @@ import pytest
 
 from tests.uwblink.recording.test_file import random_exchanges
 from uwblink.errors import RecordingError, RecordingExistsError
-from uwblink.recording import file
+from uwblink.recording import store
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, Fault, Poses, Tag
+from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow, Poses, Tag
 
 HEARD = {name: 7.5 if kind == "DOUBLE" else 3 for name, kind in TABLES["overheard"].items()}
-CIRS = [(5, 1, 1, 2, 3.25, (0, 65535, 7)), (4, 1, 1, 2, 3.5, (1, 2, 3)), (6, 2, 2, 1, 0.0, ())]
+CIRS = [
+    CirRow(5, 1, 1, 2, 3.25, (0, 65535, 7)),
+    CirRow(4, 1, 1, 2, 3.5, (1, 2, 3)),
+    CirRow(6, 2, 2, 1, 0.0, ()),
+]
 INSTEAD = {
     "tags": [Tag(9, "z", (0.0, 0.0, 1.0))],
     "poses": Poses(np.array([1]), np.array(["z"]), np.zeros((1, 3)), np.ones((1, 4))),
     "exchanges": random_exchanges(3, seed=2),
     "overheard": {name: np.array([value, value]) for name, value in HEARD.items()},
     "cirs": CIRS[:1],
-    "frames": [(1, "1", "in", b"R01|1\r\n")],
+    "frames": [FrameRow(1, "1", "in", b"R01|1\r\n")],
     "faults": [],
 }
 
@@ -35,13 +39,13 @@ def full(tmp_path):
         r.append_poses(Poses(np.array([6, 5]), np.array(["a", "b"]), np.ones((2, 3)), np.zeros((2, 4))))
         r.append_overheard([HEARD, HEARD | {"time_ns": 1, "fpp3_dbm": np.nan, "skew3_ppm": np.nan}])
         r.append_cirs(CIRS)
-        r.append_frames([(9, "1", "in", bytes(range(256))), (8, "2", "out", b"C01\r")])
-        r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "garbage", "é")])
+        r.append_frames([FrameRow(9, "1", "in", bytes(range(256))), FrameRow(8, "2", "out", b"C01\r")])
+        r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "failed exchange", "é", 2, 1)])
     with duckdb.connect(str(path)) as db:
         db.execute("INSERT INTO exchanges (time_ns, initiator, target, protocol) VALUES (1, 2, 3, 'ds')")
         db.execute("DELETE FROM exchanges WHERE rowid = 5")
         db.execute("INSERT INTO cirs VALUES (9, 1, 1, 2, NULL, NULL)")
-        db.execute("INSERT INTO faults VALUES (9, NULL, 'power', NULL)")
+        db.execute("INSERT INTO faults VALUES (9, NULL, 'power', NULL, NULL, 3)")
     return path
 
 
@@ -56,7 +60,7 @@ def rows(path):
 
 @pytest.mark.parametrize("at_a_time", [1_000_000, 7])
 def test_a_copy_has_every_row_of_every_table(full, tmp_path, monkeypatch, at_a_time):
-    monkeypatch.setattr(file, "ROWS_AT_A_TIME", at_a_time)
+    monkeypatch.setattr(store, "ROWS_AT_A_TIME", at_a_time)
     with Recording.open(full) as source:
         source.copy(tmp_path / "copy.uwb")
     before, after = rows(full), rows(tmp_path / "copy.uwb")
@@ -76,7 +80,7 @@ def test_only_what_is_replaced_differs(full, tmp_path, table):
     assert found | {"meta": sorted(found["meta"])} == expected | {"meta": sorted(expected["meta"])}
 
 
-@pytest.mark.parametrize("table", ["exchanges", "overheard", "poses", "tags", "faults", "frames"])
+@pytest.mark.parametrize("table", ["exchanges", "overheard", "poses", "tags", "faults", "frames", "cirs"])
 def test_what_a_recording_returns_can_replace(full, tmp_path, table):
     with Recording.open(full) as source:
         source.copy(tmp_path / "copy.uwb", replacing={table: getattr(source, table)()})

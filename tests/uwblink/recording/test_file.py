@@ -1,5 +1,8 @@
 """The recording: what goes in comes out, and what is not a recording says so."""
 
+import subprocess
+import sys
+
 import duckdb
 import numpy as np
 import pytest
@@ -108,3 +111,53 @@ def test_a_hostile_view_cannot_read_other_files(recording, tmp_path):
         )
     with pytest.raises(RecordingError, match="cannot be read"), Recording.open(recording) as r:
         r.faults()
+
+
+def test_a_recording_from_before_faults_named_their_exchange_is_read(recording, tmp_path):
+    with duckdb.connect(str(recording)) as db:
+        db.execute("ALTER TABLE faults DROP COLUMN initiator")
+        db.execute("ALTER TABLE faults DROP COLUMN target")
+    with Recording.open(recording) as r:
+        assert r.faults() == [Fault(9, "1", "time-out", "no answer", None, None)]
+        r.copy(tmp_path / "copy.uwb")
+    with Recording.open(tmp_path / "copy.uwb") as r:
+        assert r.faults() == [Fault(9, "1", "time-out", "no answer", None, None)]
+
+
+HOLDER = """
+import sys, duckdb
+db = duckdb.connect(sys.argv[1], read_only=sys.argv[2] == "read")
+print("open", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(
+    ("held", "update", "expected"),
+    [("write", False, "another process is writing it"), ("read", True, "another process has it open")],
+)
+def test_a_file_in_use_elsewhere_says_so(recording, held, update, expected):
+    words = [sys.executable, "-c", HOLDER, str(recording), held]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "open\n"
+        with pytest.raises(RecordingError, match=expected):
+            Recording.open(recording, update=update)
+        process.stdin.close()
+        process.wait()
+    with Recording.open(recording, update=update) as r:
+        assert r.count("exchanges") == 50
+
+
+def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp_path):
+    path = tmp_path / "blocks.uwb"
+    path.write_bytes(b"\0" * len(recording.read_bytes()))
+    with pytest.raises(RecordingError, match=r"not a \.uwb recording, or a truncated one"):
+        Recording.open(path)
+
+
+def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
+    with (
+        Recording.create(tmp_path / "live.uwb", live=True),
+        pytest.raises(RecordingError, match="open in this program"),
+    ):
+        Recording.open(tmp_path / "live.uwb")

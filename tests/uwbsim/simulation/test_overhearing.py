@@ -65,7 +65,7 @@ def test_impulse_responses_agree_with_stamp_and_room():
     result = flight(room=room, get_cir=True)
     assert len(result.cirs) == len(result.exchanges) == 100
     for row, stamp in zip(result.cirs, result.exchanges.rx3.tolist(), strict=True):
-        index, taps = row[4], np.array(row[5])
+        index, taps = row.first_path_index, np.array(row.magnitudes)
         assert len(taps) == 1016
         assert index % 1 == pytest.approx(stamp % 64 / 64, abs=0.001)
         # The floor is 1.5 m below: 5 m instead of 4 m, 3.3 ns or taps later.

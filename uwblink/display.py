@@ -1,0 +1,64 @@
+"""How tables look in a terminal and in a notebook: short, whatever they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+SHOWN_ROWS: Final = 6
+WIDTH: Final = 79
+
+
+def printable(value: Any) -> str:
+    """Return text in which nothing steers a terminal; what a file says may come from anyone."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(value))
+
+
+def excerpt(columns: Mapping[str, NDArray[Any]]) -> list[list[str]]:
+    """Return the names of columns, and as text their first rows and the last one where there are more."""
+    count = len(next(iter(columns.values())))
+    rows = list(range(count)) if count <= SHOWN_ROWS else [*range(SHOWN_ROWS - 1), count - 1]
+    table = [list(columns), *([_cell(column[k]) for column in columns.values()] for k in rows)]
+    if count > SHOWN_ROWS:
+        table.insert(-1, ["..."] * len(columns))
+    return table
+
+
+def as_text(title: str, table: Sequence[Sequence[str]]) -> str:
+    """Return a title and a table of cells, right-aligned; columns that do not fit on a line are left out and named."""
+    widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
+    fitting = sum(1 for k in range(len(widths)) if sum(widths[: k + 1]) + 2 * (k + 1) <= WIDTH)
+    lines = ["".join(f"  {cell:>{width}}" for cell, width in zip(row[:fitting], widths, strict=False)) for row in table]
+    left_out = ", ".join(table[0][fitting:])
+    more = [cut(f"  and {left_out}")] if left_out else []
+    return "\n".join([title, *lines, *more])
+
+
+def as_html(title: str, table: Sequence[Sequence[str]]) -> str:
+    """Return the same as HTML, with all columns, in a box that scrolls sideways."""
+    head = "".join(f"<th>{escape(name)}</th>" for name in table[0])
+    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in table[1:])
+    return (
+        f"<div style='overflow-x:auto'><p>{escape(title)}</p>"
+        f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
+
+
+def cut(line: str) -> str:
+    """Return a line that fits on a screen."""
+    return line if len(line) <= WIDTH else line[: WIDTH - 3] + "..."
+
+
+def first_few(items: Iterable[str], most: int = SHOWN_ROWS) -> str:
+    """Return words with commas between; how many more there are after the first ones; `none` for nothing."""
+    listed = list(items)
+    more = f" and {len(listed) - most} more" if len(listed) > most else ""
+    return (", ".join(listed[:most]) + more) or "none"
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float | np.floating) else printable(value)

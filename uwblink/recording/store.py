@@ -1,0 +1,186 @@
+"""Tables of a recording in a DuckDB file: columns in, columns out, and every error with the file's name.
+
+Files from strangers are data: they are opened read-only and with every access to other files switched off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.errors import RecordingError
+from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
+
+if TYPE_CHECKING:
+    import duckdb
+
+HEADER_BYTES: Final = 3 * 4096
+BLOCK_BYTES: Final = 16_384
+"""Smallest block of a DuckDB file; every larger one is a multiple of it."""
+
+ROWS_AT_A_TIME: Final = 100_000
+"""Rows that a copy holds in memory at once; of impulse responses, which are the largest, 0.2 GB."""
+
+
+class Store:
+    """An open file with the tables of `TABLES`; `path` is what messages call it."""
+
+    def __init__(self, connection: duckdb.DuckDBPyConnection, path: Path) -> None:
+        """Wrap an open connection."""
+        self._db = connection
+        self.path = path
+
+    @classmethod
+    def create(cls, place: Path, path: Path) -> Self:
+        """Make a file at `place` with empty tables, for a recording that is called `path`; raises `RecordingError`."""
+        import duckdb
+
+        try:
+            store = cls(duckdb.connect(str(place)), path)
+        except duckdb.Error as error:
+            raise RecordingError(f"{path}: cannot be written ({_first_line(error)})") from error
+        for table, columns in TABLES.items():
+            spec = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            store.execute(f"CREATE TABLE {table} ({spec})")
+        return store
+
+    @classmethod
+    def open(cls, path: Path, *, update: bool) -> Self:
+        """Open a file for reading, or to `update` it; raises `RecordingError` for what is none, or is in use."""
+        import duckdb
+
+        _check_length(path)
+        config: dict[str, Any] = {"enable_external_access": "false", "lock_configuration": "true"}
+        try:
+            store = cls(duckdb.connect(str(path), read_only=not update, config=config), path)
+        except duckdb.ConnectionException as error:
+            raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error
+        except duckdb.IOException as error:
+            if _is_locked(path, update=update):
+                use = "has it open" if update else "is writing it"
+                raise RecordingError(f"{path}: another process {use}; wait until that ends") from error
+            raise _damaged(path, error) from error
+        except duckdb.Error as error:
+            raise _damaged(path, error) from error
+        try:
+            store.check_columns()
+        except RecordingError:
+            store.close()
+            raise
+        return store
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    def execute(self, statement: str, values: list[Any] | None = None) -> None:
+        """Execute a statement of SQL."""
+        self._db.execute(statement, values)
+
+    def insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Add rows from columns with the table's names; what is masked in them is missing in the table."""
+        names = [name for name in TABLES[table] if name in columns]
+        if not len(columns[names[0]]):
+            return
+        batch: dict[str, NDArray[Any]] = {}
+        values = []
+        for name in names:
+            column = columns[name]
+            batch[name] = np.ascontiguousarray(np.ma.getdata(column))
+            values.append(f'"{name}"')
+            if np.ma.is_masked(column):
+                batch[f"no_{name}"] = np.ma.getmaskarray(column)
+                values[-1] = f'CASE WHEN "no_{name}" THEN NULL ELSE "{name}" END'
+        listed = ", ".join(f'"{name}"' for name in names)
+        self._db.register("batch", batch)
+        self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch")  # noqa: S608 - keys of TABLES
+        self._db.unregister("batch")
+
+    def read(self, query: str) -> dict[str, NDArray[Any]]:
+        """Return what a query finds, as columns; masked where it is missing. Raises `RecordingError`."""
+        import duckdb
+
+        try:
+            return dict(self._db.execute(query).fetchnumpy())
+        except duckdb.Error as error:
+            raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({_first_line(error)})") from error
+
+    def take(self, source: Store, table: str) -> None:
+        """Add all rows of another file's table in their order, missing values included, some at a time."""
+        names = ", ".join(f'"{name}"' for name in source.columns()[table] & TABLES[table].keys())
+        (last,) = source.read(f"SELECT max(rowid) AS last FROM {table}")["last"]  # noqa: S608 - a key of TABLES
+        for start in range(0, 0 if last is np.ma.masked else int(last) + 1, ROWS_AT_A_TIME):
+            piece = f"rowid >= {start} AND rowid < {start + ROWS_AT_A_TIME} ORDER BY rowid"
+            self.insert(table, source.read(f"SELECT {names} FROM {table} WHERE {piece}"))  # noqa: S608 - keys of TABLES
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Have everything inserted in the block written at once, or not at all; raises `RecordingError`."""
+        import duckdb
+
+        try:
+            self.execute("BEGIN")
+            yield
+            self.execute("COMMIT")
+        except duckdb.Error as error:
+            with suppress(duckdb.Error):
+                self.execute("ROLLBACK")
+            raise RecordingError(
+                f"{self.path}: cannot be written any more ({_first_line(error)}); is the disk full? "
+                "What was written before is kept"
+            ) from error
+
+    def columns(self) -> dict[str, set[str]]:
+        """Return the names of the columns of each table that the file has."""
+        found: dict[str, set[str]] = {}
+        rows = self.read(
+            "SELECT table_name AS t, column_name AS c FROM information_schema.columns WHERE table_schema = 'main'"
+        )
+        for table, column in zip(rows["t"], rows["c"], strict=True):
+            found.setdefault(str(table), set()).add(str(column))
+        return found
+
+    def check_columns(self) -> None:
+        """Raise `RecordingError` where the file lacks a table or a column of those that recordings always had."""
+        found = self.columns()
+        if "meta" not in found:
+            raise RecordingError(f"{self.path}: a DuckDB file, but not a {SUFFIX} recording (no table meta)")
+        for table, columns in TABLES.items():
+            missing = sorted(columns.keys() - found.get(table, set()) - ADDED_LATER.get(table, frozenset()))
+            if missing:
+                raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
+
+
+def _is_locked(path: Path, *, update: bool) -> bool:
+    """Whether another process holds the lock that DuckDB takes on a file it writes, or reads."""
+    try:
+        import fcntl
+    except ImportError:  # not a POSIX system, where opening the file says it
+        return False
+    try:
+        with path.open("r+b" if update else "rb") as file:
+            fcntl.lockf(file, (fcntl.LOCK_EX if update else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _damaged(path: Path, error: Exception) -> RecordingError:
+    return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({_first_line(error)})")
+
+
+def _check_length(path: Path) -> None:
+    """A DuckDB file is headers and whole blocks; one that was cut is not, and may still open."""
+    if path.stat().st_size % BLOCK_BYTES != HEADER_BYTES % BLOCK_BYTES:
+        raise RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one (its length is odd)")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]
