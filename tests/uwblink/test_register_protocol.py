@@ -124,6 +124,7 @@ def test_names_are_taken_once(registered):
         PROTOCOLS.remove("ss")
 
 
+SOON = ProtocolMessage("target", "rx1", "soon")  # type: ignore[arg-type]
 FOURTH = ProtocolMessage("target", "rx3", "at once")
 
 
@@ -159,7 +160,7 @@ def backwards(t):
             {"messages": (POLL, REPLY, ProtocolMessage("target", "rx1", "at once"))},
             "3 is from the target after rx1, expected from the target after tx2 or from the initiator after rx2",
         ),
-        ({"messages": (POLL, replace(REPLY, timing="soon"))}, "2: timing: found 'soon', allowed: at once, scheduled"),
+        ({"messages": (POLL, SOON)}, "2: timing: found 'soon', allowed: at once, scheduled"),
         ({"flight_ticks": "(dt41 - dt32) / 2"}, "flight_ticks: found '.*', expected a function"),
         ({"delay_weights": None}, "delay_weights: found None, expected a function"),
         ({"flight_ticks": doubled}, r"flight_ticks finds 2000 ticks where an exchange without noise took 1000$"),
@@ -177,4 +178,4 @@ def test_what_cannot_work_is_refused_in_one_line(change, expected):
 
 def test_what_is_no_protocol_is_refused():
     with pytest.raises(ArgumentError, match="found 'ds', expected a RangingProtocol"):
-        register_protocol("ds")
+        register_protocol("ds")  # type: ignore[arg-type]

@@ -106,7 +106,8 @@ def columns_of(reports, protocol):
     stamps = {name: ints(name) for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")}
     ranges = np.array([r.range_m for r in reports])
     return Exchanges(
-        none, none, none, np.full(len(reports), protocol), none, ranges, **stamps,
+        time_ns=none, initiator=none, target=none, protocol=np.full(len(reports), protocol), reporter=none,
+        range_m=ranges, **stamps,
         fpp1_dbm=levels, fpp2_dbm=levels, skew1_ppm=levels, skew2_ppm=levels, truth_m=levels,
     )  # fmt: skip
 
