@@ -50,7 +50,7 @@ def test_a_listener_is_told_bytes_turns_and_faults(tmp_path):
     with Recording.open(tmp_path / "f.uwb") as recording:
         assert [f.detail for f in listener.faults] == [f.detail for f in recording.faults()]
         for way in ("in", "out"):
-            assert listener.bytes[way] == b"".join(f[3] for f in recording.frames() if f[2] == way)
+            assert listener.bytes[way] == b"".join(f.data for f in recording.frames() if f.direction == way)
 
 
 def test_a_listener_that_raises_ends_the_recording_with_everything_before_in_the_file(tmp_path):
