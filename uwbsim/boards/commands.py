@@ -34,7 +34,6 @@ from uwblink.wire.messages import (
     COMMANDS,
     Bootloader,
     Broadcast,
-    BroadcastReceived,
     BroadcastSent,
     DoTests,
     EnteringBootloader,
@@ -53,21 +52,22 @@ from uwblink.wire.messages import (
     SetPassive,
     SetResponseDelay,
 )
+from uwbsim.boards.board_air import MS, US
 from uwbsim.boards.command_parser import READABLE
+from uwbsim.boards.frames import DataPayload
 from uwbsim.boards.printing import printed_float
+from uwbsim.boards.ranging import TO_AIR, initiate
 from uwbsim.errors import UwbsimError
 
 if TYPE_CHECKING:
     from uwbsim.boards.virtual_board import VirtualBoard
 
-US: Final = 1_000
-MS: Final = 1_000_000
 BOOTLOADER_AFTER: Final = 103 * MS
 ANSWER: Final = 195 * US
 """From the poll of the USB buffer that found a command to its answer on the bus."""
 
-TO_AIR: Final = 330 * US
-"""From the poll of the USB buffer that found a command to the time stamp of its frame: set-up and half a preamble."""
+TO_SENT: Final = 930 * US
+"""From the start of a broadcast's frame to its answer on the bus."""
 
 TOO_LONG: Final = b"ERROR: Requested to send message over UWB that is too long."
 
@@ -103,7 +103,9 @@ def _get_id(board: VirtualBoard) -> Message:
     return IdReport(board.id)
 
 
-def _reset(_board: VirtualBoard) -> Message:
+def _reset(board: VirtualBoard) -> Message:
+    if not board.radio.sending:
+        board.radio.listen()
     return ResetDone()
 
 
@@ -128,25 +130,26 @@ def _set_delay(board: VirtualBoard, delay_uus: int) -> Message:
 
 def _bootloader(board: VirtualBoard) -> Attempt:
     yield from board.answer(EnteringBootloader())
-    yield board.bench.env.timeout(BOOTLOADER_AFTER)
-    board.power_off()
+    board.sleep(BOOTLOADER_AFTER).callbacks.append(lambda _: board.power_off())
+    yield board.sleep(2 * BOOTLOADER_AFTER)
     return True
 
 
 def _broadcast(board: VirtualBoard, data: bytes) -> Attempt:
     if len(data) > LONGEST_BROADCAST:
         board.say(TOO_LONG, ANSWER)
-        yield board.bench.env.timeout(MS)
+        yield board.sleep(MS)
         return False
-    yield board.bench.env.timeout(TO_AIR)
-    board.send_to_all(BroadcastReceived(data))
-    yield board.bench.env.timeout(790 * US)
+    board.radio.off()
+    yield board.sleep(TO_AIR - board.bench.air.before_marker)
+    board.radio.send(None, DataPayload(data), board.radio.first_stamp())
+    yield board.sleep(TO_SENT)
     board.say(BroadcastSent())
     return True
 
 
 def _range(board: VirtualBoard, target: int, target_reports: bool, double_sided: bool, get_cir: bool) -> Attempt:
-    return board.range_with(target % 256, target_reports, double_sided, get_cir)
+    return initiate(board, target % 256, target_reports, double_sided, get_cir)
 
 
 EXECUTORS: Final[dict[bytes, Executor]] = {}

@@ -18,7 +18,8 @@ from typing import Final
 import numpy as np
 
 from uwblink.boards.pseudo_terminals import Terminal
-from uwbsim.boards.virtual_board import MS, NS_PER_S, Bench
+from uwbsim.boards.board_air import MS, NS_PER_S
+from uwbsim.boards.virtual_board import Bench
 from uwbsim.random_streams import stream
 from uwbsim.scenario.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
 from uwbsim.scenario.model import Scenario

@@ -18,7 +18,8 @@ from collections.abc import Sequence
 
 from uwblink.boards.ports import Transport
 from uwblink.errors import PortLostError, PortMissingError
-from uwbsim.boards.virtual_board import NS_PER_S, Bench
+from uwbsim.boards.board_air import NS_PER_S
+from uwbsim.boards.virtual_board import Bench
 from uwbsim.scenario.model import Scenario
 
 
@@ -50,7 +51,7 @@ class VirtualPorts:
         if tag is None or not self.bench.boards[tag].powered:
             raise PortMissingError(f"{name}: no such port; there are {', '.join(self.names.values())}")
         port = self.port(tag)
-        port.waiting = b""
+        port.waiting.clear()
         self._opened.append(port)
         return port
 
@@ -97,7 +98,7 @@ class VirtualPort:
         """Belong to a set of ports."""
         self._ports, self.tag = ports, tag
         self.name = ports.names[tag]
-        self.waiting = b""
+        self.waiting = bytearray()
 
     def read(self, timeout_s: float) -> bytes:
         """Let time pass until something comes, or the time is over; raises `PortLostError` at an unplugged board."""
@@ -108,7 +109,8 @@ class VirtualPort:
         if not self.waiting:
             self._check()
             bench.advance(until_ns)
-        data, self.waiting = self.waiting, b""
+        data = bytes(self.waiting)
+        self.waiting.clear()
         return data
 
     def write(self, data: bytes) -> None:
@@ -122,7 +124,7 @@ class VirtualPort:
 
     def close(self) -> None:
         """Forget what was not read."""
-        self.waiting = b""
+        self.waiting.clear()
 
     def _check(self) -> None:
         if not self._ports.bench.boards[self.tag].powered:

@@ -10,8 +10,9 @@ from tests.boards import bench_scenario
 from uwblink.boards.board import Board
 from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
+from uwbsim.boards.board_air import MS
 from uwbsim.boards.command_parser import atoi, read
-from uwbsim.boards.commands import EXECUTORS, MS, register_command
+from uwbsim.boards.commands import EXECUTORS, register_command
 from uwbsim.boards.printing import printed_float
 from uwbsim.boards.virtual_port import VirtualPorts
 from uwbsim.errors import UwbsimError

@@ -1,0 +1,198 @@
+"""Frames between virtual boards: what they carry, when they leave, and what every other board makes of them.
+
+The same clocks, radios and firmware arithmetic as in a batch simulation, for one frame at a time, whose instant is
+known only when a command arrives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, UUS_TICKS
+from uwbsim.random_streams import stream
+from uwbsim.scenario.airtime import FINAL_BYTES, POLL_BYTES, RESPONSE_BYTES
+from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.timestamps import draw_reply_s, reception
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.lookahead import SampledWorld
+from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
+from uwbsim.world.world import World
+
+MASK: Final = (1 << REPORT_BITS) - 1
+DATA_BYTES: Final = 8
+"""A broadcast's frame besides its payload (firmware wire format, 2.1)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PollPayload:
+    """Signal 1: what the initiator wants."""
+
+    target_reports: bool
+    double_sided: bool
+    get_cir: bool
+    length = POLL_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class ResponsePayload:
+    """Signal 2 of a double-sided exchange."""
+
+    length = RESPONSE_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class FinalPayload:
+    """The last signal of either side: stamps of its sender as printed, power and skew of the first it received."""
+
+    stamps: tuple[int, int, int]
+    power_dbm: float
+    skew_ppm: float
+    length = FINAL_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class DataPayload:
+    """A broadcast."""
+
+    data: bytes
+
+    @property
+    def length(self) -> int:
+        """Return the length of the frame in bytes."""
+        return DATA_BYTES + len(self.data)
+
+
+Payload = PollPayload | ResponsePayload | FinalPayload | DataPayload
+
+
+@dataclass(frozen=True, slots=True)
+class Receptions:
+    """A frame at all boards, shape (tags,): power at the antenna, whether it is strong enough and not lost, its stamp
+    (ticks, not wrapped), and what is printed of it. `echoes` are added where an impulse response is asked for."""
+
+    power_dbm: Floats
+    heard: Bools
+    stamp: Ints
+    printed_dbm: Floats
+    skew_ppm: Floats
+
+
+@dataclass(slots=True)
+class Frame:
+    """A frame on the air, or about to be.
+
+    `stamp` is the sender's transmit stamp (ticks, not wrapped), `departure` the true time (sub-ticks) at which its
+    marker leaves, `start` and `end` when it is on the air (ns). `receiver` is None for a broadcast. `excess_m` is the
+    detour between the two boards of an exchange. A frame that was `cancelled` before its start is never sent.
+    """
+
+    sender: int
+    receiver: int | None
+    payload: Payload
+    stamp: int
+    departure: int
+    receptions: Receptions
+    excess_m: float
+    start: int = 0
+    end: int = 0
+    cancelled: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A frame as one board received it: its stamp (ticks, not wrapped), printed power and skew."""
+
+    frame: Frame
+    stamp: int
+    power_dbm: float
+    skew_ppm: float
+
+
+class Radios:
+    """The radios of a scenario's tags; `lost_share` of all receptions fail besides the weak ones."""
+
+    def __init__(self, scenario: Scenario, lost_share: float = 0.0) -> None:
+        """Set up world and clocks; chance comes from the scenario's seed."""
+        self.scenario = scenario
+        self.world = World.of(scenario)
+        self.sampled_world = SampledWorld(self.world)
+        self.clocks = Clocks.of(scenario)
+        self.lost_share = lost_share
+        self.place = {tag.id: k for k, tag in enumerate(scenario.tags)}
+        self._all = np.arange(len(scenario.tags))
+        self._delays = np.array([t.delays_ns() for t in scenario.tags]) * 1e-9 * SUBTICKS_PER_SECOND
+        self._chance = stream(scenario.run.seed, "boards")
+
+    def next_stamp(self, board: int, time: int) -> int:
+        """Return the first transmit stamp that a board's clock allows at or after a true time (sub-ticks)."""
+        me = self._one(board)
+        ready = -(-int(self.clocks.read(me, np.array([time]))[0]) // SUBTICKS)
+        return _on_grid(ready) + ANTENNA_DELAY_TICKS
+
+    def reply_stamp(self, received: int) -> int:
+        """Return the transmit stamp of a reply sent at once to what was received at a stamp; its latency is drawn."""
+        latency = round(float(draw_reply_s(self.scenario, self._chance, 1)[0]) / TICK_S)
+        return _on_grid(received + latency - ANTENNA_DELAY_TICKS) + ANTENNA_DELAY_TICKS
+
+    def excess_m(self) -> float:
+        """Draw the detour of an exchange's signals."""
+        multipath = self.scenario.radio.multipath
+        if multipath and self._chance.random() < multipath.probability:
+            return float(self._chance.exponential(multipath.mean_excess_m))
+        return 0.0
+
+    def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
+        """Return a frame that leaves at a transmit stamp of its sender's clock, and how every board receives it."""
+        jitter = self._chance.normal() * self.scenario.radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
+        place = self.place[sender]
+        left = stamp * SUBTICKS + round(jitter - self._delays[place, 0])
+        departure = int(self.clocks.when(self._one(sender), np.array([left]))[0])
+        excess = np.zeros(len(self._all))
+        if receiver in self.place:
+            excess[self.place[receiver]] = excess_m
+        return Frame(sender, receiver, payload, stamp, departure, self._receptions(place, departure, excess), excess_m)
+
+    def received(self, frame: Frame, board: int) -> Received:
+        """Return what one board has of a frame."""
+        at, k = frame.receptions, self.place[board]
+        return Received(frame, int(at.stamp[k]), float(at.printed_dbm[k]), float(at.skew_ppm[k]))
+
+    def echoes(self, sender: int, receiver: int, time: int) -> list[tuple[float, float]]:
+        """Return the reflections at a board, as `World.echoes` does."""
+        return self.world.echoes(self.place[sender], self.place[receiver], time)
+
+    def _receptions(self, sender: int, departure: int, excess_m: Floats) -> Receptions:
+        radio, chance, count = self.scenario.radio, self._chance, len(self._all)
+        link = self.sampled_world.from_sender(sender, departure)
+        noise = chance.normal(size=(4, count))
+        heard = link.power_dbm + noise[0] * radio.power_noise_db >= radio.sensitivity_dbm
+        heard &= chance.random(count) >= self.lost_share
+        late_s = reception_bias_s(radio, link.power_dbm, link.total_dbm)
+        late_s = late_s + noise[1] * reception_noise_s(radio, link.power_dbm)
+        way = link.distance_m + link.excess_m + excess_m
+        arrival = departure + np.rint(way / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND).astype(np.int64)
+        stamp = reception(self.clocks, self._all, arrival, late_s, self._delays[:, 1])
+        rate = self.clocks.rate(self._all, np.full(count, departure))
+        power = printed_power_dbm(radio, link.power_dbm, noise[2])
+        skew = printed_skew_ppm(radio, (rate - rate[sender]) * 1e6, noise[3])
+        return Receptions(link.power_dbm, heard, stamp, power, skew)
+
+    def _one(self, board: int) -> Ints:
+        return np.array([self.place[board]])
+
+
+def scheduled_stamp(reference: int, delay_uus: int) -> int:
+    """Return the transmit stamp of a frame that is to leave a while after the stamp `reference`.
+
+    The chip ignores the low nine bits of the time at which it is told to send.
+    """
+    due = reference + delay_uus * UUS_TICKS
+    return due // DELAYED_TX_GRID * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS
+
+
+def _on_grid(ticks: int) -> int:
+    return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID

@@ -1,0 +1,201 @@
+"""Ranging as the firmware does it: the initiator's side in the USB task, the target's in the interrupt's.
+
+Each waits for a frame as the firmware does, takes whatever comes first, and gives up on anything else than what it
+waits for (firmware wire format, 3.1 and 3.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import simpy
+
+from uwblink.ticks import REPORT_BITS
+from uwblink.twr import Exchanges, board_range
+from uwblink.wire.codec import encode
+from uwblink.wire.messages import Cir, RangeReport, TargetRangeReport
+from uwbsim.boards.board_air import MS, US
+from uwbsim.boards.frames import (
+    MASK,
+    FinalPayload,
+    Frame,
+    Payload,
+    PollPayload,
+    Received,
+    ResponsePayload,
+    scheduled_stamp,
+)
+from uwbsim.world.impulse_response import impulse_response, in_transfers
+
+if TYPE_CHECKING:
+    from uwbsim.boards.virtual_board import VirtualBoard
+
+TO_AIR: Final = 330 * US
+"""From the poll of the USB buffer that found a command to the time stamp of its frame: set-up and half a preamble."""
+
+TO_FINAL: Final = 136 * US
+"""From the end of the target's last frame to the start of the initiator's final."""
+
+TO_REPORT: Final = 474 * US
+"""From the end of the last frame to the report on the bus: read-out, arithmetic, printing."""
+
+TO_CIR: Final = (3_800 * US, 6_000 * US)
+"""From a report to the first piece of its impulse response: read-out over SPI, and 1016 magnitudes."""
+
+SINGLE_SIDED_DELAY_UUS: Final = 1500
+"""The reply of a single-sided exchange is not settable on the boards (firmware wire format, 0.5)."""
+
+SHORTEST_WORKING_DELAY_UUS: Final = 265
+"""Below this many the delayed transmission would start in the past (firmware wire format, 3.6)."""
+
+LONGEST_ACCEPTED_DELAY_UUS: Final = 32_767
+OWN_ID: Final = b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n"
+
+Steps = Generator[simpy.Event, Any, None]
+Attempt = Generator[simpy.Event, Any, bool]
+Answers = Generator[simpy.Event, Any, "tuple[Received, Received] | None"]
+
+
+def is_expected(received: Received | None, payload: type[Payload], sender: int, receiver: int) -> bool:
+    """Whether what came is what was waited for; boards look at type and both ids."""
+    if received is None:
+        return False
+    frame = received.frame
+    return isinstance(frame.payload, payload) and (frame.sender, frame.receiver) == (sender, receiver)
+
+
+def initiate(board: VirtualBoard, target: int, target_reports: bool, double_sided: bool, get_cir: bool) -> Attempt:
+    """Range with a target, one try (C05)."""
+    if target == board.id:
+        return (yield from board.answer(OWN_ID))
+    radio = board.radio
+    radio.off()
+    board.ranging = radio.masked = True
+    yield board.sleep(TO_AIR - board.bench.air.before_marker)
+    wish = PollPayload(target_reports, double_sided, get_cir)
+    poll = radio.send(target, wish, radio.first_stamp(), board.bench.radios.excess_m())
+    answers = yield from _answers(board, poll, double_sided)
+    if answers is not None:
+        yield from _report(board, poll, wish, *answers)
+    board.ranging = radio.masked = False
+    radio.listen()
+    return answers is not None
+
+
+def _answers(board: VirtualBoard, poll: Frame, double_sided: bool) -> Answers:
+    """Wait for the target's frames: its first and its last."""
+    first = None
+    if double_sided:
+        first = yield from board.radio.wait()
+        if first is None or not is_expected(first, ResponsePayload, poll.receiver or 0, board.id):
+            return None
+    last = yield from board.radio.wait()
+    if last is None or not is_expected(last, FinalPayload, poll.receiver or 0, board.id):
+        return None
+    return first or last, last
+
+
+def _report(board: VirtualBoard, poll: Frame, wish: PollPayload, first: Received, last: Received) -> Steps:
+    """Print the report; before it send the final if the target reports too, after it print the impulse response."""
+    came, target = last.frame.payload, poll.receiver or 0
+    if not isinstance(came, FinalPayload):
+        raise TypeError("the last frame of a target is its final")
+    mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if wish.double_sided else 0
+    if wish.target_reports:
+        yield board.sleep(TO_FINAL)
+        final = FinalPayload(mine, first.power_dbm, first.skew_ppm)
+        board.radio.send(target, final, board.radio.first_stamp(), poll.excess_m)
+    yield board.sleep(TO_REPORT - (TO_FINAL if wish.target_reports else 0))
+    powers = came.power_dbm, first.power_dbm, came.skew_ppm, first.skew_ppm
+    board.say(range_report(target, _in_order(mine, came.stamps), powers))
+    if wish.get_cir:
+        yield from print_cir(board, board.id, target, last)
+
+
+def answer(board: VirtualBoard, received: Received) -> Steps:
+    """Answer a poll: response and delayed final, or the final alone; report if the initiator's final comes."""
+    wish, initiator, radio = received.frame.payload, received.frame.sender, board.radio
+    if not isinstance(wish, PollPayload):
+        raise TypeError("only a poll is answered")
+    excess = received.frame.excess_m
+    if wish.double_sided:
+        first = board.bench.radios.reply_stamp(received.stamp)
+        yield radio.over(radio.send(initiator, ResponsePayload(), first, excess))
+        if not SHORTEST_WORKING_DELAY_UUS <= board.delay_uus <= LONGEST_ACCEPTED_DELAY_UUS:
+            return
+        last = scheduled_stamp(first, board.delay_uus)
+    else:
+        first = last = scheduled_stamp(received.stamp, SINGLE_SIDED_DELAY_UUS)
+    mine = received.stamp & MASK, first & MASK, last & MASK if wish.double_sided else 0
+    radio.send(initiator, FinalPayload(mine, received.power_dbm, received.skew_ppm), last, excess)
+    if not wish.target_reports:
+        return
+    came = yield from radio.wait()
+    if came is None or not is_expected(came, FinalPayload, initiator, board.id):
+        return
+    yield from _target_report(board, mine, received, came, get_cir=wish.get_cir)
+
+
+def _target_report(
+    board: VirtualBoard, mine: tuple[int, int, int], poll: Received, came: Received, *, get_cir: bool
+) -> Steps:
+    theirs, initiator = came.frame.payload, poll.frame.sender
+    if not isinstance(theirs, FinalPayload):
+        raise TypeError("a target reports after a final")
+    yield board.sleep(TO_REPORT)
+    if get_cir:
+        yield from print_cir(board, initiator, board.id, came)
+    powers = poll.power_dbm, theirs.power_dbm, poll.skew_ppm, theirs.skew_ppm
+    report = range_report(initiator, _in_order(theirs.stamps, mine), powers)
+    board.say(TargetRangeReport(*(getattr(report, name) for name in RangeReport.FIELDS)))
+
+
+def _in_order(initiator: tuple[int, int, int], target: tuple[int, int, int]) -> dict[str, int]:
+    """Return the stamps of an exchange by name from those of its two boards."""
+    tx1, rx2, rx3 = initiator
+    rx1, tx2, tx3 = target
+    return {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
+
+
+def range_report(neighbour: int, stamps: dict[str, int], powers: tuple[float, float, float, float]) -> RangeReport:
+    """Return the report of an exchange, with the range that the boards compute from the same stamps."""
+    fpp1, fpp2, skew1, skew2 = powers
+    none = np.zeros(1, dtype=np.int64)
+    exchange = Exchanges(
+        time_ns=none,
+        initiator=none,
+        target=none,
+        protocol=np.array(["ds" if stamps["rx3"] or stamps["tx3"] else "ss"]),
+        reporter=none,
+        range_m=none.astype(np.float64),
+        fpp1_dbm=np.array([fpp1]),
+        fpp2_dbm=np.array([fpp2]),
+        skew1_ppm=np.array([skew1]),
+        skew2_ppm=np.array([skew2]),
+        truth_m=none.astype(np.float64),
+        bits=REPORT_BITS,
+        **{name: np.array([stamp], dtype=np.int64) for name, stamp in stamps.items()},
+    )
+    return RangeReport(
+        neighbour,
+        float(board_range(exchange)[0]),
+        **stamps,
+        fpp1_dbm=fpp1,
+        fpp2_dbm=fpp2,
+        skew1_ppm=skew1,
+        skew2_ppm=skew2,
+    )
+
+
+def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) -> Steps:
+    """Print the impulse response of the last frame received, a piece a millisecond; other tasks run between them."""
+    yield board.sleep(int(board.chance.integers(*TO_CIR)))
+    board.release()
+    frame = last.frame
+    echoes = board.bench.radios.echoes(frame.sender, board.id, frame.departure)
+    index, taps = impulse_response(board.chance, last.stamp & MASK, echoes)
+    for piece in in_transfers(encode(Cir(initiator, target, index, taps))):
+        board.say(piece)
+        yield board.sleep(MS + int(board.chance.integers(0, 120 * US)))
