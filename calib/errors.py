@@ -1,12 +1,24 @@
-"""Everything `calib` raises, in the two kinds that differ in exit status."""
+"""Everything `calib` raises, in the two kinds that differ in exit status.
+
+Texts are for those who call functions: they name parameters, in backticks. The command line puts its flags in their
+place (`calib.cli.flags`).
+"""
 
 
 class CalibError(Exception):
-    """Base of the errors of this package; the text says what, where and what to do."""
+    """Base of the errors of this package; the text says what, where and what to do.
+
+    `parameter` is the name of the parameter that is at fault, where it is one.
+    """
+
+    def __init__(self, text: str, *, parameter: str | None = None) -> None:
+        """Say what, where and what to do; a parameter's name goes before the text."""
+        super().__init__(f"`{parameter}`: {text}" if parameter else text)
+        self.parameter = parameter
 
 
 class BadInputError(CalibError, ValueError):
-    """A file or an option that cannot be used: exit status 2."""
+    """A file or an argument that cannot be used: exit status 2."""
 
 
 class UnanswerableError(CalibError, ValueError):
@@ -15,7 +27,7 @@ class UnanswerableError(CalibError, ValueError):
     `undetermined` are groups of tags whose delays the data leave free, where that is the reason.
     """
 
-    def __init__(self, text: str, undetermined: list[list[int]] | None = None) -> None:
+    def __init__(self, text: str, *, parameter: str | None = None, undetermined: list[list[int]] | None = None) -> None:
         """Say what, where and what to do."""
-        super().__init__(text)
+        super().__init__(text, parameter=parameter)
         self.undetermined = undetermined or []

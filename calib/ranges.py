@@ -147,7 +147,7 @@ def without_static(ranges: Ranges) -> Ranges:
     moves = np.empty(len(ranges), dtype=bool)
     moves[order] = np.repeat(reach > STATIC_M, np.diff(starts, append=len(ranges)))
     if not moves.any():
-        raise UnanswerableError(f"{ranges.source}: nothing moves, so --trim-static leaves nothing")
+        raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` leaves nothing")
     count = int(np.count_nonzero(~moves))
     return replace(ranges[moves], excluded=ranges.excluded | ({STATIC: count} if count else {}))
 

@@ -46,8 +46,9 @@ def _csv(calibration: Calibration) -> str:
 def _one_curve(calibration: Calibration, form: str) -> None:
     if calibration.groups:
         raise BadInputError(
-            f"--to {form}: has one curve for all tags, this calibration one for each of the groups "
-            f"{', '.join(calibration.groups)}; export it as json"
+            f"{form} has one curve for all tags, this calibration one for each of the groups "
+            f"{', '.join(calibration.groups)}; export it as json",
+            parameter="to",
         )
 
 
@@ -91,6 +92,13 @@ FORMATS: Final[dict[str, Callable[[Calibration], str]]] = {
     "miluv": _miluv,
     "ros-yaml": _ros_yaml,
 }
+
+
+def as_format(calibration: Calibration, to: str) -> str:
+    """Return a calibration as text in one of `FORMATS`; raises `BadInputError` where that cannot be done."""
+    if to not in FORMATS:
+        raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
+    return FORMATS[to](calibration)
 
 
 def read_miluv(path: Path) -> Calibration:

@@ -9,6 +9,7 @@ import typer
 
 import uwblink
 from calib.cli import evaluating, files, fitting, reporting
+from calib.cli.flags import with_flags
 from calib.errors import CalibError, UnanswerableError
 from uwblink.errors import UwblinkError
 
@@ -40,8 +41,8 @@ def main() -> None:
     try:
         app(args=reporting.spread(sys.argv[1:]))
     except UnanswerableError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {with_flags(str(error))}", err=True)
         sys.exit(1)
     except (CalibError, UwblinkError) as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {with_flags(str(error))}", err=True)
         sys.exit(2)

@@ -107,11 +107,12 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Name what is wrong with a recording, with the evidence and the remedy."""
-    from dataclasses import asdict
+    from dataclasses import asdict, replace
 
+    from calib.cli.flags import with_flags
     from calib.doctor.examine import examine
 
-    findings = examine(recording)
+    findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in examine(recording)]
     if as_json:
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
         return

@@ -40,11 +40,10 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a calibration in another form."""
-    from calib.calibration.formats import FORMATS
+    from calib.calibration.formats import as_format
     from calib.calibration.model import load, write_text
-    from calib.cli.options import one_of
 
-    text = FORMATS[one_of("--to", to, FORMATS)](load(calibration))
+    text = as_format(load(calibration), to)
     if output is None:
         typer.echo(text, nl=False)
         return

@@ -25,6 +25,7 @@ from calib.cli.arguments import (
     Sequential,
     TrimStatic,
 )
+from calib.cli.flags import with_flags
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -64,7 +65,7 @@ def fit(
         result = run(ranges, **options)
     except UnanswerableError as error:
         if as_json:
-            typer.echo(json.dumps({"error": str(error), "undetermined": error.undetermined}, indent=1))
+            typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
         raise
     save(result.calibration, output, force=force)
     if as_json:
@@ -77,7 +78,7 @@ def fit(
     for reason, count in ranges.excluded.items():
         typer.echo(f"  left out: {count} exchanges, {reason}")
     for warning in result.warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        typer.echo(f"warning: {with_flags(warning)}", err=True)
 
 
 def delay_lines(found: Calibration) -> Iterator[str]:

@@ -8,10 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TypedDict
 
-from calib.calibration.power_curves import LIFTS
 from calib.errors import BadInputError
-from calib.estimation.fitting import MIXTURE
-from calib.estimation.robust import LOSSES
 from calib.ranges import Ranges, concatenate, load, without_static
 
 
@@ -37,13 +34,11 @@ def fit_options(
     sequential: bool,
     minimum_norm: bool,
 ) -> FitOptions:
-    """Return what the options of a fit mean; raises `BadInputError`."""
-    if sequential and loss == MIXTURE:
-        raise BadInputError("--sequential: goes with a loss, not with the mixture; leave one of the two away")
+    """Return what the options of a fit mean; raises `BadInputError` for what cannot be read."""
     return {
-        "loss": loss_name(loss),
+        "loss": loss,
         "scale_ns": scale_ns(scale),
-        "lift": lift_name(lift),
+        "lift": lift,
         "fixed_ns": fixed_ns(fix or ()),
         "groups": groups_of_tags(group) if group else {},
         "sequential": sequential,
@@ -62,14 +57,14 @@ def load_all(recordings: Iterable[Path], *, trim_static: bool = False) -> Ranges
     return concatenate(load_each(recordings, trim_static=trim_static))
 
 
-def check_folder(option: str, folder: Path | None) -> None:
+def check_folder(parameter: str, folder: Path | None) -> None:
     """Raise `BadInputError` where a folder to write into cannot be one."""
     if folder is None:
         return
     if folder.exists() and not folder.is_dir():
-        raise BadInputError(f"{option}: {folder} is a file, expected a folder")
+        raise BadInputError(f"{folder} is a file, expected a folder", parameter=parameter)
     if not folder.parent.is_dir():
-        raise BadInputError(f"{option}: {folder.parent} does not exist")
+        raise BadInputError(f"{folder.parent} does not exist", parameter=parameter)
 
 
 def groups_of_tags(path: Path) -> dict[str, tuple[int, ...]]:
@@ -77,33 +72,16 @@ def groups_of_tags(path: Path) -> dict[str, tuple[int, ...]]:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise BadInputError(f"--group: {path}: no such file") from error
+        raise BadInputError(f"{path}: no such file", parameter="groups") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInputError(f"--group: {path}: not valid TOML ({error})") from error
+        raise BadInputError(f"{path}: not valid TOML ({error})", parameter="groups") from error
     groups = table.get("groups")
     if not isinstance(groups, dict) or not groups or set(table) != {"groups"}:
-        raise BadInputError(f"--group: {path}: expected one table [groups], as in: monopole = [1, 2]")
-    found: dict[str, tuple[int, ...]] = {}
-    seen: dict[int, str] = {}
+        raise BadInputError(f"{path}: expected one table [groups], as in: monopole = [1, 2]", parameter="groups")
     for name, tags in groups.items():
-        if not isinstance(tags, list) or not tags or not all(type(t) is int and 0 <= t < 65_536 for t in tags):
-            raise BadInputError(f"--group: {path}: {name}: expected a list of tag ids, as in [1, 2]")
-        for tag in tags:
-            if tag in seen:
-                raise BadInputError(f"--group: {path}: tag {tag} is in {seen[tag]!r} and in {name!r}")
-            seen[tag] = name
-        found[name] = tuple(tags)
-    return found
-
-
-def loss_name(text: str) -> str:
-    """Return a key of `LOSSES`, or the mixture."""
-    return one_of("--loss", text, [*LOSSES, MIXTURE])
-
-
-def lift_name(text: str) -> str:
-    """Return a key of `LIFTS`."""
-    return one_of("--lift", text, LIFTS)
+        if not isinstance(tags, list):
+            raise BadInputError(f"{path}: {name}: expected a list of tag ids, as in [1, 2]", parameter="groups")
+    return {name: tuple(tags) for name, tags in groups.items()}
 
 
 def scale_ns(text: str) -> float | None:
@@ -111,12 +89,9 @@ def scale_ns(text: str) -> float | None:
     if text == "auto":
         return None
     try:
-        value = float(text)
+        return float(text)
     except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise BadInputError(f"--scale: found {text!r}, expected auto or a positive number of ns")
-    return value
+        raise BadInputError(f"found {text!r}, expected auto or a positive number of ns", parameter="scale_ns") from None
 
 
 def fixed_ns(texts: Iterable[str]) -> dict[int, float]:
@@ -129,15 +104,8 @@ def fixed_ns(texts: Iterable[str]) -> dict[int, float]:
         except ValueError:
             delay = math.nan
         if not (equals and tag.strip().isdecimal() and math.isfinite(delay)):
-            raise BadInputError(f"--fix: found {text!r}, expected TAG=NS, as in 1=-0.36")
+            raise BadInputError(f"found {text!r}, expected TAG=NS, as in 1=-0.36", parameter="fixed_ns")
         if int(tag) in fixed:
-            raise BadInputError(f"--fix: tag {int(tag)} is pinned twice")
+            raise BadInputError(f"tag {int(tag)} is pinned twice", parameter="fixed_ns")
         fixed[int(tag)] = delay
     return fixed
-
-
-def one_of(option: str, text: str, allowed: Iterable[str]) -> str:
-    """Return a word that is allowed; raises `BadInputError` that lists what is."""
-    if text not in allowed:
-        raise BadInputError(f"{option}: found {text!r}, allowed: {', '.join(allowed)}")
-    return text

@@ -23,6 +23,7 @@ from calib.cli.arguments import (
     Sequential,
     TrimStatic,
 )
+from calib.cli.flags import with_flags
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -83,7 +84,7 @@ def report(
     options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
     for path in filter(None, (output, pdf)):
         check_output(path, force=force)
-    check_folder("--figures", figures)
+    check_folder("figures", figures)
     judged = tests or []
     with Console(file=sys.stderr).status("loading") as status:
         training, testing = load_each(recordings, trim_static=trim_static), load_each(judged)
@@ -109,12 +110,13 @@ def report(
     for path in filter(None, (output, pdf, figures)):
         typer.echo(f"report: {path}")
     for warning in [*found.warnings, *(f"{name}: {finding.fault}" for name, finding in findings)]:
-        typer.echo(f"warning: {warning}", err=True)
+        typer.echo(f"warning: {with_flags(warning)}", err=True)
 
 
 def _refits(ranges: Ranges, calibration: Calibration, options: FitOptions) -> dict[float, Calibration]:
     """Fit again with other scales of the loss; the mixture and least squares have none."""
-    from calib.estimation.fitting import MIXTURE, fit
+    from calib.estimation.fitting import fit
+    from calib.estimation.losses import MIXTURE
 
     if calibration.loss in (MIXTURE, "l2"):
         return {}

@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
 CELLS_A_SIGMA: Final = 5
@@ -86,7 +87,7 @@ def fit_error_mixture(error_m: Floats, bins: Ints, count: int, near: ErrorMixtur
     `near` is a mixture that is near the truth already, if there is one.
     """
     median = float(np.median(error_m))
-    spread = max(1.4826 * float(np.median(np.abs(error_m - median))), 1e-9)
+    spread = max(robust_spread(error_m), 1e-9)
     edges = np.arange(-REACH_BELOW, REACH_ABOVE, 1 / CELLS_A_SIGMA) * spread + median
     middle = (edges[1:] + edges[:-1]) / 2
     cell = np.floor((error_m - edges[0]) * (CELLS_A_SIGMA / spread)).astype(np.int64)

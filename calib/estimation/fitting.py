@@ -20,17 +20,15 @@ import uwblink
 from calib.calibration.json_format import Matrix
 from calib.calibration.model import Calibration, TagGroup, Uncertainty
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve
+from calib.estimation.arguments import check_fit
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.sigma_curve import fit_sigma
-from calib.estimation.solver import MIXTURE, Solved, solve
+from calib.estimation.solver import Solved, solve
 from calib.estimation.warnings import warnings_of
 from calib.ranges import Ranges
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
-
-__all__ = ["MIXTURE", "FitResult", "fit"]
-
 
 INLIER_SIGMAS: Final = 3.0
 
@@ -68,12 +66,23 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     ranges, their power does not vary, or the pairs do not determine the delays, and `BadInputError` for pinned tags or
     groups that are not in the data.
     """
-    fixed = dict(fixed_ns or {})
+    fixed, groups = dict(fixed_ns or {}), dict(groups or {})
+    check_fit(
+        loss=loss,
+        scale_ns=scale_ns,
+        lift=lift,
+        alpha_dbm=alpha_dbm,
+        fixed_ns=fixed,
+        groups=groups,
+        sequential=sequential,
+    )
+    fixed = {int(tag): float(delay) for tag, delay in fixed.items()}
+    groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
     problem = build_problem(
-        ranges, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups or {}, minimum_norm=minimum_norm
+        ranges, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups, minimum_norm=minimum_norm
     )
     found = solve(problem, loss, None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT, sequential=sequential)
-    calibration = _calibration(problem, found, loss, lift, alpha_dbm, fixed, groups or {})
+    calibration = _calibration(problem, found, loss, lift, alpha_dbm, fixed, groups)
     applied = calibration.apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
     inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m

@@ -9,7 +9,9 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import equal_bins
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimation.arguments import check_choice, check_tag
 from calib.estimation.error_mixture import fit_error_mixture
+from calib.estimation.losses import LOSSES
 from calib.estimation.robust import robust_fit
 from calib.ranges import Ranges
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -24,11 +26,14 @@ def add_tag(ranges: Ranges, calibration: Calibration, tag: int, loss: str = "cau
     fit over all exchanges with calibrated tags, at the centre of the core of their errors. Raises `BadInputError`
     where the tag is known already or not in the data, `UnanswerableError` where too few exchanges help.
     """
+    check_tag(tag)
+    check_choice("loss", loss, LOSSES)
     if tag in calibration.delays_ns:
-        raise BadInputError(f"--tag: tag {tag} has a delay in the calibration already; fit anew to change it")
+        raise BadInputError(f"tag {tag} has a delay in the calibration already; fit anew to change it", parameter="tag")
     if tag not in ranges.tags():
         raise BadInputError(
-            f"--tag: tag {tag} does not range in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}"
+            f"tag {tag} does not range in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}",
+            parameter="tag",
         )
     mine_first, mine_second = ranges.initiator == tag, ranges.target == tag
     other = np.where(mine_first, ranges.target, ranges.initiator)
@@ -44,7 +49,7 @@ def add_tag(ranges: Ranges, calibration: Calibration, tag: int, loss: str = "cau
     applied = trial.apply(some)
     error = applied.corrected_m - some.truth_m
     start = np.array([float(np.median(-error / mine))])
-    found = robust_fit(mine[:, None], -error, loss, start=start)
+    found = robust_fit(mine[:, None], error, loss, start=start)
     core = error + mine * found.parameters[0]
     bins = equal_bins(applied.lifted)
     delay = float(

@@ -20,7 +20,8 @@ from calib.calibration.power_curves import (
     populated,
 )
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.robust import design, determined, undetermined
+from calib.estimation.identifiability import identifiable_directions, require_determined
+from calib.estimation.robust import design
 from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 
@@ -32,7 +33,7 @@ FEWEST_BLOCKS: Final = 200
 ROWS_AT_ONCE: Final = 65_536
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
     """Residuals `error + design @ x` (n,) metres; x = delays by way of `directions`, then the curves' coefficients.
 
@@ -118,38 +119,40 @@ def build_problem(
     shares = _shares(ranges, groups, everyone)
     matrix = design(ranges, everyone)
     unpinned = np.array([tag not in fixed for tag in everyone])
-    directions, free = determined(matrix[:, unpinned], tags, ranges.initiator, ranges.target)
-    if free and not minimum_norm:
-        raise undetermined(free)
+    directions, free = identifiable_directions(matrix[:, unpinned], tags, ranges.initiator, ranges.target)
+    if not minimum_norm:
+        require_determined(free)
     known = matrix[:, ~unpinned] @ np.array([fixed[tag] for tag in everyone if tag in fixed])
     knots = knots_for(ordered, BIAS_SEGMENTS)
     # The integral of a B-spline is its coefficients times a quarter of each one's span.
     averages = (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (high - low)
     return Problem(
-        ranges,
-        tags,
-        directions,
-        ranges.raw_m - ranges.truth_m + known,
-        _columns(matrix[:, unpinned] @ directions, lifted, knots, averages, shares),
-        lifted,
-        equal_bins(lifted, order=order),
-        (low, high),
-        knots,
-        averages,
-        tuple(groups) or ("",),
-        _blocks(ranges.time_ns),
-        shares,
-        free,
+        ranges=ranges,
+        tags=tags,
+        directions=directions,
+        error=ranges.raw_m - ranges.truth_m + known,
+        design=_columns(matrix[:, unpinned] @ directions, lifted, knots, averages, shares),
+        lifted=lifted,
+        bins=equal_bins(lifted, order=order),
+        span=(low, high),
+        knots=knots,
+        averages=averages,
+        groups=tuple(groups) or ("",),
+        blocks=_blocks(ranges.time_ns),
+        shares=shares,
+        free=free,
     )
 
 
 def _free_tags(everyone: list[int], fixed: Mapping[int, float]) -> list[int]:
     unknown = sorted(set(fixed) - set(everyone))
     if unknown:
-        raise BadInputError(f"--fix: found tag {unknown[0]}, the tags are {', '.join(map(str, everyone))}")
+        raise BadInputError(
+            f"found tag {unknown[0]}, the tags are {', '.join(map(str, everyone))}", parameter="fixed_ns"
+        )
     tags = [tag for tag in everyone if tag not in fixed]
     if not tags:
-        raise BadInputError("--fix: every tag is pinned, so no delay is left to fit")
+        raise BadInputError("every tag is pinned, so no delay is left to fit", parameter="fixed_ns")
     return tags
 
 
@@ -160,10 +163,10 @@ def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]], everyone: lis
     member = {tag: name for name, tags in groups.items() for tag in tags}
     lonely = [tag for tag in everyone if tag not in member]
     if lonely:
-        raise BadInputError(f"--group: tag {lonely[0]} is in no group; the groups are {', '.join(groups)}")
+        raise BadInputError(f"tag {lonely[0]} is in no group; the groups are {', '.join(groups)}", parameter="groups")
     unused = [name for name, tags in groups.items() if not set(tags) & set(everyone)]
     if unused:
-        raise BadInputError(f"--group: no tag of group {unused[0]!r} ranges in {ranges.source}")
+        raise BadInputError(f"no tag of group {unused[0]!r} ranges in {ranges.source}", parameter="groups")
     return [0.5 * np.isin(ranges.initiator, tags) + 0.5 * np.isin(ranges.target, tags) for tags in groups.values()]
 
 

@@ -1,47 +1,17 @@
-"""Robust least squares for antenna delays, and whether the pairs of tags determine them."""
+"""Robust least squares for antenna delays and curves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from calib.errors import UnanswerableError
+from calib.estimation.losses import LOSSES, Loss
 from calib.ranges import Ranges
+from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
-
-Loss = Callable[[Floats], tuple[Floats, Floats]]
-"""Maps residuals over scale (n,) to IRLS weights rho' and to the slope of the score, both (n,)."""
-
-
-def _cauchy(u: Floats) -> tuple[Floats, Floats]:
-    weight = 1 / (1 + u**2)
-    return weight, (1 - u**2) * weight**2
-
-
-def _soft_l1(u: Floats) -> tuple[Floats, Floats]:
-    weight = 1 / np.sqrt(1 + u**2)
-    return weight, weight**3
-
-
-def _huber(u: Floats) -> tuple[Floats, Floats]:
-    size = np.maximum(np.abs(u), 1.0)
-    return 1 / size, (size == 1.0).astype(np.float64)
-
-
-def _l2(u: Floats) -> tuple[Floats, Floats]:
-    return np.ones_like(u), np.ones_like(u)
-
-
-LOSSES: Final[dict[str, Loss]] = {
-    "cauchy": _cauchy,
-    "huber": _huber,
-    "soft_l1": _soft_l1,
-    "l2": _l2,
-}
 
 SCALE_OF_SPREAD: Final = 0.5
 """The loss's scale over the robust spread of the residuals.
@@ -51,12 +21,6 @@ still leaves a Cauchy loss two thirds of least squares' efficiency on clean data
 """
 
 SCALE_FLOOR_NS: Final = 0.002
-UNDETERMINED: Final = 1e-8
-"""Smallest share of the largest eigenvalue at which a direction counts as determined.
-
-Clock ratios differ from 1 by parts per million, which lifts a free direction to 1e-12 at most.
-"""
-
 MAX_STEPS: Final = 100
 SETTLING: Final = 4
 """Steps of reweighting during which an unknown scale follows the residuals; then it stands."""
@@ -76,7 +40,7 @@ STILL_M: Final = 1e-8
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """The optimum of a robust fit: parameters (m,), covariance (m, m), residuals (n,)."""
+    """The optimum of a robust fit: parameters (m,), covariance (m, m), residuals (n,): what is left of the errors."""
 
     parameters: Floats
     covariance: Floats
@@ -99,50 +63,9 @@ def design(ranges: Ranges, tags: list[int]) -> Floats:
     return matrix
 
 
-def determined(matrix: Floats, tags: list[int], initiator: Ints, target: Ints) -> tuple[Floats, list[list[int]]]:
-    """Return the directions that the rows of `matrix` (n, tags) determine, (tags, rank), and the tags left free.
-
-    `initiator` and `target` (n,) are the ids of the rows. The free tags come in groups that shift together: tags that
-    range only with tags of another group (anchors against robots, a single pair) can shift by +a and -a without a
-    trace in any range. Where nothing is free, the directions are the tags themselves.
-    """
-    values, vectors = np.linalg.eigh(matrix.T @ matrix)
-    loose = values < UNDETERMINED * values[-1]
-    if not loose.any():
-        return np.eye(len(tags)), []
-    free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max() > 1e-3}
-    return np.asarray(vectors[:, ~loose]), _connected(free, set(zip(initiator.tolist(), target.tolist(), strict=True)))
-
-
-def undetermined(groups: list[list[int]]) -> UnanswerableError:
-    """Return the error that names groups of tags whose delays are free, and what would settle them."""
-    named = "; ".join(", ".join(map(str, group)) for group in groups)
-    return UnanswerableError(
-        f"the pairs do not determine the antenna delays of tags {named}: some can grow as "
-        "others shrink without changing any range; record three tags that all range with each other, or pin a known "
-        "delay with --fix TAG=NS (--minimum-norm fits regardless, and says so)",
-        groups,
-    )
-
-
-def _connected(tags: set[int], pairs: set[tuple[int, int]]) -> list[list[int]]:
-    """Return the parts of a graph of pairs that hang together, among some tags."""
-    left, groups = set(tags), []
-    while left:
-        group, waiting = set(), [min(left)]
-        while waiting:
-            tag = waiting.pop()
-            group.add(tag)
-            linked = {b for a, b in pairs if a == tag} | {a for a, b in pairs if b == tag}
-            waiting += sorted((linked & left) - group)
-        groups.append(sorted(group))
-        left -= group
-    return groups
-
-
 def robust_fit(
     matrix: Floats,
-    aim: Floats,
+    error: Floats,
     loss: str,
     scale: float | None = None,
     penalty: Floats | None = None,
@@ -151,9 +74,9 @@ def robust_fit(
     *,
     near: bool = False,
 ) -> Solution:
-    """Minimise the robust loss of `aim - matrix @ x` plus half of x' penalty x.
+    """Minimise the robust loss of the residuals `error + matrix @ x` plus half of x' penalty x.
 
-    `matrix` (n, m) and `aim` (n,) share a unit, which is that of `scale` (estimated from the
+    `matrix` (n, m) and `error` (n,) share a unit, which is that of `scale` (estimated from the
     residuals where not given). The covariance is the sandwich H^-1 S H^-1, which holds under a heavy
     tail where the usual one does not. S sums the scores of each of the `blocks` (n,), numbered from 0 in the order of
     rows, before it squares them, so errors that persist within a block do not pass for independent ones; by default
@@ -161,24 +84,24 @@ def robust_fit(
     once.
     """
     ridge = np.zeros((matrix.shape[1],) * 2) if penalty is None else penalty
-    x = start if start is not None else _absolute_start(matrix, aim, ridge)
+    x = start if start is not None else _absolute_start(matrix, error, ridge)
     function = LOSSES[loss]
     reach = np.abs(matrix).max(axis=0)
-    residual = aim - matrix @ x
+    residual = error + matrix @ x
     width = scale or scale_of(residual)
     steps, moved, curvature = 0, 0.5 * NEWTON_M if near else np.inf, None
     while moved > STILL_M and steps < MAX_STEPS:
         weight, slope = function(residual / width)
-        gradient = matrix.T @ (weight * residual) - ridge @ x
+        downhill = -(matrix.T @ (weight * residual)) - ridge @ x
         # Reweighting descends from anywhere; Newton is faster, where it descends at all. Near the end the curvature no
         # longer changes, and the last one serves on.
         if (near or steps >= SETTLING) and moved < NEWTON_M and (curvature is None or moved > CHORD_M):
             curvature = _descending(_normal(matrix, slope, ridge))
-        step = None if curvature is None else np.linalg.solve(curvature, gradient)
+        step = None if curvature is None else np.linalg.solve(curvature, downhill)
         if step is None or np.max(np.abs(reach * step)) > NEWTON_M:
-            step, curvature = np.linalg.lstsq(_normal(matrix, weight, ridge), gradient, rcond=1e-13)[0], None
+            step, curvature = np.linalg.lstsq(_normal(matrix, weight, ridge), downhill, rcond=1e-13)[0], None
         x = np.asarray(x + step)
-        residual = aim - matrix @ x
+        residual = error + matrix @ x
         moved = float(np.max(np.abs(reach * step)))
         steps += 1
         if scale is None and steps <= SETTLING:
@@ -201,18 +124,17 @@ def _descending(curvature: Floats) -> Floats | None:
 
 def scale_of(residual: Floats) -> float:
     """Return the loss's scale from the median absolute deviation of residuals in metres."""
-    spread = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
-    return max(SCALE_OF_SPREAD * spread, SCALE_FLOOR_NS * 1e-9 * SPEED_OF_LIGHT)
+    return max(SCALE_OF_SPREAD * robust_spread(residual), SCALE_FLOOR_NS * 1e-9 * SPEED_OF_LIGHT)
 
 
-def _absolute_start(matrix: Floats, aim: Floats, ridge: Floats) -> Floats:
+def _absolute_start(matrix: Floats, error: Floats, ridge: Floats) -> Floats:
     """A few rounds towards least absolute deviations: a start that outliers do not own."""
-    weight = np.ones(len(aim))
+    weight = np.ones(len(error))
     x = np.zeros(matrix.shape[1])
     for _ in range(5):
-        gradient = matrix.T @ (weight * (aim - matrix @ x)) - ridge @ x
-        x = x + np.linalg.lstsq(_normal(matrix, weight, ridge), gradient, rcond=1e-13)[0]
-        residual = np.abs(aim - matrix @ x)
+        downhill = -(matrix.T @ (weight * (error + matrix @ x))) - ridge @ x
+        x = x + np.linalg.lstsq(_normal(matrix, weight, ridge), downhill, rcond=1e-13)[0]
+        residual = np.abs(error + matrix @ x)
         weight = 1 / np.maximum(residual, 0.1 * np.median(residual) + 1e-9)
         weight /= weight.max()
     return x
@@ -228,9 +150,10 @@ def _normal(matrix: Floats, weight: Floats, ridge: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class QuadraticModel:
-    """A robust loss near a point, as a quadratic: curvature (m, m), pull (m,), and the variance an error counts for.
+    """A robust loss near a point, as a quadratic: curvature (m, m), and pull (m,) towards the optimum.
 
-    `dispersion` is the mean squared score over the mean slope of the score: sigma squared for least squares.
+    `dispersion` is the variance that an error counts for: the mean squared score over the mean slope of the score,
+    which is sigma squared for least squares.
     """
 
     curvature: Floats
@@ -245,7 +168,7 @@ def quadratic_model(matrix: Floats, residual: Floats, loss: str, width: float) -
     nothing = np.zeros((matrix.shape[1],) * 2)
     return QuadraticModel(
         _normal(matrix, slope, nothing),
-        matrix.T @ score,
+        -(matrix.T @ score),
         float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope)),
     )
 

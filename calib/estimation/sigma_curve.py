@@ -91,7 +91,7 @@ def _by_groups(problem: Problem, centred_m: Floats) -> tuple[Floats, Floats, Int
     for name, enough in zip(problem.groups, covered, strict=True):
         if not enough:
             raise UnanswerableError(
-                f"--group: group {name!r} has too few ranges for a curve, at least {FEWEST} are needed"
+                f"group {name!r} has too few ranges for a curve, at least {FEWEST} are needed", parameter="groups"
             )
     where, sigma, counts, share = (np.concatenate(column) for column in zip(*parts, strict=True))
     return where, sigma, counts, share

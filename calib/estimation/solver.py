@@ -7,14 +7,12 @@ from typing import Final
 
 import numpy as np
 
+from calib.estimation.losses import MIXTURE
 from calib.estimation.mixture_fit import refine
 from calib.estimation.problem import Problem
 from calib.estimation.robust import quadratic_model, robust_fit, scale_of
 from calib.estimation.smoothing import reml_penalty
 from uwblink.arrays import Floats
-
-MIXTURE: Final = "mixture"
-"""The loss that is no loss of residuals: the likelihood of `calib.estimation.mixture_fit`, begun from a Cauchy fit."""
 
 PILOT: Final = 6000
 """Rows of the sample on which a start is found; from there, a few Newton steps over all rows suffice."""
@@ -44,11 +42,11 @@ def solve(problem: Problem, loss: str, scale_m: float | None, *, sequential: boo
     if sequential:
         return _one_after_the_other(problem, robust, scale_m)
     start, steps = _pilot(problem, robust, scale_m)
-    residual = -problem.error - problem.design @ start
+    residual = problem.error + problem.design @ start
     width = scale_m or scale_of(residual)
     near = quadratic_model(problem.design, residual, robust, width)
     ridge, start = reml_penalty(near, start, problem.penalties())
-    joint = robust_fit(problem.design, -problem.error, robust, width, ridge, start, problem.blocks, near=True)
+    joint = robust_fit(problem.design, problem.error, robust, width, ridge, start, problem.blocks, near=True)
     steps += joint.steps
     if loss != MIXTURE:
         return Solved(joint.parameters, joint.covariance, joint.scale, steps, joint.success)
@@ -70,9 +68,9 @@ def _pilot(problem: Problem, loss: str, scale_m: float | None) -> tuple[Floats, 
     rows = np.sort(np.random.default_rng(0).permutation(count)[:PILOT])
     small = problem if len(rows) == count else problem.sample(rows)
     some = slice(None, None, 3)
-    alone = robust_fit(small.design[some, : problem.rank], -small.error[some], loss, scale_m)
+    alone = robust_fit(small.design[some, : problem.rank], small.error[some], loss, scale_m)
     start = np.concatenate([alone.parameters, np.zeros(problem.design.shape[1] - problem.rank)])
-    joint = robust_fit(small.design, -small.error, loss, scale_m, _first_ridge(small), start)
+    joint = robust_fit(small.design, small.error, loss, scale_m, _first_ridge(small), start)
     return joint.parameters, alone.steps + joint.steps
 
 
@@ -89,7 +87,7 @@ def _first_ridge(problem: Problem) -> Floats:
 def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None) -> Solved:
     """Delays first, then the curves on what they leave, as in ICRA 2023, section V, with our splines."""
     rank, columns = problem.rank, problem.design.shape[1]
-    alone = robust_fit(problem.design[:, :rank], -problem.error, loss, scale_m, blocks=problem.blocks)
+    alone = robust_fit(problem.design[:, :rank], problem.error, loss, scale_m, blocks=problem.blocks)
     # The curves' splines are less their average; a column of ones lets the curve have a constant while it is fitted.
     design = np.hstack([np.ones((len(problem.error), 1)), problem.design[:, rank:]])
     penalties = [np.pad(p[rank:, rank:], ((1, 0), (1, 0))) for p in problem.penalties()]

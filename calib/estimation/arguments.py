@@ -1,0 +1,78 @@
+"""What the parameters of a fit may be; mistakes are found before anything is computed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from calib.calibration.power_curves import LIFTS
+from calib.errors import BadInputError
+from calib.estimation.losses import MIXTURE, known_losses
+
+HIGHEST_TAG = 65_535
+
+
+def check_fit(
+    *,
+    loss: str,
+    scale_ns: float | None,
+    lift: str,
+    alpha_dbm: float,
+    fixed_ns: Mapping[int, float],
+    groups: Mapping[str, Iterable[int]],
+    sequential: bool,
+) -> None:
+    """Raise `BadInputError` that names the parameter of `calib.fit` that cannot be used."""
+    check_loss(loss)
+    check_choice("lift", lift, LIFTS)
+    if scale_ns is not None and not (_is_finite(scale_ns) and scale_ns > 0):
+        raise BadInputError(f"found {scale_ns!r}, expected a positive number of ns", parameter="scale_ns")
+    if not _is_finite(alpha_dbm):
+        raise BadInputError(f"found {alpha_dbm!r}, expected a power in dBm", parameter="alpha_dbm")
+    if sequential and loss == MIXTURE:
+        raise BadInputError("goes with a loss, not with the mixture; leave one of the two away", parameter="sequential")
+    for tag, delay in fixed_ns.items():
+        if not (_is_tag(tag) and _is_finite(delay)):
+            raise BadInputError(
+                f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter="fixed_ns"
+            )
+    _check_groups(groups)
+
+
+def check_loss(loss: str) -> None:
+    """Raise `BadInputError` for a loss that nobody knows."""
+    check_choice("loss", loss, known_losses())
+
+
+def check_choice(parameter: str, value: str, allowed: Iterable[str]) -> None:
+    """Raise `BadInputError` that lists what is allowed."""
+    if value not in allowed:
+        raise BadInputError(f"found {value!r}, allowed: {', '.join(allowed)}", parameter=parameter)
+
+
+def check_tag(tag: int) -> None:
+    """Raise `BadInputError` for what cannot be the id of a tag."""
+    if not _is_tag(tag):
+        raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to {HIGHEST_TAG}", parameter="tag")
+
+
+def _check_groups(groups: Mapping[str, Iterable[int]]) -> None:
+    seen: dict[int, str] = {}
+    for name, tags in groups.items():
+        listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []
+        if not listed or not all(_is_tag(tag) for tag in listed):
+            raise BadInputError(f"{name}: expected a list of tag ids, as in [1, 2]", parameter="groups")
+        for tag in listed:
+            if tag in seen:
+                raise BadInputError(f"tag {tag} is in {seen[tag]!r} and in {name!r}", parameter="groups")
+            seen[tag] = name
+
+
+def _is_tag(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and 0 <= int(value) <= HIGHEST_TAG
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,61 @@
+"""Whether the pairs of tags determine the antenna delays, and which combinations of delays they leave free."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from calib.errors import UnanswerableError
+from uwblink.arrays import Floats, Ints
+
+UNDETERMINED: Final = 1e-8
+"""Smallest share of the largest eigenvalue at which a direction counts as determined.
+
+Clock ratios differ from 1 by parts per million, which lifts a free direction to 1e-12 at most.
+"""
+
+
+def identifiable_directions(
+    matrix: Floats, tags: list[int], initiator: Ints, target: Ints
+) -> tuple[Floats, list[list[int]]]:
+    """Return the directions that the rows of `matrix` (n, tags) determine, (tags, rank), and the tags left free.
+
+    `initiator` and `target` (n,) are the ids of the rows. The free tags come in groups that shift together: tags that
+    range only with tags of another group (anchors against robots, a single pair) can shift by +a and -a without a
+    trace in any range. Where nothing is free, the directions are the tags themselves.
+    """
+    values, vectors = np.linalg.eigh(matrix.T @ matrix)
+    loose = values < UNDETERMINED * values[-1]
+    if not loose.any():
+        return np.eye(len(tags)), []
+    free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max() > 1e-3}
+    return np.asarray(vectors[:, ~loose]), _connected(free, set(zip(initiator.tolist(), target.tolist(), strict=True)))
+
+
+def require_determined(groups: list[list[int]]) -> None:
+    """Raise `UnanswerableError` that names groups of tags whose delays are free, and what would settle them."""
+    if not groups:
+        return
+    named = "; ".join(", ".join(map(str, group)) for group in groups)
+    raise UnanswerableError(
+        f"the pairs do not determine the antenna delays of tags {named}: some can grow as "
+        "others shrink without changing any range; record three tags that all range with each other, or pin a known "
+        "delay with `fixed_ns` (`minimum_norm` fits regardless, and says so)",
+        undetermined=groups,
+    )
+
+
+def _connected(tags: set[int], pairs: set[tuple[int, int]]) -> list[list[int]]:
+    """Return the parts of a graph of pairs that hang together, among some tags."""
+    left, groups = set(tags), []
+    while left:
+        group, waiting = set(), [min(left)]
+        while waiting:
+            tag = waiting.pop()
+            group.add(tag)
+            linked = {b for a, b in pairs if a == tag} | {a for a, b in pairs if b == tag}
+            waiting += sorted((linked & left) - group)
+        groups.append(sorted(group))
+        left -= group
+    return groups
