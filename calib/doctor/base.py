@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.twr import Exchanges
@@ -48,7 +49,7 @@ def spread_m(view: RecordingView, truth_m: Floats | None = None, raw_m: Floats |
     pair = pair_ids(view.exchanges)
     good = np.isfinite(error)
     parts = [v - np.median(v) for p in np.unique(pair[good]) if len(v := error[good & (pair == p)]) > 10]
-    return 1.4826 * float(np.median(np.abs(np.concatenate(parts)))) if parts else float("inf")
+    return robust_spread(np.concatenate(parts), 0.0) if parts else float("inf")
 
 
 def pair_ids(e: Exchanges) -> Ints:

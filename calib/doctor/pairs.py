@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from calib.doctor.base import Finding, RecordingView, pair_ids
-from calib.estimation.robust import determined
+from calib.estimation.identifiability import identifiable_directions
 from uwblink.recording.summary import failures_by_pair
 from uwblink.twr import delay_weights
 
@@ -29,13 +29,13 @@ def pairs(view: RecordingView) -> Iterator[Finding]:
     rows = np.arange(len(matrix))
     matrix[rows, np.searchsorted(place, e.initiator[good])] += first[good]
     matrix[rows, np.searchsorted(place, e.target[good])] += second[good]
-    _, free = determined(matrix, tags, e.initiator[good], e.target[good])
+    _, free = identifiable_directions(matrix, tags, e.initiator[good], e.target[good])
     if free:
         groups = "; ".join(", ".join(map(str, group)) for group in free)
         yield Finding(
             "too few pairs",
             f"the pairs do not determine the delays of tags {groups}",
-            "record three tags that all range with each other, or pin a known delay with --fix TAG=NS",
+            "record three tags that all range with each other, or pin a known delay with `fixed_ns`",
             0.99,
         )
 

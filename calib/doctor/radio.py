@@ -12,7 +12,7 @@ from calib.doctor.base import Finding, RecordingView, pair_ids, spread_m
 from calib.estimation.confounding import explained_by_distance
 from calib.estimation.error_mixture import fit_error_mixture
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.ticks import TICKS_PER_SECOND
+from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import intervals
 
 CONFOUNDED: Final = "power confounded with distance"
@@ -25,7 +25,7 @@ def skew(view: RecordingView) -> Iterator[Finding]:
     if np.count_nonzero(single) < 100:
         return
     dt32_s = intervals(e[single]).dt32 / TICKS_PER_SECOND
-    expected = -0.5 * 299_702_547.0 * e.skew1_ppm[single] * 1e-6 * dt32_s
+    expected = -0.5 * SPEED_OF_LIGHT * e.skew1_ppm[single] * 1e-6 * dt32_s
     error = view.error_m[single]
     slope = float(np.polyfit(expected, error, 1)[0]) if np.std(expected) > 0.05 else 0.0
     if 0.5 < slope < 1.5:
@@ -99,7 +99,7 @@ def reflections(view: RecordingView) -> Iterator[Finding]:
             "reflections",
             f"about {100 * mixture.tail_share:.0f} % of the ranges are longer than noise explains, by "
             f"{100 * mixture.tail_mean_m:.0f} cm on average",
-            "move antennas away from bodies and walls, or fit with --loss mixture",
+            "move antennas away from bodies and walls, or fit with `loss` mixture",
             0.75,
         )
 

@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from calib.doctor.base import PLAUSIBLE_M, Finding, RecordingView, pair_ids, plausible_share
-from uwblink.ticks import TICKS_PER_SECOND
+from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import board_range, intervals, raw_range, single_sided
 
-VACUUM_OVER_AIR: Final = 299_792_458.0 / 299_702_547.0
+VACUUM_OVER_AIR: Final = 299_792_458.0 / SPEED_OF_LIGHT
 
 
 def units(view: RecordingView) -> Iterator[Finding]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration, CorrectedRanges
 from calib.ranges import Ranges
+from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -160,14 +161,13 @@ def statistics(error_m: Floats) -> Stats:
     """Return the statistics of range errors (n,); NaN where there are none."""
     if not len(error_m):
         return Stats(0, *[float("nan")] * 7)
-    median = float(np.median(error_m))
     low, high = np.quantile(error_m, (0.025, 0.975))
     return Stats(
         len(error_m),
         float(np.mean(error_m)),
-        median,
+        float(np.median(error_m)),
         float(np.std(error_m)),
-        1.4826 * float(np.median(np.abs(error_m - median))),
+        robust_spread(error_m),
         float(low),
         float(high),
         float(np.quantile(np.abs(error_m), 0.95)),

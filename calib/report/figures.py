@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from calib.calibration.model import Calibration, CorrectedRanges
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
 from calib.ranges import Ranges
+from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -61,7 +62,7 @@ def bias_over_power(ranges: Ranges, applied: CorrectedRanges, calibration: Calib
 def sigma_over_power(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> Figure:
     """Robust standard deviation of calibrated errors over lifted power, likewise."""
     error = 100 * (applied.corrected_m - ranges.truth_m)
-    figure = _over_power(ranges, applied, error, _robust_std)
+    figure = _over_power(ranges, applied, error, robust_spread)
     axes = figure.axes[0]
     grid = np.linspace(*calibration.sigma_curve.range, 300)
     _band(axes, grid, 100 * calibration.sigma_curve(grid), calibration.band(grid, "sigma"))
@@ -123,10 +124,6 @@ def _binned(x: Floats, y: Floats, summary: Any) -> tuple[Floats, Floats]:
         np.array([np.median(x[rows]) for rows in groups]),
         np.array([summary(y[rows]) for rows in groups]),
     )
-
-
-def _robust_std(values: Floats) -> float:
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def label(axes: Axes, x: str, y: str) -> None:
