@@ -111,9 +111,9 @@ def simulating(*, passive: bool = False) -> float:
 def fitting(recording: Path) -> float:
     """Return the time to fit what is already in memory, in seconds."""
     from calib.estimation.fitting import fit
-    from calib.ranges import load
+    from calib.sources import load_ranges
 
-    ranges = load(recording)
+    ranges = load_ranges(recording)
     return timed(lambda: fit(ranges))
 
 

@@ -38,7 +38,7 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
 
     from calib.estimation.fitting import fit
     from calib.evaluation.statistics import evaluate
-    from calib.ranges import load
+    from calib.sources import load_ranges
     from uwbsim.scenario.loading import load as load_scenario
     from uwbsim.simulation.run import simulate, write
 
@@ -47,7 +47,7 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "flight.uwb"
         write(simulate(load_scenario(TRAIN, settings)), path)
-        ranges = load(path)
+        ranges = load_ranges(path)
     found = {}
     for loss in LOSSES:
         calibration = fit(ranges, loss=loss).calibration

@@ -9,7 +9,8 @@ import numpy as np
 
 from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate
-from calib.ranges import concatenate, load
+from calib.ranges import concatenate
+from calib.sources import load_ranges
 from uwblink.ticks import TICK_S, elapsed
 from uwblink.twr import intervals, truncate4
 from uwbsim.scenario.loading import load as load_scenario
@@ -98,7 +99,7 @@ def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[tuple[s
         parts = []
         for name, run in (("train", train), ("test1", one), ("test2", two)):
             write(run, Path(folder) / f"{name}.uwb")
-            parts.append(load(Path(folder) / f"{name}.uwb"))
+            parts.append(load_ranges(Path(folder) / f"{name}.uwb"))
     tests = concatenate(parts[1:])
     error = tests.raw_m - tests.truth_m
     skewness = np.mean(((error - error.mean()) / error.std()) ** 3)

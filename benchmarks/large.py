@@ -83,10 +83,9 @@ def flight(size: int):  # type: ignore[no-untyped-def]
     delay = np.array([0, -0.36, 0.0, -0.07, -0.36, -0.17, -0.12])
     raw = truth + 0.08 * np.sin(3 * lifted) - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
     raw += 0.08 * rng.normal(size=size) + np.where(rng.random(size) < 0.11, rng.exponential(0.34, size), 0)
-    ranges = Ranges(
-        "synthetic", time_ns, initiator, target, np.full(size, "ds"), raw, truth, np.full(size, 0.5),
-        np.full(size, 0.5), power[0], power[1], {}, None,
-    )  # fmt: skip
+    ranges = Ranges.from_arrays(
+        raw, truth_m=truth, initiator=initiator, target=target, fpp1_dbm=power[0], fpp2_dbm=power[1], time_ns=time_ns
+    )
     return poses, tags, ranges
 
 

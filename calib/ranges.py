@@ -1,27 +1,35 @@
-"""From recordings to the columns a calibration works with; the only reader of recordings in here."""
+"""Ranges as the columns a calibration works with; the one place where exchanges or arrays become them."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from calib.errors import UnanswerableError
+from calib.errors import BadInputError, UnanswerableError
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import distances_m
-from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, delay_weights, intervals, raw_range
 
+IN_MEMORY: Final = "memory"
+"""The source of ranges that come from no file."""
 
-@dataclass(frozen=True, slots=True)
+HALVES: Final = (0.5, 0.5)
+LONGEST_M: Final = 1e4
+LOUDEST_DBM: Final = -30.0
+FAINTEST_DBM: Final = -140.0
+"""Powers beyond these bounds were not measured: a board that cannot tell a strong power prints 0."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Ranges:
-    """Ranges with their truth as columns of length n.
+    """Ranges with their truth as columns of length n; `from_exchanges` and `from_arrays` make them.
 
     `raw_m` is the range recomputed from the stamps, `truth_m` the distance between the antennas;
     `weight_initiator` and `weight_target` are the derivatives of the calibrated time of flight with
@@ -43,6 +51,91 @@ class Ranges:
     excluded: dict[str, int]
     planted: dict[str, Any] | None
 
+    @classmethod
+    def from_exchanges(
+        cls,
+        exchanges: Exchanges,
+        truth_m: Floats | None = None,
+        *,
+        poses: Poses | None = None,
+        tags: Sequence[Tag] = (),
+        planted: Mapping[str, Any] | None = None,
+        source: str = IN_MEMORY,
+    ) -> Ranges:
+        """Return a row for every exchange, usable or not (`usable` leaves out those that a fit cannot use).
+
+        True distances are `truth_m` (n,), or those of the exchanges; where there is neither they come from `poses` and
+        the lever arms of `tags`. A power that cannot have been measured is NaN. Raises `BadInputError` where `truth_m`
+        has another length than the exchanges.
+        """
+        given = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
+        if given.shape != (len(exchanges),):
+            raise BadInputError(f"has shape {given.shape}, expected ({len(exchanges)},)", parameter="truth_m")
+        initiator, target = delay_weights(exchanges)
+        return cls(
+            source=source,
+            time_ns=exchanges.time_ns,
+            initiator=exchanges.initiator,
+            target=exchanges.target,
+            protocol=exchanges.protocol,
+            raw_m=raw_range(exchanges),
+            truth_m=_truth(exchanges, given, poses, tags),
+            weight_initiator=initiator,
+            weight_target=target,
+            fpp1_dbm=measured_powers(exchanges.fpp1_dbm),
+            fpp2_dbm=measured_powers(exchanges.fpp2_dbm),
+            excluded={},
+            planted=dict(planted) if planted else None,
+        )
+
+    @classmethod
+    def from_arrays(  # noqa: PLR0913 - columns by name, most of which have a default
+        cls,
+        range_m: ArrayLike,
+        *,
+        initiator: ArrayLike,
+        target: ArrayLike,
+        fpp1_dbm: ArrayLike,
+        fpp2_dbm: ArrayLike | None = None,
+        truth_m: ArrayLike = math.nan,
+        time_ns: ArrayLike = 0,
+        protocol: str = "ds",
+        weights: tuple[ArrayLike, ArrayLike] = HALVES,
+        source: str = IN_MEMORY,
+    ) -> Ranges:
+        """Return a row for every range of arrays (n,), metres and dBm; a single number serves all rows.
+
+        `truth_m` and `time_ns` are needed to fit, and not to correct. Where there is one power only it is `fpp1_dbm`.
+        `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as if both clocks ran
+        alike, which no range notices by more than a hundredth of a millimetre. Raises `BadInputError` where the arrays
+        do not fit each other.
+
+        >>> from calib import Ranges
+        >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
+        2
+        """
+        columns = {
+            "raw_m": range_m,
+            "truth_m": truth_m,
+            "fpp1_dbm": fpp1_dbm,
+            "fpp2_dbm": math.nan if fpp2_dbm is None else fpp2_dbm,
+            "weight_initiator": weights[0],
+            "weight_target": weights[1],
+        }
+        ids = {"initiator": initiator, "target": target, "time_ns": time_ns}
+        try:
+            floats = [np.asarray(column, dtype=np.float64) for column in columns.values()]
+            ints = [np.asarray(column).astype(np.int64, casting="same_kind") for column in ids.values()]
+            rows = np.broadcast_arrays(*np.atleast_1d(*floats, *ints))
+        except (TypeError, ValueError) as error:
+            raise BadInputError(f"arrays of ranges do not fit each other: {error}") from error
+        if rows[0].ndim != 1:
+            raise BadInputError(f"has shape {np.shape(range_m)}, expected one dimension", parameter="range_m")
+        filled = dict(zip([*columns, *ids], rows, strict=True))
+        filled |= {name: measured_powers(filled[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
+        kind = np.full(len(rows[0]), protocol)
+        return cls(source=source, protocol=kind, excluded={}, planted=None, **filled)
+
     def __len__(self) -> int:
         """Return the number of ranges."""
         return len(self.time_ns)
@@ -51,67 +144,46 @@ class Ranges:
         """Return the chosen rows, in their order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
 
+    def __repr__(self) -> str:
+        """Return how many ranges of which tags there are, and what was left out."""
+        left = "".join(f", {count} left out: {reason}" for reason, count in self.excluded.items())
+        return f"<Ranges of {self.source}: {len(self)} of tags {', '.join(map(str, self.tags()))}{left}>"
+
     def tags(self) -> list[int]:
         """Return the ids of the tags that range, in order."""
         counts = [np.bincount(ids) > 0 for ids in (self.initiator, self.target)]
         return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
 
+    def usable(self, why_no_truth: str = "") -> Ranges:
+        """Leave out what has no true distance, no power at either end, or impossible stamps, and count it.
+
+        Raises `UnanswerableError` where nothing is left, with `why_no_truth` where that is the reason.
+        """
+        if not len(self):
+            raise UnanswerableError(f"{self.source}: holds no exchanges")
+        reasons = {
+            "no true distance": np.isfinite(self.truth_m),
+            "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm),
+            "impossible stamps": np.isfinite(self.raw_m) & (np.abs(self.raw_m) < LONGEST_M),
+        }
+        keep = np.ones(len(self), dtype=bool)
+        excluded = {}
+        for reason, good in reasons.items():
+            excluded[reason] = int(np.count_nonzero(keep & ~good))
+            keep &= good
+        if keep.all():
+            return self
+        if not keep.any():
+            most = max(excluded, key=lambda reason: excluded[reason])
+            missing = f"; {why_no_truth or 'it needs poses and lever arms, or measured distances'}"
+            raise UnanswerableError(
+                f"{self.source}: none of its {len(self)} exchanges can be used: {most}"
+                + (missing if "true" in most else "")
+            )
+        return replace(self[keep], excluded=self.excluded | {r: n for r, n in excluded.items() if n})
+
 
 COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted"})
-
-
-def load(path: str | os.PathLike[str]) -> Ranges:
-    """Read a recording and work out true distances, leaving out what cannot be used.
-
-    Raises the errors of `Recording.open`, and `UnanswerableError` when no exchange can be used.
-    """
-    with Recording.open(path) as recording:
-        exchanges = recording.exchanges()
-        truth = _truth(recording, exchanges)
-        uncovered = _uncovered(recording, exchanges, truth)
-        planted = recording.meta().get("planted")
-    if not len(exchanges):
-        raise UnanswerableError(f"{path}: holds no exchanges")
-    raw = raw_range(exchanges)
-    initiator, target = delay_weights(exchanges)
-    ranges = Ranges(
-        source=os.path.basename(path),
-        time_ns=exchanges.time_ns,
-        initiator=exchanges.initiator,
-        target=exchanges.target,
-        protocol=exchanges.protocol,
-        raw_m=raw,
-        truth_m=truth,
-        weight_initiator=initiator,
-        weight_target=target,
-        fpp1_dbm=exchanges.fpp1_dbm,
-        fpp2_dbm=exchanges.fpp2_dbm,
-        excluded={},
-        planted=planted if isinstance(planted, dict) else None,
-    )
-    return _usable(ranges, path, uncovered)
-
-
-@dataclass(frozen=True, slots=True)
-class Flight:
-    """Ranges together with where bodies and tags were."""
-
-    ranges: Ranges
-    poses: Poses
-    tags: list[Tag]
-
-    def moving_bodies(self) -> list[str]:
-        """Return the bodies whose position changes by more than a decimetre."""
-        names = sorted(set(self.poses.body.tolist()))
-        spans = {n: np.ptp(self.poses.position_m[self.poses.body == n], axis=0).max() for n in names}
-        return [name for name in names if spans[name] > 0.1]
-
-
-def load_flight(path: str | os.PathLike[str]) -> Flight:
-    """Read a recording with its poses; raises what `load` raises."""
-    ranges = load(path)
-    with Recording.open(path) as recording:
-        return Flight(ranges, recording.poses(), recording.tags())
 
 
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
@@ -152,58 +224,16 @@ def without_static(ranges: Ranges) -> Ranges:
     return replace(ranges[moves], excluded=ranges.excluded | ({STATIC: count} if count else {}))
 
 
-def _truth(recording: Recording, exchanges: Exchanges) -> Floats:
-    if np.isfinite(exchanges.truth_m).all() or not recording.count("poses"):
-        return exchanges.truth_m
-    # A range belongs to the middle of its first two messages.
-    middle = exchanges.time_ns + np.rint(intervals(exchanges).dt41 * (TICK_S * 5e8)).astype(np.int64)
-    computed = distances_m(recording.poses(), recording.tags(), exchanges.initiator, exchanges.target, middle)
-    return np.where(np.isfinite(exchanges.truth_m), exchanges.truth_m, computed)
-
-
-def _uncovered(recording: Recording, exchanges: Exchanges, truth_m: Floats) -> str:
-    """Say how poses and exchanges lie in time, where no exchange has a true distance although there are poses."""
-    if np.isfinite(truth_m).any() or not recording.count("poses") or not len(exchanges):
-        return ""
-    poses = recording.poses()
-    missing = sorted({t.body for t in recording.tags()} - set(np.unique(poses.body).tolist()))
-    if missing:
-        return f"no poses of body {missing[0]}"
-    start = int(poses.time_ns[0])
-    spans = [((int(t.min()) - start) * 1e-9, (int(t.max()) - start) * 1e-9) for t in (poses.time_ns, exchanges.time_ns)]
-    return (
-        f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s, its exchanges {spans[1][0]:.1f} to "
-        f"{spans[1][1]:.1f} s after the first pose; shift the poses with 'uwblink poses --offset'"
-    )
-
-
-LOUDEST_DBM = -30.0
-FAINTEST_DBM = -140.0
-"""Powers beyond these bounds were not measured: a board that cannot tell a strong power prints 0."""
-
-
-def _powers(fpp_dbm: Floats) -> Floats:
-    """Return first-path powers (n,), NaN where the number cannot be one."""
+def measured_powers(fpp_dbm: Floats) -> Floats:
+    """Return first-path powers (n,) in dBm, NaN where the number cannot be one."""
     with np.errstate(invalid="ignore"):
         return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
 
 
-def _usable(ranges: Ranges, path: str | os.PathLike[str], uncovered: str) -> Ranges:
-    ranges = replace(ranges, fpp1_dbm=_powers(ranges.fpp1_dbm), fpp2_dbm=_powers(ranges.fpp2_dbm))
-    reasons = {
-        "no true distance": np.isfinite(ranges.truth_m),
-        "no power": np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm),
-        "impossible stamps": np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < 1e4),
-    }
-    keep = np.ones(len(ranges), dtype=bool)
-    excluded = {}
-    for reason, good in reasons.items():
-        excluded[reason] = int(np.count_nonzero(keep & ~good))
-        keep &= good
-    if not keep.any():
-        most = max(excluded, key=lambda reason: excluded[reason])
-        raise UnanswerableError(
-            f"{path}: none of its {len(ranges)} exchanges can be used: {most}"
-            + (f"; {uncovered or 'it needs poses and lever arms, or measured distances'}" if "true" in most else "")
-        )
-    return replace(ranges[keep], excluded={r: n for r, n in excluded.items() if n})
+def _truth(exchanges: Exchanges, given_m: Floats, poses: Poses | None, tags: Sequence[Tag]) -> Floats:
+    known = np.isfinite(given_m)
+    if known.all() or poses is None or not len(poses):
+        return given_m
+    # A range belongs to the middle of its first two messages.
+    middle = exchanges.time_ns + np.rint(intervals(exchanges).dt41 * (TICK_S * 5e8)).astype(np.int64)
+    return np.where(known, given_m, distances_m(poses, list(tags), exchanges.initiator, exchanges.target, middle))

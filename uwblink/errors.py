@@ -25,6 +25,10 @@ class RecordingExistsError(UwblinkError, FileExistsError):
     """The output is already there and `--force` was not given."""
 
 
+class OutputError(UwblinkError, OSError):
+    """A file that cannot be written, for want of space or permission."""
+
+
 class RecordingMissingError(UwblinkError, FileNotFoundError):
     """The recording to read is not there."""
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import os
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,46 +11,47 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.ranges import Ranges
-from uwblink.recording.file import Recording, check_output
-from uwblink.twr import delay_weights, raw_range
+from uwblink.output import check_output
+from uwblink.recording.file import Recording
 
 
-def correct(source: Path, calibration: Calibration, output: Path, *, force: bool = False) -> tuple[int, int]:
-    """Correct `range_m` of every exchange; returns how many, and how many beyond the fitted power.
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """How many ranges were corrected, and how many of them at powers beyond the fitted ones."""
 
-    Stamps stay as they were recorded, and everything else is copied. An exchange without any power
-    gets the delays' part only. Raises `BadInputError` for a recording that is corrected already.
+    count: int
+    clamped: int
+
+
+def apply(
+    source: str | os.PathLike[str], calibration: Calibration, output: str | os.PathLike[str], *, force: bool = False
+) -> Applied:
+    """Write a recording again with `range_m` of every exchange corrected, and every other row of every table as it was.
+
+    Stamps stay as they were recorded. An exchange without any power gets the delays' part only. Raises `BadInputError`
+    for a recording that is corrected already, and what `Recording.open` and `check_output` raise.
+
+    >>> import calib, tempfile
+    >>> from uwblink import Recording
+    >>> flight = calib.sample_flight()
+    >>> known = calib.fit(flight).calibration
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with Recording.create(f"{folder}/flight.uwb") as recording:
+    ...         recording.append_exchanges(flight.exchanges)
+    ...     calib.apply(f"{folder}/flight.uwb", known, f"{folder}/corrected.uwb").count
+    900
     """
-    check_output(output, force=force)
+    check_output(Path(output), force=force)
     with Recording.open(source) as recording:
-        meta = recording.meta()
-        if "calibration" in meta:
+        if "calibration" in recording.meta():
             raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")
         exchanges = recording.exchanges()
-        initiator, target = delay_weights(exchanges)
-        nothing = np.full(len(exchanges), np.nan)
-        applied = calibration.apply(
-            Ranges(
-                source.name,
-                exchanges.time_ns,
-                exchanges.initiator,
-                exchanges.target,
-                exchanges.protocol,
-                raw_range(exchanges),
-                nothing,
-                initiator,
-                target,
-                exchanges.fpp1_dbm,
-                exchanges.fpp2_dbm,
-                {},
-                None,
-            )
-        )
+        applied = calibration.apply(Ranges.from_exchanges(exchanges, source=Path(source).name))
         corrected = np.where(np.isfinite(applied.lifted), applied.corrected_m, applied.delay_corrected_m)
-        with Recording.create(output, meta=meta, force=force) as written:
-            written.append_meta({"calibration": calibration.provenance})
-            written.append_tags(recording.tags())
-            written.append_poses(recording.poses())
-            written.append_faults(recording.faults())
-            written.append_exchanges(replace(exchanges, range_m=corrected))
-    return len(exchanges), int(np.count_nonzero(applied.clamped))
+        recording.copy(
+            output,
+            replacing={"exchanges": replace(exchanges, range_m=corrected)},
+            meta={"calibration": calibration.provenance},
+            force=force,
+        )
+    return Applied(len(exchanges), int(np.count_nonzero(applied.clamped)))

@@ -8,27 +8,34 @@ agreement is the robust spread of errors after each pair's own median, which nei
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from calib.doctor import geometry, pairs, radio, timestamps
 from calib.doctor.base import Finding, RecordingView
+from calib.sources import Data, opened
 from uwblink.recording.distances import distances_m
-from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.twr import Exchanges, raw_range
 
 
-def examine(path: Path) -> list[Finding]:
-    """Return what is wrong with a recording, the surest first; raises what `Recording.open` raises."""
-    with Recording.open(path) as recording:
-        exchanges, poses, tags = recording.exchanges(), recording.poses(), recording.tags()
-        faults = recording.faults()
+def examine(data: Data) -> list[Finding]:
+    """Return what is wrong with a recording, the surest first: each fault with its evidence and what to do about it.
+
+    `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`; ranges
+    alone do not say enough. Raises what `Recording.open` raises.
+
+    >>> import calib
+    >>> [finding.fault for finding in calib.examine(calib.sample_flight())]
+    []
+    """
+    with opened(data) as (name, source):
+        exchanges, poses, tags = source.exchanges, source.poses, list(source.tags)
+        faults = list(getattr(source, "faults", ()))
     if not len(exchanges):
         return [Finding("empty", "the recording holds no exchanges", "record or import some", 1.0)]
-    view = _admitted(path.name, exchanges, poses, tags, faults)
+    view = _admitted(name, exchanges, poses, tags, faults)
     findings: list[Finding] = []
     for examination in GROSS:
         findings += examination(view)

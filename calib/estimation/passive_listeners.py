@@ -12,7 +12,6 @@ transmission and reception: moving a tag's clock by a moves its transmissions an
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,9 +21,9 @@ from numpy.typing import NDArray
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lift
 from calib.estimation.error_mixture import fit_error_mixture
+from calib.sources import Data, opened
 from uwblink.arrays import Floats
 from uwblink.recording.distances import distances_m
-from uwblink.recording.file import Recording
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import third_from_target
 
@@ -41,16 +40,19 @@ class OverheardDelay:
     count: int
 
 
-def heard_delays(path: str | os.PathLike[str], calibration: Calibration) -> dict[int, OverheardDelay]:
+def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDelay]:
     """Return delays by tag from the overheard exchanges of a recording; empty where it has none, or no true distances.
 
     Only protocols whose third message comes from the target are of use: its two transmissions tell the listener how
     fast the target's clock runs. The bias curve of the calibration corrects each of the three receptions.
     """
-    with Recording.open(path) as recording:
-        heard, poses, tags = recording.overheard(), recording.poses(), recording.tags()
-        protocols = set(np.unique(recording.exchanges().protocol).tolist())
-    if not len(heard["time_ns"]) or not len(poses) or not protocols <= set(third_from_target()):
+    with opened(data) as (_, source):
+        heard = getattr(source, "overheard", None)
+        if not heard or not len(heard["time_ns"]):
+            return {}
+        poses, tags = source.poses, list(source.tags)
+        protocols = set(np.unique(source.exchanges.protocol).tolist())
+    if not len(poses) or not protocols <= set(third_from_target()):
         return {}
     sides = [("initiator", "target"), ("target", "listener"), ("initiator", "listener")]
     near, away, across = (distances_m(poses, tags, heard[a], heard[b], heard["time_ns"]) for a, b in sides)

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.errors import UnanswerableError
-from calib.ranges import Flight
+from calib.sources import Data, Flight, load_flight
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 
@@ -72,12 +72,22 @@ class Localization:
     tracks: dict[str, Track]
 
 
-def localize(flight: Flight, calibration: Calibration, settings: Settings | None = None) -> list[Localization]:
-    """Track every body that moves and ranges in a flight, one at a time.
+def localize(data: Data | Flight, calibration: Calibration, settings: Settings | None = None) -> list[Localization]:
+    """Track every body that moves and ranges in a recording, one at a time, with an extended Kalman filter.
 
-    Raises what `Calibration.apply` raises, and `UnanswerableError` where no body moves or the recording has no poses.
+    `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`. Raises
+    what `Calibration.apply` raises, and `UnanswerableError` where no body moves or the recording has no poses.
+
+    >>> import calib
+    >>> known = calib.fit(calib.sample_flight()).calibration
+    >>> found = calib.localize(calib.sample_flight(seed=2), known)
+    >>> [one.body for one in found]
+    ['robot1', 'robot2', 'robot3']
+    >>> found[0].tracks["calibrated"].rmse_m < 0.1
+    True
     """
     chosen = settings or Settings()
+    flight = data if isinstance(data, Flight) else load_flight(data)
     ranges = flight.ranges
     applied = calibration.apply(ranges)
     error = applied.raw_m - ranges.truth_m

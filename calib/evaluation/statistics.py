@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration, CorrectedRanges
 from calib.ranges import Ranges
+from calib.sources import Data, load_ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -104,8 +106,19 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and value != value else value
 
 
-def evaluate(ranges: Ranges, calibration: Calibration) -> Evaluation:
-    """Evaluate a calibration; raises what `Calibration.apply` raises."""
+def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluation:
+    """Compare raw, delay-corrected and fully corrected ranges with the truth, for all ranges and for each pair of tags.
+
+    `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. Errors are
+    in metres. Raises what `load_ranges` and `Calibration.apply` raise.
+
+    >>> import calib
+    >>> known = calib.fit(calib.sample_flight()).calibration
+    >>> found = calib.evaluate(calib.sample_flight(seed=2), known).overall
+    >>> f"{100 * found.raw.std_m:.1f} cm raw, {100 * found.full.std_m:.1f} cm corrected"
+    '4.0 cm raw, 3.0 cm corrected'
+    """
+    ranges = load_ranges(data)
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
     return Evaluation(

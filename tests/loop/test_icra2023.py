@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from calib.calibration.model import Calibration
-from calib.calibration.model import load as load_calibration
-from calib.ranges import concatenate, load
+from calib.calibration.model import Calibration, load_calibration
+from calib.ranges import concatenate
+from calib.sources import load_ranges
 from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -53,14 +53,14 @@ def common_shift_ns(calibration, planted):
 
 
 def test_the_flights_have_the_size_the_issue_of_the_paper_has(flights):
-    sizes = {name: len(load(flights / f"{name}.uwb")) for name in ("train", "test1", "test2")}
+    sizes = {name: len(load_ranges(flights / f"{name}.uwb")) for name in ("train", "test1", "test2")}
     assert 36_000 < sizes["train"] < 40_000
     assert 9_000 < sizes["test1"] < 11_000
     assert 9_000 < sizes["test2"] < 11_000
 
 
 def test_raw_errors_resemble_the_paper(flights):
-    tests = concatenate([load(flights / "test1.uwb"), load(flights / "test2.uwb")])
+    tests = concatenate([load_ranges(flights / "test1.uwb"), load_ranges(flights / "test2.uwb")])
     error = tests.raw_m - tests.truth_m
     # ICRA 2023 reports 11.1 cm and 19.0 cm on its own tests; 2 cm is the spread between flights.
     assert np.mean(error) == pytest.approx(0.111, abs=0.02)
@@ -80,7 +80,7 @@ def test_planted_bias_curve_is_found_within_5_mm_rms(flights, calibration, plant
     knots = np.array(curve["knots"])
     spline = BSpline(knots, np.array(curve["coefficients"]), curve["degree"])
     lo, hi = calibration.bias_curve.range
-    lifted = calibration.lifted(load(flights / "train.uwb"))
+    lifted = calibration.lifted(load_ranges(flights / "train.uwb"))
     populated = np.sort(lifted[(lifted >= lo) & (lifted <= hi)])
     truth = spline(np.clip(populated, knots[0], knots[-1]))
     fitted = calibration.bias_curve(populated)

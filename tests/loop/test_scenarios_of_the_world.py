@@ -8,7 +8,7 @@ import pytest
 from calib.errors import UnanswerableError
 from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate, pair_rows
-from calib.ranges import load as load_ranges
+from calib.sources import load_ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate, write

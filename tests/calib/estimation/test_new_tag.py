@@ -9,7 +9,7 @@ import pytest
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.fitting import fit
 from calib.estimation.new_tag import add_tag
-from calib.ranges import load
+from calib.sources import load_ranges
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 ROOT = Path(__file__).parents[3]
@@ -58,9 +58,9 @@ def test_the_scenario_of_a_new_tag(tmp_path, known):
     write(simulate(read(ROOT / "scenarios" / "icra2023" / "train.toml", ["run.duration_s=120"])), train)
     new = tmp_path / "new.uwb"
     write(simulate(read(ROOT / "scenarios" / "new_tag" / "new_tag.toml")), new)
-    calibration = fit(load(train)).calibration
-    added = add_tag(load(new), calibration, 7)
-    planted = load(new).planted["delays_ns"]
+    calibration = fit(load_ranges(train)).calibration
+    added = add_tag(load_ranges(new), calibration, 7)
+    planted = load_ranges(new).planted["delays_ns"]
     shift = calibration.delays_ns[1] - planted["1"]
     # The common shift is the curve's constant. Tag 1 is known to 11 ps and moves the new one the other way; the curve
     # is known to 3 mm, 20 ps.

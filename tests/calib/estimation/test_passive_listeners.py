@@ -10,7 +10,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
 from calib.estimation.fitting import fit
 from calib.estimation.passive_listeners import heard_delays
-from calib.ranges import load as load_ranges
+from calib.sources import load_ranges
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate, write
@@ -29,7 +29,10 @@ def nothing(tags):
     flat = Curve((0.0,) * 4 + (9.0,) * 4, (0.0,) * 4, 3, (0.0, 9.0))
     one = replace(flat, coefficients=(0.1,) * 4)
     zero = dict.fromkeys(tags, 0.0)
-    return Calibration(zero, zero, "cauchy", 0.1, "mean-of-lifted", -82.0, 299702547.0, flat, one)
+    return Calibration(
+        delays_ns=zero, delays_std_ns=zero, loss="cauchy", scale_ns=0.1, lift="mean-of-lifted", alpha_dbm=-82.0,
+        speed_of_light=299702547.0, bias_curve=flat, sigma_curve=one,
+    )  # fmt: skip
 
 
 def test_without_noise_they_are_what_was_planted(tmp_path):

@@ -11,7 +11,7 @@ from calib.calibration.power_curves import Curve
 from calib.errors import UnanswerableError
 from calib.estimation.fitting import fit
 from calib.evaluation.localization import Settings, as_tum, localize, summarize
-from calib.ranges import Flight, load_flight
+from calib.sources import Flight, load_flight
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate, write
 
@@ -37,8 +37,9 @@ def clean(flight: Flight, sigma_m=0.08) -> tuple[Flight, Calibration]:
     raw = ranges.truth_m + rng.normal(size=len(ranges)) * sigma_m
     tags = ranges.tags()
     calibration = Calibration(
-        dict.fromkeys(tags, 0.0), dict.fromkeys(tags, 0.0), "cauchy", 0.1, "mean-of-lifted", -82.0, 299702547.0,
-        flat(0.0), flat(sigma_m),
+        delays_ns=dict.fromkeys(tags, 0.0), delays_std_ns=dict.fromkeys(tags, 0.0), loss="cauchy", scale_ns=0.1,
+        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=flat(0.0),
+        sigma_curve=flat(sigma_m),
     )  # fmt: skip
     return replace(flight, ranges=replace(ranges, raw_m=raw)), calibration
 

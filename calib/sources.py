@@ -1,0 +1,213 @@
+"""Where ranges come from: recordings, open ones, simulations in memory, or several of them; the only reader in here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import BadInputError
+from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.twr import Exchanges
+
+
+def no_poses() -> Poses:
+    """Return poses of nothing."""
+    return Poses(np.zeros(0, np.int64), np.zeros(0, np.str_), np.zeros((0, 3)), np.zeros((0, 4)))
+
+
+@runtime_checkable
+class Source(Protocol):
+    """What anything may hand over instead of a file: exchanges, poses of bodies, the tags on them, what was planted.
+
+    A simulation's result has these attributes. `faults` and `overheard` (columns of the recording's table) are used
+    where they are there, too.
+    """
+
+    @property
+    def exchanges(self) -> Exchanges:
+        """The exchanges, in order of time."""
+
+    @property
+    def poses(self) -> Poses:
+        """Poses of the bodies; none where the exchanges carry their true distances."""
+
+    @property
+    def tags(self) -> Sequence[Tag]:
+        """The tags with their bodies and lever arms."""
+
+    @property
+    def planted(self) -> Mapping[str, Any] | None:
+        """What a simulation put in, which is shown and never used."""
+
+
+Data = str | os.PathLike[str] | Recording | Source | Exchanges | Ranges
+"""One recording: its path, an open one, a `Source`, exchanges with their distances, or ranges loaded before."""
+
+
+class RecordedSource:
+    """An open recording as a `Source`, which reads each table when it is asked for."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Read from a recording, which must stay open."""
+        self._recording = recording
+
+    @cached_property
+    def exchanges(self) -> Exchanges:
+        """Return the exchanges."""
+        return self._recording.exchanges()
+
+    @cached_property
+    def poses(self) -> Poses:
+        """Return the poses."""
+        return self._recording.poses()
+
+    @cached_property
+    def tags(self) -> list[Tag]:
+        """Return the tags."""
+        return self._recording.tags()
+
+    @cached_property
+    def planted(self) -> Mapping[str, Any] | None:
+        """Return what a simulation planted, None in a real recording."""
+        found = self._recording.meta().get("planted")
+        return found if isinstance(found, dict) else None
+
+    @cached_property
+    def faults(self) -> list[Fault]:
+        """Return what went wrong while recording."""
+        return self._recording.faults()
+
+    @cached_property
+    def overheard(self) -> dict[str, NDArray[Any]]:
+        """Return the columns of passively heard exchanges."""
+        return self._recording.overheard()
+
+
+@dataclass(frozen=True, slots=True)
+class _Bare:
+    """Exchanges that carry their true distances, and nothing beside them."""
+
+    exchanges: Exchanges
+    poses: Poses = field(default_factory=no_poses)
+    tags: Sequence[Tag] = ()
+    planted: Mapping[str, Any] | None = None
+
+
+@contextmanager
+def opened(data: Data) -> Iterator[tuple[str, Source]]:
+    """Yield a name and a `Source`, which is good inside the block.
+
+    Raises the errors of `Recording.open`, and `BadInputError` for what is no recording at all.
+    """
+    if isinstance(data, Recording):
+        yield data.path.name, RecordedSource(data)
+    elif isinstance(data, str | os.PathLike):
+        with Recording.open(data) as recording:
+            yield Path(data).name, RecordedSource(recording)
+    elif isinstance(data, Exchanges):
+        yield IN_MEMORY, _Bare(data)
+    elif isinstance(data, Source):
+        yield str(getattr(data, "name", IN_MEMORY)), data
+    else:
+        raise _no_recording(data)
+
+
+def _no_recording(data: object) -> BadInputError:
+    return BadInputError(
+        f"found {type(data).__name__}, expected a path, a Recording, Exchanges, Ranges, or an object with exchanges, "
+        "poses, tags and planted",
+        parameter="data",
+    )
+
+
+def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False) -> Ranges:
+    """Return the ranges of one or more recordings with their true distances, without those that cannot be used.
+
+    `data` is the path of a recording, an open `Recording`, `Ranges`, any object with `exchanges`, `poses`, `tags` and
+    `planted` (as `uwbsim.simulate` gives it), or several of those. `trim_static` leaves out spans of two seconds in
+    which a pair's distance stays within two centimetres. Raises the errors of `Recording.open`, and
+    `UnanswerableError` where nothing can be used.
+
+    >>> import calib
+    >>> own = calib.Ranges.from_arrays([3.1, 4.2], initiator=1, target=2, fpp1_dbm=-85.0, truth_m=[3.0, 4.0])
+    >>> calib.load_ranges(own)
+    <Ranges of memory: 2 of tags 1, 2>
+    """
+    parts = load_each(data, trim_static=trim_static)
+    return parts[0] if len(parts) == 1 else concatenate(parts)
+
+
+def load_each(data: Data | Iterable[Data], *, trim_static: bool = False) -> list[Ranges]:
+    """Return the ranges of each recording; raises what `load_ranges` raises."""
+    parts = [_load(one) for one in each(data)]
+    return [without_static(part) for part in parts] if trim_static else parts
+
+
+def each(data: Data | Iterable[Data]) -> list[Data]:
+    """Return one recording or several as a list; raises `BadInputError` where there is none."""
+    if isinstance(data, str | os.PathLike | Recording | Ranges | Exchanges | Source):
+        return [data]
+    if not isinstance(data, Iterable):
+        raise _no_recording(data)
+    found = list(data)
+    if not found:
+        raise BadInputError("no recording was given", parameter="data")
+    return found
+
+
+def _load(data: Data) -> Ranges:
+    if isinstance(data, Ranges):
+        return data.usable()
+    with opened(data) as (name, source):
+        exchanges = source.exchanges
+        complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
+        poses, tags = (None, []) if complete else (source.poses, source.tags)
+        planted = source.planted
+    ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, planted=planted, source=name)
+    return ranges.usable(_why_no_truth(ranges, poses, tags))
+
+
+def _why_no_truth(ranges: Ranges, poses: Poses | None, tags: Sequence[Tag]) -> str:
+    """Say how poses and exchanges lie in time, where no exchange has a true distance although there are poses."""
+    if poses is None or not len(poses) or not len(ranges) or np.isfinite(ranges.truth_m).any():
+        return ""
+    missing = sorted({t.body for t in tags} - set(np.unique(poses.body).tolist()))
+    if missing:
+        return f"no poses of body {missing[0]}"
+    start = int(poses.time_ns[0])
+    spans = [((int(t.min()) - start) * 1e-9, (int(t.max()) - start) * 1e-9) for t in (poses.time_ns, ranges.time_ns)]
+    return (
+        f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s, its exchanges {spans[1][0]:.1f} to "
+        f"{spans[1][1]:.1f} s after the first pose; shift the poses with 'uwblink poses --offset'"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """Ranges together with where bodies and tags were."""
+
+    ranges: Ranges
+    poses: Poses
+    tags: list[Tag]
+
+    def moving_bodies(self) -> list[str]:
+        """Return the bodies whose position changes by more than a decimetre."""
+        names = sorted(set(self.poses.body.tolist()))
+        spans = {n: np.ptp(self.poses.position_m[self.poses.body == n], axis=0).max() for n in names}
+        return [name for name in names if spans[name] > 0.1]
+
+
+def load_flight(data: Data) -> Flight:
+    """Return a recording's ranges with its poses; raises what `load_ranges` raises."""
+    with opened(data) as (_, source):
+        return Flight(load_ranges(data), source.poses, list(source.tags))

@@ -1,0 +1,98 @@
+"""A corrected recording: the ranges that `evaluate` sees, and every other row of every table as it was."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import calib
+from calib.samples import sample_flight
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import TABLES, Fault
+from uwblink.twr import COLUMNS
+
+
+def full_recording(path):
+    """Write a recording with rows in every table, in which a board printed 0.0000 dBm now and then."""
+    flight = sample_flight(600)
+    power = flight.exchanges.fpp1_dbm.copy()
+    power[::9] = 0.0
+    both = flight.exchanges.fpp2_dbm.copy()
+    both[::90] = 0.0
+    exchanges = replace(flight.exchanges, fpp1_dbm=power, fpp2_dbm=both)
+    with Recording.create(path, meta={"note": "kept"}) as recording:
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(exchanges)
+        recording.append_faults([Fault(5, "1", "time-out", "no answer")])
+        recording.append_frames([(7, "1", "in", b"\x00\xff raw"), (8, "1", "out", b"C05")])
+        recording.append_cirs([(9, 1, 1, 2, 741.25, tuple(range(1016)))])
+        recording.append_overheard([{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
+    return exchanges
+
+
+def rows(path, table):
+    import duckdb
+
+    with duckdb.connect(str(path), read_only=True) as db:
+        found = db.execute(f"SELECT * FROM {table}").fetchall()
+        names = [column[0] for column in db.description]
+    return names, found
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("corrected")
+    exchanges = full_recording(folder / "f.uwb")
+    known = calib.fit(folder / "f.uwb").calibration
+    done = calib.apply(folder / "f.uwb", known, folder / "c.uwb")
+    return folder, exchanges, known, done
+
+
+@pytest.mark.parametrize("table", sorted(TABLES))
+def test_every_table_is_there(corrected, table):
+    folder, *_ = corrected
+    names, before = rows(folder / "f.uwb", table)
+    also, after = rows(folder / "c.uwb", table)
+    assert names == also
+    assert before, "a table without rows shows nothing"
+    if table == "exchanges":
+        place = names.index("range_m")
+        before, after = ([row[:place] + row[place + 1 :] for row in part] for part in (before, after))
+    if table == "meta":
+        after = [row for row in after if row[0] != "calibration"]
+        before, after = sorted(before), sorted(after)
+    assert repr(after) == repr(before)
+
+
+def test_apply_and_evaluate_correct_the_same_range_alike(corrected):
+    folder, exchanges, known, done = corrected
+    with Recording.open(folder / "c.uwb") as recording:
+        written = recording.exchanges().range_m
+    judged = calib.load_ranges(folder / "f.uwb")
+    usable = np.isfinite(judged.truth_m)
+    kept = (exchanges.fpp1_dbm < 0) | (exchanges.fpp2_dbm < 0)
+    assert judged.excluded == {"no power": np.count_nonzero(~kept)}
+    assert usable.all()
+    assert done.count == len(exchanges)
+    np.testing.assert_array_equal(written[kept], known.apply(judged).corrected_m)
+    # And neither takes the 0 for a power: that would be 8 orders of magnitude of lifted power too much.
+    zero = (exchanges.fpp1_dbm == 0) & kept
+    assert np.count_nonzero(zero) > 50
+    one = known.correct(
+        exchanges.range_m[zero], exchanges.fpp2_dbm[zero], exchanges.fpp2_dbm[zero],
+        exchanges.initiator[zero], exchanges.target[zero],
+    )  # fmt: skip
+    # The boards' stamps are whole ticks: 4.7 mm of two flights, half of that of one.
+    np.testing.assert_allclose(written[zero], one.range_m, atol=0.0024)
+
+
+def test_a_corrected_recording_is_not_corrected_again(corrected):
+    folder, _, known, _ = corrected
+    with pytest.raises(calib.BadInputError, match="corrected already"):
+        calib.apply(folder / "c.uwb", known, folder / "again.uwb")
+    assert not (folder / "again.uwb").exists()
+
+
+def test_all_columns_of_exchanges_are_compared():
+    assert set(COLUMNS) == set(TABLES["exchanges"])

@@ -1,0 +1,134 @@
+"""Ranges from files, open recordings, objects in memory and arrays: all the same, and mistakes are named."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import calib
+from calib.errors import BadInputError, UnanswerableError
+from calib.ranges import COLUMNS, Ranges
+from calib.samples import DELAYS_NS, sample_flight
+from calib.sources import load_flight, load_ranges
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Poses, Tag
+from uwblink.twr import Exchanges
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    flight = sample_flight()
+    place = tmp_path_factory.mktemp("source") / "sample.uwb"
+    with Recording.create(place, meta={"planted": flight.planted}) as recording:
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(flight.exchanges)
+    return place
+
+
+def assert_same(one, other):
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+def test_a_file_an_open_recording_and_an_object_are_the_same(path):
+    from_file = load_ranges(path)
+    assert from_file.source == "sample.uwb"
+    assert from_file.planted == {"delays_ns": {str(tag): delay for tag, delay in DELAYS_NS.items()}}
+    assert_same(load_ranges(str(path)), from_file)
+    with Recording.open(path) as recording:
+        assert_same(load_ranges(recording), from_file)
+    in_memory = load_ranges(sample_flight())
+    assert in_memory.source == "memory"
+    assert_same(in_memory, from_file)
+    assert load_ranges(from_file) is from_file
+
+
+def test_several_are_one_after_the_other(path):
+    both = load_ranges([path, sample_flight(300, seed=2)])
+    assert len(both) == 1200
+    assert both.source == "sample.uwb, memory"
+    assert_same(both[:900], load_ranges(path))
+
+
+def test_every_function_takes_what_a_fit_takes(path):
+    in_memory, from_file = sample_flight(), calib.fit([path])
+    result = calib.fit(in_memory)
+    assert result.calibration.delays_ns == from_file.calibration.delays_ns
+    known = result.calibration
+    assert calib.evaluate(in_memory, known).to_dict() == calib.evaluate(path, known).to_dict()
+    assert calib.examine(in_memory) == calib.examine(path)
+    ours, theirs = calib.localize(in_memory, known), calib.localize(path, known)
+    assert [one.tracks["raw"].rmse_m for one in ours] == [one.tracks["raw"].rmse_m for one in theirs]
+    # Delays differ from the planted ones by a common shift, which is a constant of the curve.
+    away = np.array([known.delays_ns[tag] - DELAYS_NS[tag] for tag in DELAYS_NS])
+    np.testing.assert_allclose(away - away.mean(), 0, atol=0.02)
+
+
+@dataclass
+class Bare:
+    """Somebody else's object, with nothing but the four attributes."""
+
+    exchanges: Exchanges
+    poses: Poses
+    tags: list[Tag]
+    planted: dict[str, Any] | None = None
+
+
+def test_a_strangers_object_will_do():
+    flight = sample_flight()
+    bare = Bare(flight.exchanges, flight.poses, flight.tags)
+    assert load_ranges(bare).planted is None
+    assert_same(load_ranges(bare), load_ranges(flight))
+    assert calib.examine(bare) == []
+
+
+def test_exchanges_with_their_distances_need_no_poses():
+    flight = sample_flight()
+    truth = load_ranges(flight).truth_m
+    carried = replace(flight.exchanges, truth_m=truth)
+    assert_same(load_ranges(carried), load_ranges(flight))
+    assert_same(Ranges.from_exchanges(flight.exchanges, truth), load_ranges(flight))
+    with pytest.raises(BadInputError, match=r"`truth_m`: has shape \(3,\)"):
+        Ranges.from_exchanges(flight.exchanges, np.zeros(3))
+    with pytest.raises(UnanswerableError, match="it needs poses and lever arms, or measured distances"):
+        load_ranges(flight.exchanges)
+
+
+@pytest.mark.parametrize("data", [None, 3, [], [None], {"a": 1}])
+def test_what_is_no_recording_is_refused(data):
+    with pytest.raises((BadInputError, FileNotFoundError)):
+        load_ranges(data)
+
+
+def test_arrays_become_ranges():
+    r = Ranges.from_arrays([3, 4], initiator=1, target=[2, 3], fpp1_dbm=[-85.0, 0.0], truth_m=[2.9, 3.9])
+    assert r.tags() == [1, 2, 3]
+    assert repr(r) == "<Ranges of memory: 2 of tags 1, 2, 3>"
+    np.testing.assert_array_equal(r.fpp1_dbm, [-85.0, math.nan])
+    assert repr(r.usable()) == "<Ranges of memory: 1 of tags 1, 2, 1 left out: no power>"
+    assert load_ranges(r.usable()).excluded == {"no power": 1}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"range_m": [1.0, 2.0, 3.0]},
+        {"range_m": [[1.0, 2.0]]},
+        {"initiator": [1.5, 2.5]},
+        {"target": ["a", "b"]},
+        {"fpp1_dbm": ["loud", "low"]},
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(wrong):
+    good: dict[str, Any] = {"range_m": [1.0, 2.0], "initiator": [1, 2], "target": [2, 3], "fpp1_dbm": -85.0}
+    columns = good | wrong
+    with pytest.raises(BadInputError):
+        Ranges.from_arrays(columns.pop("range_m"), **columns)
+
+
+def test_a_flight_has_its_poses(path):
+    assert load_flight(path).moving_bodies() == ["robot1", "robot2", "robot3"]
+    assert load_flight(sample_flight()).tags == load_flight(path).tags

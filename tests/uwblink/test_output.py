@@ -1,0 +1,41 @@
+"""Output files: whole or not there at all."""
+
+import pytest
+
+from uwblink.errors import OutputError, RecordingError, RecordingExistsError
+from uwblink.output import write_bytes, write_text
+
+
+def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
+    write_text(tmp_path / "a.txt", "± 1 µs\n", force=False)
+    assert (tmp_path / "a.txt").read_bytes() == "± 1 µs\n".encode()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_only_force_replaces(tmp_path):
+    write_bytes(tmp_path / "a", b"first", force=False)
+    with pytest.raises(RecordingExistsError):
+        write_bytes(tmp_path / "a", b"second", force=False)
+    assert (tmp_path / "a").read_bytes() == b"first"
+    write_bytes(tmp_path / "a", b"second", force=True)
+    assert (tmp_path / "a").read_bytes() == b"second"
+
+
+def test_what_was_there_stays_where_the_disk_is_full(tmp_path, monkeypatch):
+    write_bytes(tmp_path / "a", b"first", force=False)
+
+    def full(self, data):
+        with self.open("wb") as file:
+            file.write(data[: len(data) // 2])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(tmp_path), "write_bytes", full)
+    with pytest.raises(OutputError, match=r"a: cannot be written \(No space left"):
+        write_bytes(tmp_path / "a", b"second", force=True)
+    assert (tmp_path / "a").read_bytes() == b"first"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RecordingError, match="does not exist"):
+        write_text(tmp_path / "no" / "a", "x", force=False)
