@@ -53,7 +53,16 @@ class Comparison:
 
 
 def compare(first: Calibration, second: Calibration) -> Comparison:
-    """Compare two calibrations; raises `UnanswerableError` where fewer than two tags are in both."""
+    """Say whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
+
+    Differences in ns are second minus first, less the shift common to all delays. Raises `UnanswerableError` where
+    fewer than two tags have a determined delay in both.
+
+    >>> import calib
+    >>> first, second = (calib.fit(calib.sample_flight(seed=seed)).calibration for seed in (1, 2))
+    >>> calib.compare(first, second).same
+    True
+    """
     from scipy.stats import chi2
 
     known = [{t for t in c.delays_ns if np.isfinite(c.delays_std_ns.get(t, 0.0))} for c in (first, second)]

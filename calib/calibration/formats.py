@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -10,6 +11,7 @@ from typing import Any, Final
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.errors import BadInputError
+from uwblink.output import write_text
 from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
 
 TX_SHARE: Final = 0.44
@@ -94,11 +96,25 @@ FORMATS: Final[dict[str, Callable[[Calibration], str]]] = {
 }
 
 
-def as_format(calibration: Calibration, to: str) -> str:
-    """Return a calibration as text in one of `FORMATS`; raises `BadInputError` where that cannot be done."""
+def export(
+    calibration: Calibration, to: str, path: str | os.PathLike[str] | None = None, *, force: bool = False
+) -> str:
+    """Return a calibration as text in another form, and write it to `path` where one is given.
+
+    `to` is "registers" (values for the DW1000's antenna-delay registers, as CSV), "json", "csv" (delays), "miluv" or
+    "ros-yaml". Raises `BadInputError` for another, and for a calibration with groups of tags in a form that has one
+    curve.
+
+    >>> import calib
+    >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[0])
+    tag,tx_antenna_delay,rx_antenna_delay
+    """
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
-    return FORMATS[to](calibration)
+    text = FORMATS[to](calibration)
+    if path is not None:
+        write_text(Path(path), text, force=force)
+    return text
 
 
 def read_miluv(path: Path) -> Calibration:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import TypedDict
 
 import numpy as np
 
@@ -12,6 +13,19 @@ from calib.errors import BadInputError
 from calib.estimation.losses import MIXTURE, known_losses
 
 HIGHEST_TAG = 65_535
+
+
+class FitSettings(TypedDict, total=False):
+    """The keyword arguments of `calib.fit`."""
+
+    loss: str
+    scale_ns: float | None
+    lift: str
+    alpha_dbm: float
+    fixed_ns: Mapping[int, float] | None
+    groups: Mapping[str, tuple[int, ...]] | None
+    sequential: bool
+    minimum_norm: bool
 
 
 def check_fit(

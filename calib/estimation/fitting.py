@@ -10,8 +10,8 @@ centre of the core of the calibrated errors at zero: the core is told from the t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,30 +23,20 @@ from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve
 from calib.estimation.arguments import check_fit
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.problem import Problem, build_problem
+from calib.estimation.result import FitResult
 from calib.estimation.sigma_curve import fit_sigma
 from calib.estimation.solver import Solved, solve
 from calib.estimation.warnings import warnings_of
 from calib.ranges import Ranges
+from calib.sources import Data, load_ranges
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 INLIER_SIGMAS: Final = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class FitResult:
-    """A calibration and how it came about; residuals are full-corrected errors (n,), metres."""
-
-    calibration: Calibration
-    residuals_m: Floats
-    inliers: Bools
-    success: bool
-    message: str
-    warnings: list[str]
-
-
 def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its default
-    ranges: Ranges,
+    data: Data | Iterable[Data],
     *,
     loss: str = "cauchy",
     scale_ns: float | None = None,
@@ -57,14 +47,24 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     sequential: bool = False,
     minimum_norm: bool = False,
 ) -> FitResult:
-    """Fit a calibration to ranges with known truth.
+    """Fit antenna delays and the curves of bias and standard deviation to ranges with known truth.
+
+    `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `loss` is
+    "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added, or "mixture", the likelihood of core, tail and
+    outliers.
 
     `scale_ns` is the scale of the robust loss in time of flight, estimated from the data by default; `fixed_ns` are
     delays that are known; `groups` name tags that share a curve (by default all do). `sequential` is the recipe of ICRA
     2023, section V: delays first, then the curve on what they leave. `minimum_norm` fits even where the pairs leave
     delays free, with the smallest ones that agree with the data. Raises `UnanswerableError` when there are too few
     ranges, their power does not vary, or the pairs do not determine the delays, and `BadInputError` for pinned tags or
-    groups that are not in the data.
+    groups that are not in the data, and for a parameter that cannot be used.
+
+    >>> import calib
+    >>> result = calib.fit(calib.sample_flight())
+    >>> delays = result.calibration.delays_ns
+    >>> f"{delays[2] - delays[1]:.2f} ns, planted 0.40 ns"
+    '0.40 ns, planted 0.40 ns'
     """
     fixed, groups = dict(fixed_ns or {}), dict(groups or {})
     check_fit(
@@ -78,6 +78,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     )
     fixed = {int(tag): float(delay) for tag, delay in fixed.items()}
     groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
+    ranges = load_ranges(data)
     problem = build_problem(
         ranges, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups, minimum_norm=minimum_norm
     )
@@ -89,12 +90,13 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     warnings = warnings_of(ranges, applied, float(np.mean(inliers)), problem.free)
     provenance = _provenance(ranges, inliers, fixed, sequential, problem, warnings)
     return FitResult(
-        replace(calibration, provenance=provenance),
-        residuals,
-        inliers,
-        found.success,
-        f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
-        warnings,
+        calibration=replace(calibration, provenance=provenance),
+        ranges=ranges,
+        residuals_m=residuals,
+        inliers=inliers,
+        success=found.success,
+        message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
+        warnings=warnings,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -13,21 +14,29 @@ from calib.estimation.arguments import check_choice, check_tag
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.losses import LOSSES
 from calib.estimation.robust import robust_fit
-from calib.ranges import Ranges
+from calib.sources import Data, load_ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 FEWEST = 50
 
 
-def add_tag(ranges: Ranges, calibration: Calibration, tag: int, loss: str = "cauchy") -> Calibration:
+def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, loss: str = "cauchy") -> Calibration:
     """Return the calibration with the delay of one more tag; everything known stays as it was.
 
+    `data` is what `load_ranges` takes.
     Start is the closed form of ICRA 2023, section IV, for one pair (the median of what is missing); result a robust
     fit over all exchanges with calibrated tags, at the centre of the core of their errors. Raises `BadInputError`
     where the tag is known already or not in the data, `UnanswerableError` where too few exchanges help.
+
+    >>> import calib, dataclasses
+    >>> known = calib.fit(calib.sample_flight()).calibration
+    >>> two = dataclasses.replace(known, delays_ns={tag: known.delays_ns[tag] for tag in (1, 2)})
+    >>> abs(calib.add_tag(calib.sample_flight(seed=2), two, 3).delays_ns[3] - known.delays_ns[3]) < 0.02
+    True
     """
     check_tag(tag)
     check_choice("loss", loss, LOSSES)
+    ranges = load_ranges(data)
     if tag in calibration.delays_ns:
         raise BadInputError(f"tag {tag} has a delay in the calibration already; fit anew to change it", parameter="tag")
     if tag not in ranges.tags():

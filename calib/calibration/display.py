@@ -1,0 +1,79 @@
+"""A calibration on one screen: a table of delays and of the curves, as text and as HTML."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from html import escape
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from calib.calibration.model import Calibration, TagGroup
+
+TWO_SIDED_95: Final = 1.959963984540054
+MOST_TAGS: Final = 40
+"""Tags that are listed; of more, the first are."""
+
+POINTS: Final = 6
+"""Lifted powers at which the curves are shown."""
+
+
+def as_text(calibration: Calibration) -> str:
+    """Return the calibration as lines of text."""
+    lines = [_headline(calibration), f"  {'tag':>5}  {'delay (ns)':>11}  95 % interval"]
+    for tag, delay, interval in delay_rows(calibration):
+        lines.append(f"  {tag:>5}  {delay:>11}  {interval}")
+    power, *curves = curve_rows(calibration)
+    for name, *cells in (power, *curves):
+        lines.append(f"  {name:18s}" + "".join(f"{cell:>9s}" for cell in cells))
+    return "\n".join(lines)
+
+
+def as_html(calibration: Calibration) -> str:
+    """Return the calibration as HTML tables, for notebooks."""
+    delays = [("tag", "delay (ns)", "95 % interval"), *delay_rows(calibration)]
+    return f"<p>{escape(_headline(calibration))}</p>" + "".join(
+        "<table>"
+        + "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>" for row in rows)
+        + "</table>"
+        for rows in (delays, curve_rows(calibration))
+    )
+
+
+def delay_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield tag, delay in ns, and its interval in words."""
+    rows = sorted(calibration.delays_ns.items())
+    for tag, delay in rows[:MOST_TAGS]:
+        half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, math.nan)
+        if math.isinf(half):
+            interval = "undetermined"
+        elif half == 0:
+            interval = "pinned"
+        else:
+            interval = f"± {half:.4f}" if math.isfinite(half) else "unknown"
+        yield str(tag), f"{delay:+.4f}", interval
+    if len(rows) > MOST_TAGS:
+        yield "...", "", f"{len(rows) - MOST_TAGS} more"
+
+
+def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+    """Return lifted powers, and the curves there: of each group of tags, or the one of all."""
+    shown = np.linspace(*calibration.bias_curve.range, POINTS)
+    named: dict[str, Calibration | TagGroup] = dict(calibration.groups) or {"": calibration}
+    rows = [("lifted power", *(f"{power:.3g}" for power in shown))]
+    for name, curves in named.items():
+        of = f" {name}" if name else ""
+        rows.append((f"bias (cm){of}", *(f"{100 * value:+.1f}" for value in curves.bias_curve(shown))))
+        rows.append((f"sigma (cm){of}", *(f"{100 * value:.1f}" for value in curves.sigma_curve(shown))))
+    return rows
+
+
+def _headline(calibration: Calibration) -> str:
+    fitted = calibration.provenance.get("exchanges")
+    of = f" from {fitted} ranges" if fitted else ""
+    return (
+        f"Calibration of {len(calibration.delays_ns)} tags{of}: {calibration.loss} loss, scale "
+        f"{calibration.scale_ns:.3g} ns, {calibration.lift} power above {calibration.alpha_dbm:g} dBm"
+    )

@@ -1,0 +1,80 @@
+"""What a fit returns: a calibration, how it came about, and ways to look at it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING
+
+from calib.calibration.model import Calibration, save
+from calib.ranges import Ranges
+from uwblink.arrays import Bools, Floats
+
+if TYPE_CHECKING:
+    from calib.figures import Axes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class FitResult:
+    """A calibration and how it came about.
+
+    `ranges` are those that were fitted (n,), `residuals_m` their fully corrected errors, corrected range less truth;
+    `inliers` those within three sigmas. `message` says how the search ended, `warnings` what a user should know before
+    trusting it, the gravest first. The `plot_` methods draw into matplotlib axes, new ones if none are given, and
+    return them.
+
+    >>> import calib
+    >>> result = calib.fit(calib.sample_flight())
+    >>> print(repr(result).split(":")[0])
+    Fit of 900 ranges of memory
+    >>> axes = result.plot_bias()
+    """
+
+    calibration: Calibration
+    ranges: Ranges
+    residuals_m: Floats
+    inliers: Bools
+    success: bool
+    message: str
+    warnings: list[str]
+
+    def __repr__(self) -> str:
+        """Return the calibration as a table, below what it was fitted to, above the warnings."""
+        return "\n".join([self._headline(), repr(self.calibration), *(f"warning: {text}" for text in self.warnings)])
+
+    def _repr_html_(self) -> str:
+        """Return the same as HTML, for notebooks."""
+        warned = "".join(f"<p><b>Warning:</b> {escape(text)}</p>" for text in self.warnings)
+        return f"<p>{escape(self._headline())}</p>{self.calibration._repr_html_()}{warned}"
+
+    def _headline(self) -> str:
+        return f"Fit of {len(self.ranges)} ranges of {self.ranges.source}: {self.message}"
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
+        save(self.calibration, path, force=force)
+
+    def plot_bias(self, axes: Axes | None = None) -> Axes:
+        """Draw medians of the delay-corrected errors over lifted power, in cm, and the fitted curve with its band."""
+        from calib.figures import bias_over_power
+
+        return bias_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, axes)
+
+    def plot_sigma(self, axes: Axes | None = None) -> Axes:
+        """Draw robust standard deviations of the errors over lifted power, in cm, and the curve with its band."""
+        from calib.figures import sigma_over_power
+
+        return sigma_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, axes)
+
+    def plot_residuals(self, axes: Axes | None = None) -> Axes:
+        """Draw a histogram of the errors in cm: raw, with the delays corrected, and fully corrected."""
+        from calib.figures import histogram
+
+        return histogram(self.ranges, self.calibration.apply(self.ranges), axes)
+
+    def plot_delays(self, axes: Axes | None = None) -> Axes:
+        """Draw the antenna delays in ns with their 95 % intervals."""
+        from calib.figures import delays
+
+        return delays(self.calibration, axes=axes)
