@@ -1,16 +1,82 @@
-"""Fits, applies and evaluates calibrations of ultra-wideband ranges."""
+"""Fits, applies and evaluates calibrations of ultra-wideband ranges.
+
+>>> import calib
+>>> calib.__all__[:5]
+['BadInputError', 'CalibError', 'Calibration', 'CorrectedRanges', 'FitResult']
+"""
 
 from typing import TYPE_CHECKING, Final
 
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
+    from calib.calibration.comparison import compare
+    from calib.calibration.correction import apply
+    from calib.calibration.formats import export
+    from calib.calibration.model import Calibration, CorrectedRanges, load_calibration
+    from calib.doctor.examine import examine
+    from calib.errors import BadInputError, CalibError, UnanswerableError
+    from calib.estimation.fitting import fit
     from calib.estimation.losses import register_loss
+    from calib.estimation.new_tag import add_tag
+    from calib.estimation.result import FitResult
+    from calib.evaluation.localization import localize
+    from calib.evaluation.statistics import evaluate
+    from calib.ranges import Ranges
+    from calib.report.campaign import run_campaign
+    from calib.report.layout import register_report_section
+    from calib.report.report import write_report
+    from calib.samples import sample_flight
+    from calib.sources import load_ranges
 
-__all__ = ["register_loss"]
+__all__ = [
+    "BadInputError",
+    "CalibError",
+    "Calibration",
+    "CorrectedRanges",
+    "FitResult",
+    "Ranges",
+    "UnanswerableError",
+    "add_tag",
+    "apply",
+    "compare",
+    "evaluate",
+    "examine",
+    "export",
+    "fit",
+    "load_calibration",
+    "load_ranges",
+    "localize",
+    "register_loss",
+    "register_report_section",
+    "run_campaign",
+    "sample_flight",
+    "write_report",
+]
 
 _HOMES: Final = {
+    "BadInputError": "calib.errors",
+    "CalibError": "calib.errors",
+    "Calibration": "calib.calibration.model",
+    "CorrectedRanges": "calib.calibration.model",
+    "FitResult": "calib.estimation.result",
+    "Ranges": "calib.ranges",
+    "UnanswerableError": "calib.errors",
+    "add_tag": "calib.estimation.new_tag",
+    "apply": "calib.calibration.correction",
+    "compare": "calib.calibration.comparison",
+    "evaluate": "calib.evaluation.statistics",
+    "examine": "calib.doctor.examine",
+    "export": "calib.calibration.formats",
+    "fit": "calib.estimation.fitting",
+    "load_calibration": "calib.calibration.model",
+    "load_ranges": "calib.sources",
+    "localize": "calib.evaluation.localization",
     "register_loss": "calib.estimation.losses",
+    "register_report_section": "calib.report.layout",
+    "run_campaign": "calib.report.campaign",
+    "sample_flight": "calib.samples",
+    "write_report": "calib.report.report",
 }
 
 if not TYPE_CHECKING:

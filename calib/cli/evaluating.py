@@ -26,15 +26,16 @@ def evaluate(
     force: Force = False,
 ) -> None:
     """Compare raw, delay-corrected and fully corrected ranges with the truth."""
-    from calib.calibration.model import load as load_calibration
+    from calib.calibration.model import load_calibration
     from calib.evaluation.statistics import evaluate as run
-    from calib.ranges import concatenate, load
-    from uwblink.recording.file import check_output
+    from calib.ranges import concatenate
+    from calib.sources import load_ranges
+    from uwblink.output import check_output
 
     if report:
         check_output(report, force=force)
     known = load_calibration(calibration)
-    parts = [load(path) for path in recordings]
+    parts = [load_ranges(path) for path in recordings]
     evaluation = run(concatenate(parts), known)
     if report:
         from calib.report.report import write_report
@@ -62,14 +63,13 @@ def localize(
     """Track each body with an EKF: raw, calibrated, and calibrated with its variance."""
     from dataclasses import asdict
 
-    from calib.calibration.model import load as load_calibration
-    from calib.calibration.model import write_text
+    from calib.calibration.model import load_calibration
     from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, as_tum, summarize
     from calib.evaluation.localization import localize as run
-    from calib.ranges import load_flight
+    from uwblink.output import write_text
 
     known = load_calibration(calibration)
-    found = [one for path in recordings for one in run(load_flight(path), known)]
+    found = [one for path in recordings for one in run(path, known)]
     if tum:
         tum.mkdir(parents=True, exist_ok=True)
         for one in found:
@@ -131,9 +131,9 @@ def compare(
 ) -> None:
     """Say whether two calibrations differ by more than they do not know."""
     from calib.calibration.comparison import compare as run
-    from calib.calibration.model import load
+    from calib.calibration.model import load_calibration
 
-    found = run(load(first), load(second))
+    found = run(load_calibration(first), load_calibration(second))
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
         return

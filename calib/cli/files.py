@@ -26,11 +26,10 @@ def apply(
     force: Force = False,
 ) -> None:
     """Write a recording whose ranges are corrected."""
-    from calib.calibration.correction import correct
-    from calib.calibration.model import load
+    import calib
 
-    count, clamped = correct(recording, load(calibration), output, force=force)
-    typer.echo(f"{output}: {count} ranges corrected, {clamped} beyond the fitted power")
+    applied = calib.apply(recording, calib.load_calibration(calibration), output, force=force)
+    typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
 
 
 def export(
@@ -40,15 +39,13 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a calibration in another form."""
-    from calib.calibration.formats import as_format
-    from calib.calibration.model import load, write_text
+    import calib
 
-    text = as_format(load(calibration), to)
+    text = calib.export(calib.load_calibration(calibration), to, output, force=force)
     if output is None:
         typer.echo(text, nl=False)
-        return
-    write_text(output, text, force=force)
-    typer.echo(f"{output}")
+    else:
+        typer.echo(f"{output}")
 
 
 @imports.command("miluv")
@@ -60,7 +57,7 @@ def import_miluv(
     """Read the calibration published with the MILUV dataset."""
     from calib.calibration.formats import read_miluv
     from calib.calibration.model import save
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output
 
     check_output(output, force=force)
     found = read_miluv(source)

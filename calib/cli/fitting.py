@@ -53,14 +53,15 @@ def fit(
 ) -> None:
     """Fit antenna delays and power curves."""
     from calib.calibration.model import save
-    from calib.cli.options import fit_options, load_all
+    from calib.cli.options import fit_options
     from calib.errors import UnanswerableError
     from calib.estimation.fitting import fit as run
-    from uwblink.recording.file import check_output
+    from calib.sources import load_ranges
+    from uwblink.output import check_output
 
     options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
     check_output(output, force=force)
-    ranges = load_all(recordings, trim_static=trim_static)
+    ranges = load_ranges(recordings, trim_static=trim_static)
     try:
         result = run(ranges, **options)
     except UnanswerableError as error:
@@ -100,14 +101,13 @@ def add_tag(
     force: Force = False,
 ) -> None:
     """Add a new tag to a calibration."""
-    from calib.calibration.model import load as load_calibration
-    from calib.calibration.model import save
+    from calib.calibration.model import load_calibration, save
     from calib.estimation.new_tag import add_tag as run
-    from calib.ranges import load
-    from uwblink.recording.file import check_output
+    from calib.sources import load_ranges
+    from uwblink.output import check_output
 
     check_output(output, force=force)
-    found = run(load(recording), load_calibration(calibration), tag)
+    found = run(load_ranges(recording), load_calibration(calibration), tag)
     save(found, output, force=force)
     half = 1.96 * found.delays_std_ns[tag]
     typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")

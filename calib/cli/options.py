@@ -6,22 +6,9 @@ import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TypedDict
 
 from calib.errors import BadInputError
-from calib.ranges import Ranges, concatenate, load, without_static
-
-
-class FitOptions(TypedDict):
-    """Keyword arguments of `calib.estimation.fitting.fit`."""
-
-    loss: str
-    scale_ns: float | None
-    lift: str
-    fixed_ns: dict[int, float]
-    groups: dict[str, tuple[int, ...]]
-    sequential: bool
-    minimum_norm: bool
+from calib.estimation.arguments import FitSettings
 
 
 def fit_options(
@@ -33,7 +20,7 @@ def fit_options(
     *,
     sequential: bool,
     minimum_norm: bool,
-) -> FitOptions:
+) -> FitSettings:
     """Return what the options of a fit mean; raises `BadInputError` for what cannot be read."""
     return {
         "loss": loss,
@@ -44,27 +31,6 @@ def fit_options(
         "sequential": sequential,
         "minimum_norm": minimum_norm,
     }
-
-
-def load_each(recordings: Iterable[Path], *, trim_static: bool = False) -> list[Ranges]:
-    """Load recordings, without the seconds in which a pair stands still, if so wished."""
-    parts = [load(path) for path in recordings]
-    return [without_static(part) for part in parts] if trim_static else parts
-
-
-def load_all(recordings: Iterable[Path], *, trim_static: bool = False) -> Ranges:
-    """Load recordings as one."""
-    return concatenate(load_each(recordings, trim_static=trim_static))
-
-
-def check_folder(parameter: str, folder: Path | None) -> None:
-    """Raise `BadInputError` where a folder to write into cannot be one."""
-    if folder is None:
-        return
-    if folder.exists() and not folder.is_dir():
-        raise BadInputError(f"{folder} is a file, expected a folder", parameter=parameter)
-    if not folder.parent.is_dir():
-        raise BadInputError(f"{folder.parent} does not exist", parameter=parameter)
 
 
 def groups_of_tags(path: Path) -> dict[str, tuple[int, ...]]:

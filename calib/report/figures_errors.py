@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.calibration.model import CorrectedRanges
+from calib.evaluation.statistics import pair_rows
+from calib.figures import COLOURS, label
 from calib.ranges import Ranges
-from calib.report.figures import COLOURS, label
 
 SIZE: Final = (8.0, 3.6)
 REACH: Final = 6.0
@@ -60,4 +61,28 @@ def residuals(ranges: Ranges, applied: CorrectedRanges, alpha_dbm: float) -> Fig
         panel.set_ylim(-40, 60)
         label(panel, name, "calibrated error (cm)" if panel is panels[0] else "")
     panels[0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def over_time(ranges: Ranges, applied: CorrectedRanges) -> Figure:
+    """Calibrated error of each pair over time, with the band in which 95 % should lie."""
+    pairs = pair_rows(ranges)
+    rows_of_panels = int(np.ceil(len(pairs) / 3))
+    figure = Figure(figsize=(10, 1.9 * rows_of_panels + 0.4), layout="constrained")
+    panels = figure.subplots(rows_of_panels, 3, sharex=True, sharey=True, squeeze=False).flat
+    start = ranges.time_ns.min()
+    for panel, (name, rows) in zip(panels, pairs.items(), strict=False):
+        time = (ranges.time_ns[rows] - start) * 1e-9
+        order = np.argsort(time)
+        error = 100 * (applied.corrected_m - ranges.truth_m)[rows]
+        panel.plot(time, error, ".", ms=1.5, color=COLOURS["full"], alpha=0.5, rasterized=True)
+        band = 196 * applied.sigma_m[rows][order]
+        panel.fill_between(time[order], -band, band, color="0.6", alpha=0.45, lw=0, rasterized=True)
+        panel.set_title(f"tags {name}", fontsize="small", loc="left")
+        panel.set_ylim(-60, 60)
+        panel.grid(alpha=0.25)
+    for panel in list(panels)[len(pairs) :]:
+        panel.set_visible(False)
+    figure.supxlabel("time (s)")
+    figure.supylabel("calibrated error (cm)")
     return figure

@@ -1,4 +1,4 @@
-"""Figures of a fit: delays with their intervals, and how they depend on the scale of the loss."""
+"""How the delays of a fit depend on the scale of the loss."""
 
 from __future__ import annotations
 
@@ -8,31 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.calibration.model import Calibration
-from calib.report.figures import COLOURS, label
+from calib.figures import label
 
-TWO_SIDED_95: Final = 1.959963984540054
 SIZE: Final = (8.0, 3.4)
-
-
-def delays(calibration: Calibration, planted_ns: dict[int, float], shift_ns: float) -> Figure:
-    """Delays with 95 % intervals; planted ones beside them, moved by the common shift."""
-    figure = Figure(figsize=SIZE, layout="constrained")
-    axes = figure.subplots()
-    tags = sorted(calibration.delays_ns)
-    place = np.arange(len(tags))
-    values = np.array([calibration.delays_ns[tag] for tag in tags])
-    std = np.array([calibration.delays_std_ns.get(tag, np.nan) for tag in tags])
-    bars = np.where(np.isfinite(std), TWO_SIDED_95 * std, 0.0)
-    axes.errorbar(place, values, bars, fmt="o", ms=5, capsize=4, color=COLOURS["full"], label="fitted, 95 % interval")
-    if planted_ns:
-        known = [planted_ns.get(tag, np.nan) + shift_ns for tag in tags]
-        axes.plot(place, known, "x", ms=8, mew=2, color=COLOURS["planted"], label="planted, moved by the common shift")
-    axes.axhline(0, color="0.7", lw=0.8, zorder=0)
-    axes.set_xticks(place, [str(tag) for tag in tags])
-    axes.margins(x=0.08)
-    label(axes, "tag", "antenna delay (ns)")
-    axes.legend(frameon=False)
-    return figure
 
 
 def scale_sensitivity(scales_ns: list[float], fits: list[Calibration], chosen_ns: float) -> Figure:

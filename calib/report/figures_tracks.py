@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, Localization, summarize
-from calib.report.figures import COLOURS, label
+from calib.figures import COLOURS, label
 
 COLOUR_OF: Final = {"raw": COLOURS["raw"], "calibrated": COLOURS["delays"], "variance": COLOURS["full"]}
 NAMES: Final = {"raw": "raw", "calibrated": "calibrated", "variance": "calibrated, with variance"}

@@ -9,12 +9,11 @@ import numpy as np
 
 from calib.calibration.model import Calibration, CorrectedRanges
 from calib.estimation.error_mixture import fit_error_mixture
-from calib.estimation.fitting import FitResult
 from calib.estimation.passive_listeners import OverheardDelay
+from calib.estimation.result import FitResult
 from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation, PlantedComparison, pair_rows
 from calib.ranges import Ranges
 from calib.report.blocks import Block, Heading, Picture, Table, Text
-from calib.report.figures_fit import TWO_SIDED_95
 
 OUTLIER_SIGMAS: Final = 3.0
 NOT_SPLIT: Final = (
@@ -84,7 +83,7 @@ def delays(
     calibration: Calibration, planted: PlantedComparison | None, truth: dict[str, Any], heard: dict[int, OverheardDelay]
 ) -> list[Block]:
     """Return delays with intervals; beside them what was planted, and what listeners heard."""
-    from calib.report import figures_fit
+    from calib import figures
 
     known = {int(tag): float(d) for tag, d in truth.get("delays_ns", {}).items()} if planted else {}
     header = ["tag", "delay (ns)", "95 % from", "to"]
@@ -92,7 +91,7 @@ def delays(
     header += ["heard by others (ns)", "± 1 std"] if heard else []
     rows = []
     for tag, delay in sorted(calibration.delays_ns.items()):
-        half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, float("nan"))
+        half = figures.TWO_SIDED_95 * calibration.delays_std_ns.get(tag, float("nan"))
         bounds = [f"{delay - half:+.4f}", f"{delay + half:+.4f}"] if np.isfinite(half) else ["undetermined", ""]
         row = [str(tag), f"{delay:+.4f}", *bounds]
         if known and planted:
@@ -105,7 +104,7 @@ def delays(
         Table(header, rows),
         Picture(
             "delays",
-            partial(figures_fit.delays, calibration, known, shift),
+            partial(figures.alone, partial(figures.delays, calibration, known, shift), figures.LOW),
             "Antenna delays with their 95 % intervals.",
         ),
     ]
@@ -138,19 +137,19 @@ def sensitivity(calibration: Calibration, refits: dict[float, Calibration]) -> l
 
 def curves(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
     """Return the curves over power, with bands and data."""
-    from calib.report import figures
+    from calib import figures
 
     return [
         Heading("Bias and standard deviation over power"),
         Picture(
             "bias",
-            partial(figures.bias_over_power, ranges, applied, calibration),
+            partial(figures.alone, partial(figures.bias_over_power, ranges, applied, calibration)),
             "Bias over lifted first-path power: medians of the delay-corrected errors, and the curve with its band. "
             "Where there are reflections their tail lifts the medians above the curve, which follows the core.",
         ),
         Picture(
             "sigma",
-            partial(figures.sigma_over_power, ranges, applied, calibration),
+            partial(figures.alone, partial(figures.sigma_over_power, ranges, applied, calibration)),
             "Standard deviation over lifted first-path power: robust estimates, and the curve of the core.",
         ),
     ]
@@ -197,12 +196,13 @@ def _cells(group: ErrorStatistics) -> list[str]:
 
 def errors(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
     """Return histograms, z-scores, and residuals over distance and power."""
-    from calib.report import figures, figures_errors
+    from calib import figures
+    from calib.report import figures_errors
 
     return [
         Picture(
             "errors",
-            partial(figures.histogram, ranges, applied),
+            partial(figures.alone, partial(figures.histogram, ranges, applied)),
             "Range errors. The outermost bins hold everything beyond them.",
         ),
         Picture(
@@ -250,14 +250,14 @@ def outliers(ranges: Ranges, applied: CorrectedRanges) -> list[Block]:
 
 def over_time(recordings: list[Ranges], calibration: Calibration) -> list[Block]:
     """Return a figure a recording of the calibrated errors over time."""
-    from calib.report import figures
+    from calib.report import figures_errors
 
     blocks: list[Block] = [Heading("Over time")]
     for k, recording in enumerate(recordings):
         blocks.append(
             Picture(
                 f"over-time-{k + 1}",
-                partial(figures.over_time, recording, calibration.apply(recording)),
+                partial(figures_errors.over_time, recording, calibration.apply(recording)),
                 f"{recording.source}: calibrated errors, and the band in which 95 % should lie.",
             )
         )

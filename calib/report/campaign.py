@@ -1,0 +1,200 @@
+"""A whole campaign: fit, examine, localize and judge, all that a report tells of."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Unpack
+
+from calib.calibration.model import Calibration, CorrectedRanges
+from calib.doctor.base import Finding
+from calib.doctor.examine import examine
+from calib.errors import UnanswerableError
+from calib.estimation.arguments import FitSettings
+from calib.estimation.fitting import fit
+from calib.estimation.losses import MIXTURE
+from calib.estimation.passive_listeners import OverheardDelay, heard_delays
+from calib.estimation.result import FitResult
+from calib.evaluation.localization import FILTERS, Localization, localize, summarize
+from calib.evaluation.statistics import Evaluation, evaluate
+from calib.ranges import Ranges, concatenate
+from calib.sources import Data, each, load_each, opened
+
+SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
+"""Scales of the loss, over the chosen one, for which a campaign is fitted again."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Everything that a report tells of: what was fitted from which recordings, and how it does on which tests.
+
+    `refits` are calibrations for other scales of the loss, by scale in ns; `heard` delays as passive listeners see
+    them; `findings` the doctor's, by recording; `tracks` the bodies that were localized.
+    """
+
+    training: list[Ranges]
+    tests: list[Ranges]
+    fit: FitResult
+    refits: dict[float, Calibration] = field(default_factory=dict)
+    heard: dict[int, OverheardDelay] = field(default_factory=dict)
+    findings: list[tuple[str, Finding]] = field(default_factory=list)
+    tracks: list[Localization] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        """Return what it comes to: the fit, how many tests there are, and what the doctor found."""
+        found = [f"{name}: {finding.fault}" for name, finding in self.findings]
+        return "\n".join([repr(self.fit), f"judged on {self.judged.source}", *found])
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration that was fitted."""
+        return self.fit.calibration
+
+    @cached_property
+    def trained(self) -> Ranges:
+        """The ranges of all training recordings."""
+        return concatenate(self.training)
+
+    @cached_property
+    def judged(self) -> Ranges:
+        """The ranges of the tests, or of the training where there are none."""
+        return concatenate(self.tests or self.training)
+
+    @cached_property
+    def corrected(self) -> CorrectedRanges:
+        """The judged ranges, corrected."""
+        return self.calibration.apply(self.judged)
+
+    @cached_property
+    def evaluation(self) -> Evaluation:
+        """How the calibration does on the judged ranges."""
+        return evaluate(self.judged, self.calibration)
+
+    def write(
+        self,
+        html: str | os.PathLike[str],
+        pdf: str | os.PathLike[str] | None = None,
+        figures: str | os.PathLike[str] | None = None,
+        *,
+        force: bool = False,
+        progress: Progress = lambda _: None,
+    ) -> None:
+        """Write the report as one HTML page, as PDF, and its figures at paper size (PDF and SVG) into a folder.
+
+        `progress` is told what is being done. Raises the errors of `check_output` before anything is drawn.
+        """
+        from calib.report.layout import document
+        from calib.report.writing import write_document
+
+        write_document(
+            document(self),
+            Path(html),
+            None if pdf is None else Path(pdf),
+            None if figures is None else Path(figures),
+            force=force,
+            progress=progress,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `calib report --json` prints."""
+        plain: dict[str, Any] = {
+            "calibration": json.loads(self.calibration.to_json()),
+            "warnings": self.fit.warnings,
+            "evaluation": self.evaluation.to_dict(),
+            "heard": {str(tag): asdict(heard) for tag, heard in self.heard.items()},
+            "findings": [{"recording": name} | asdict(finding) for name, finding in self.findings],
+        }
+        if self.tracks:
+            plain["localization"] = {
+                "scenarios": [
+                    {"recording": t.source, "body": t.body, "rmse_m": {s: t.tracks[s].rmse_m for s in FILTERS}}
+                    for t in self.tracks
+                ],
+                "summary": asdict(summarize(self.tracks)),
+            }
+        return plain
+
+
+def run_campaign(
+    training: Data | Iterable[Data],
+    tests: Data | Iterable[Data] = (),
+    *,
+    trim_static: bool = False,
+    progress: Progress = lambda _: None,
+    **settings: Unpack[FitSettings],
+) -> Campaign:
+    """Fit to the training recordings, judge and localize on the tests, and return all that a report tells of.
+
+    Recordings are what `load_ranges` takes, `settings` what `fit` takes. Without tests the training is judged, and the
+    report says so. `Ranges` alone are fitted and judged, but neither examined nor localized: that takes a recording.
+    `trim_static` leaves out of the training where nothing moves; `progress` is told what is being done. Raises what
+    `load_ranges` and `fit` raise.
+
+    >>> import calib
+    >>> campaign = calib.run_campaign(calib.sample_flight(), calib.sample_flight(300, seed=2), loss="huber")
+    >>> campaign.evaluation.overall.full.n
+    300
+    """
+    recordings = each(training)
+    judged = each(tests) if tests else []
+    progress("loading")
+    fitted, testing = load_each(recordings, trim_static=trim_static), load_each(judged) if judged else []
+    progress("fitting")
+    found = fit(concatenate(fitted), **settings)
+    refits = _refits(concatenate(fitted), found.calibration, settings)
+    progress("examining")
+    findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
+    progress("localizing")
+    return Campaign(
+        fitted,
+        testing,
+        found,
+        refits,
+        _heard(recordings, found.calibration),
+        findings,
+        _tracks(judged or recordings, found.calibration),
+    )
+
+
+def _refits(ranges: Ranges, calibration: Calibration, settings: FitSettings) -> dict[float, Calibration]:
+    """Fit again with other scales of the loss; the mixture and least squares have none."""
+    if calibration.loss in (MIXTURE, "l2"):
+        return {}
+    found = {}
+    for factor in SCALES:
+        changed = settings.copy()
+        changed["scale_ns"] = factor * calibration.scale_ns
+        found[factor * calibration.scale_ns] = fit(ranges, **changed).calibration
+    return found
+
+
+def _findings(data: Data) -> list[tuple[str, Finding]]:
+    if isinstance(data, Ranges):
+        return []
+    with opened(data) as (name, _):
+        return [(name, finding) for finding in examine(data)]
+
+
+def _heard(recordings: list[Data], calibration: Calibration) -> dict[int, OverheardDelay]:
+    """Delays by passive listeners, from the first recording that has them."""
+    whole = [data for data in recordings if not isinstance(data, Ranges)]
+    return next(filter(None, (heard_delays(data, calibration) for data in whole)), {})
+
+
+def _tracks(recordings: list[Data], calibration: Calibration) -> list[Localization]:
+    """Localize in every recording that has a body to localize; a report does without those that have none."""
+    found: list[Localization] = []
+    for data in recordings:
+        if isinstance(data, Ranges):
+            continue
+        try:
+            found += localize(data, calibration)
+        except UnanswerableError:
+            continue
+    return found

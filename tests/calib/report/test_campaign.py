@@ -1,0 +1,100 @@
+"""A campaign from Python: what the command makes, and sections of one's own."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import calib
+from calib.report.blocks import Heading, Text
+from calib.report.layout import SECTIONS
+from calib.samples import sample_flight
+from uwblink.recording.file import Recording
+
+BIN = Path(sys.executable).parent
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("campaign")
+    for name, seed in (("train", 1), ("test", 2)):
+        flight = sample_flight(seed=seed)
+        with Recording.create(folder / f"{name}.uwb", meta={"planted": flight.planted}) as recording:
+            recording.append_tags(flight.tags)
+            recording.append_poses(flight.poses)
+            recording.append_exchanges(flight.exchanges)
+    return folder
+
+
+def test_it_is_what_the_command_makes(recordings, tmp_path):
+    told: list[str] = []
+    campaign = calib.run_campaign(recordings / "train.uwb", recordings / "test.uwb", loss="huber", progress=told.append)
+    campaign.write(tmp_path / "python.html")
+    words = ["report", "train.uwb", "--tests", "test.uwb", "-o", "command.html", "--loss", "huber", "--json"]
+    done = subprocess.run([BIN / "calib", *words], cwd=recordings, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == json.loads(json.dumps(campaign.to_dict()))
+    assert (tmp_path / "python.html").read_bytes() == (recordings / "command.html").read_bytes()
+    assert told == ["loading", "fitting", "examining", "localizing"]
+    assert len(campaign.refits) == 7
+    assert len(campaign.tracks) == 3
+    assert repr(campaign).splitlines()[-1] == "judged on test.uwb"
+
+
+def test_ranges_alone_are_fitted_and_judged(recordings):
+    campaign = calib.run_campaign(calib.load_ranges(recordings / "train.uwb"), loss="l2")
+    assert campaign.findings == []
+    assert campaign.tracks == []
+    assert campaign.judged is not None
+    assert campaign.evaluation.overall.full.n == 900
+
+
+def test_a_mistake_is_found_before_anything_is_written(recordings, tmp_path):
+    (tmp_path / "mine.html").write_text("mine")
+    campaign = calib.run_campaign(calib.load_ranges(recordings / "train.uwb"), loss="l2")
+    with pytest.raises(FileExistsError):
+        campaign.write(tmp_path / "r.html", tmp_path / "mine.html")
+    with pytest.raises(calib.BadInputError, match="`figures`"):
+        campaign.write(tmp_path / "r.html", figures=tmp_path / "mine.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.html"]
+
+
+def weather(campaign):
+    return [Heading("Weather"), Text(f"Dry over {len(campaign.judged)} ranges; <wet> tomorrow.")]
+
+
+@pytest.fixture
+def own_section():
+    before = dict(SECTIONS)
+    calib.register_report_section("weather", weather, before="outliers")
+    yield
+    SECTIONS.clear()
+    SECTIONS.update(before)
+
+
+def test_a_section_of_ones_own_is_in_the_report(recordings, tmp_path, own_section):
+    ranges = calib.load_ranges(recordings / "train.uwb")
+    calib.run_campaign(ranges, loss="l2").write(tmp_path / "r.html", tmp_path / "r.pdf")
+    page = (tmp_path / "r.html").read_text()
+    titles = re.findall("<h2>(.*?)</h2>", page)
+    assert titles[titles.index("Weather") + 1] == "Outliers"
+    assert "Dry over 900 ranges; &lt;wet&gt; tomorrow." in page
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(
+    ("name", "section", "before", "parameter"),
+    [
+        ("outliers", weather, "provenance", "name"),
+        ("weather", weather, "nowhere", "before"),
+        ("weather", "text", "provenance", "section"),
+    ],
+)
+def test_a_section_that_cannot_be_one_is_refused(name, section, before, parameter):
+    with pytest.raises(calib.BadInputError) as caught:
+        calib.register_report_section(name, section, before=before)
+    assert caught.value.parameter == parameter
+    assert "weather" not in SECTIONS

@@ -1,0 +1,48 @@
+"""The front door of calib: its names, what importing it costs, and its examples."""
+
+import doctest
+import subprocess
+import sys
+
+import pytest
+
+import calib
+from calib.estimation.losses import LOSSES
+from calib.report.layout import SECTIONS
+
+SECONDS = 0.25
+
+
+def test_the_names_are_sorted_and_all_there():
+    assert calib.__all__ == sorted(calib.__all__)
+    for name in calib.__all__:
+        assert getattr(calib, name).__name__ == name
+    assert set(calib.__all__) <= set(dir(calib))
+
+
+def test_importing_it_loads_nothing_heavy():
+    code = "import sys, calib; print([m for m in ('numpy', 'scipy', 'duckdb', 'matplotlib') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def test_importing_it_is_quick():
+    code = "import time; t = time.perf_counter(); import calib; print(time.perf_counter() - t)"
+    spent = [float(subprocess.run([sys.executable, "-c", code], capture_output=True).stdout) for _ in range(5)]
+    assert min(spent) < SECONDS
+
+
+@pytest.mark.parametrize("name", [name for name in calib.__all__ if not name.endswith("Error")])
+def test_the_examples_run(name):
+    losses, sections = dict(LOSSES), dict(SECTIONS)
+    runner = doctest.DocTestRunner()
+    examples = [test for test in doctest.DocTestFinder().find(getattr(calib, name), name, globs={}) if test.examples]
+    assert examples, f"{name} has no example"
+    try:
+        for one in examples:
+            runner.run(one)
+    finally:
+        LOSSES.clear()
+        LOSSES.update(losses)
+        SECTIONS.clear()
+        SECTIONS.update(sections)
+    assert runner.summarize(verbose=False).failed == 0
