@@ -103,6 +103,10 @@ class Calibration:
         """Return the same as HTML, for notebooks."""
         return as_html(self)
 
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
+        write_text(Path(path), self.to_json(), force=force)
+
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""
         return lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
@@ -304,11 +308,6 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         raise BadInputError(f"{path}: not JSON (not UTF-8 text)") from error
     except OSError as error:
         raise BadInputError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def save(calibration: Calibration, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a calibration file, whole or not at all; refuses to replace one unless `force`."""
-    write_text(Path(path), calibration.to_json(), force=force)
 
 
 def _rows_on_lines(text: str) -> str:

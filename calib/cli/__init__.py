@@ -14,7 +14,7 @@ from calib.errors import CalibError, UnanswerableError
 from uwblink.errors import UwblinkError
 
 app = typer.Typer(
-    help="Fit, apply and evaluate calibrations of ultra-wideband ranges.",
+    help="Fit antenna delays and power curves to ultra-wideband ranges, apply them, and say how good they are.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -7,18 +7,43 @@ from typing import Annotated
 
 import typer
 
-Recordings = Annotated[list[Path], typer.Argument(help="Recordings (.uwb).")]
+Recordings = Annotated[list[Path], typer.Argument(help="Recordings with true distances (.uwb).")]
 CalibrationFile = Annotated[Path, typer.Option("-c", "--calibration", help="Calibration (.json).")]
 NewCalibration = Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
-Loss = Annotated[str, typer.Option(help="cauchy, huber, soft_l1, l2 or mixture.")]
-Scale = Annotated[str, typer.Option(help="Scale of the loss in ns, or auto.")]
-Lift = Annotated[str, typer.Option(help="mean-of-lifted or lift-of-mean.")]
-Fix = Annotated[list[str] | None, typer.Option(metavar="TAG=NS", help="Pin a tag's known delay.")]
-GroupFile = Annotated[Path | None, typer.Option(help="Groups of tags that share a curve (.toml).")]
-Sequential = Annotated[bool, typer.Option("--sequential", help="Delays first, then the curve (the paper's recipe).")]
-TrimStatic = Annotated[bool, typer.Option("--trim-static", help="Leave out seconds in which a pair stands still.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print all figures as JSON, in SI units and ns.")]
+Force = Annotated[bool, typer.Option(help="Replace files that are there already.")]
+Loss = Annotated[
+    str,
+    typer.Option(
+        help="cauchy, huber, soft_l1, l2 (least squares), mixture (a likelihood with reflections) or a registered one."
+    ),
+]
+Scale = Annotated[
+    str, typer.Option(help="Error in ns of flight beyond which the loss discounts a range, or auto: from the data.")
+]
+Lift = Annotated[
+    str, typer.Option(help="Power of an exchange from those of its two ends: mean-of-lifted or lift-of-mean.")
+]
+Fix = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="TAG=NS", help="Delay of a tag that is known and stays as it is, as in 1=-0.36; may be repeated."
+    ),
+]
+GroupFile = Annotated[
+    Path | None,
+    typer.Option(help="Groups of tags that share curves (.toml with a table [groups]); by default all tags do."),
+]
+Sequential = Annotated[
+    bool,
+    typer.Option("--sequential", help="Fit the delays first and then the curve to what they leave, as in ICRA 2023."),
+]
+TrimStatic = Annotated[
+    bool, typer.Option("--trim-static", help="Leave out spans of 2 s in which a pair's distance stays within 2 cm.")
+]
 MinimumNorm = Annotated[
-    bool, typer.Option("--minimum-norm", help="Fit the smallest delays where the pairs leave some free.")
+    bool,
+    typer.Option(
+        "--minimum-norm", help="Where the pairs leave delays free, fit the smallest ones that agree with the data."
+    ),
 ]

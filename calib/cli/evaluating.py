@@ -21,26 +21,25 @@ def add_to(app: typer.Typer) -> None:
 def evaluate(
     recordings: Recordings,
     calibration: CalibrationFile,
-    report: Annotated[Path | None, typer.Option(help="Report to write (.html).")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    report: Annotated[Path | None, typer.Option(help="Report of the evaluation to write, one page (.html).")] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print all figures as JSON, in metres and ns, instead of a table.")
+    ] = False,
     force: Force = False,
 ) -> None:
-    """Compare raw, delay-corrected and fully corrected ranges with the truth."""
-    from calib.calibration.model import load_calibration
-    from calib.evaluation.statistics import evaluate as run
-    from calib.ranges import concatenate
-    from calib.sources import load_ranges
-    from uwblink.output import check_output
+    """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
+    import calib
+    from calib.sources import load_each
 
     if report:
+        from uwblink.output import check_output
+
         check_output(report, force=force)
-    known = load_calibration(calibration)
-    parts = [load_ranges(path) for path in recordings]
-    evaluation = run(concatenate(parts), known)
+    known = calib.load_calibration(calibration)
+    parts = load_each(recordings)
+    evaluation = calib.evaluate(parts, known)
     if report:
-        from calib.report.report import write_report
-
-        write_report(report, parts, known, force=force)
+        calib.write_report(report, parts, known, force=force)
     if as_json:
         typer.echo(json.dumps(evaluation.to_dict(), indent=1))
         return
@@ -56,20 +55,21 @@ def evaluate(
 def localize(
     recordings: Recordings,
     calibration: CalibrationFile,
-    tum: Annotated[Path | None, typer.Option(help="Folder for trajectories (.tum).")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    tum: Annotated[
+        Path | None, typer.Option(help="Folder for the estimated trajectories, one file a body and filter (.tum).")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     force: Force = False,
 ) -> None:
-    """Track each body with an EKF: raw, calibrated, and calibrated with its variance."""
+    """Track each moving body by its ranges, raw, calibrated and weighted by their variance, and print the RMSE in m."""
     from dataclasses import asdict
 
-    from calib.calibration.model import load_calibration
+    import calib
     from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, as_tum, summarize
-    from calib.evaluation.localization import localize as run
     from uwblink.output import write_text
 
-    known = load_calibration(calibration)
-    found = [one for path in recordings for one in run(path, known)]
+    known = calib.load_calibration(calibration)
+    found = [one for path in recordings for one in calib.localize(path, known)]
     if tum:
         tum.mkdir(parents=True, exist_ok=True)
         for one in found:
@@ -104,15 +104,17 @@ def localize(
 
 def doctor(
     recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
 ) -> None:
-    """Name what is wrong with a recording, with the evidence and the remedy."""
+    """Name the faults in a recording, each with what shows it and what to do about it."""
     from dataclasses import asdict, replace
 
+    import calib
     from calib.cli.flags import with_flags
-    from calib.doctor.examine import examine
 
-    findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in examine(recording)]
+    findings = [
+        replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in calib.examine(recording)
+    ]
     if as_json:
         typer.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
         return
@@ -125,15 +127,14 @@ def doctor(
 
 
 def compare(
-    first: Annotated[Path, typer.Argument(help="Calibration (.json).")],
-    second: Annotated[Path, typer.Argument(help="Calibration (.json).")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    first: Annotated[Path, typer.Argument(help="Calibration to compare with (.json).")],
+    second: Annotated[Path, typer.Argument(help="Calibration whose differences are told (.json).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
 ) -> None:
-    """Say whether two calibrations differ by more than they do not know."""
-    from calib.calibration.comparison import compare as run
-    from calib.calibration.model import load_calibration
+    """Say whether two calibrations' delays differ by more than their standard errors explain (differences in ps)."""
+    import calib
 
-    found = run(load_calibration(first), load_calibration(second))
+    found = calib.compare(calib.load_calibration(first), calib.load_calibration(second))
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
         return

@@ -9,7 +9,9 @@ import typer
 
 from calib.cli.arguments import CalibrationFile, Force
 
-imports = typer.Typer(help="Turn other files into calibrations.", no_args_is_help=True)
+imports = typer.Typer(
+    help="Turn calibrations of other programs into ones that apply and evaluate take.", no_args_is_help=True
+)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -20,12 +22,12 @@ def add_to(app: typer.Typer) -> None:
 
 
 def apply(
-    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    recording: Annotated[Path, typer.Argument(help="Recording to correct (.uwb).")],
     calibration: CalibrationFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
     force: Force = False,
 ) -> None:
-    """Write a recording whose ranges are corrected."""
+    """Write a recording again with its ranges corrected (range_m); all else stays as it was."""
     import calib
 
     applied = calib.apply(recording, calib.load_calibration(calibration), output, force=force)
@@ -33,12 +35,14 @@ def apply(
 
 
 def export(
-    calibration: Annotated[Path, typer.Argument(help="Calibration (.json).")],
-    to: Annotated[str, typer.Option(help="registers, json, csv, miluv or ros-yaml.")],
+    calibration: Annotated[Path, typer.Argument(help="Calibration to turn (.json).")],
+    to: Annotated[
+        str, typer.Option(help="registers (DW1000 antenna delays), json, csv (delays in ns), miluv or ros-yaml.")
+    ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; else it is printed.")] = None,
     force: Force = False,
 ) -> None:
-    """Write a calibration in another form."""
+    """Write a calibration as register values, CSV, MILUV's JSON or YAML for ROS."""
     import calib
 
     text = calib.export(calib.load_calibration(calibration), to, output, force=force)
@@ -54,12 +58,9 @@ def import_miluv(
     output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],
     force: Force = False,
 ) -> None:
-    """Read the calibration published with the MILUV dataset."""
+    """Turn the calibration published with the MILUV dataset into one that apply and evaluate take."""
     from calib.calibration.formats import read_miluv
-    from calib.calibration.model import save
-    from uwblink.output import check_output
 
-    check_output(output, force=force)
     found = read_miluv(source)
-    save(found, output, force=force)
+    found.save(output, force=force)
     typer.echo(f"{output}: {len(found.delays_ns)} tags")

@@ -51,24 +51,21 @@ def fit(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Fit antenna delays and power curves."""
-    from calib.calibration.model import save
+    """Fit the tags' antenna delays (ns) and the curves of bias and standard deviation over first-path power (m)."""
+    import calib
     from calib.cli.options import fit_options
-    from calib.errors import UnanswerableError
-    from calib.estimation.fitting import fit as run
-    from calib.sources import load_ranges
     from uwblink.output import check_output
 
     options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
     check_output(output, force=force)
-    ranges = load_ranges(recordings, trim_static=trim_static)
+    ranges = calib.load_ranges(recordings, trim_static=trim_static)
     try:
-        result = run(ranges, **options)
-    except UnanswerableError as error:
+        result = calib.fit(ranges, **options)
+    except calib.UnanswerableError as error:
         if as_json:
             typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
         raise
-    save(result.calibration, output, force=force)
+    result.save(output, force=force)
     if as_json:
         typer.echo(result.calibration.to_json(), nl=False)
         return
@@ -96,18 +93,16 @@ def delay_lines(found: Calibration) -> Iterator[str]:
 def add_tag(
     recording: Annotated[Path, typer.Argument(help="Recording of the new tag with calibrated ones (.uwb).")],
     calibration: CalibrationFile,
-    tag: Annotated[int, typer.Option(help="Id of the new tag.")],
+    tag: Annotated[int, typer.Option(help="Id of the tag to add.")],
     output: NewCalibration,
     force: Force = False,
 ) -> None:
-    """Add a new tag to a calibration."""
-    from calib.calibration.model import load_calibration, save
-    from calib.estimation.new_tag import add_tag as run
-    from calib.sources import load_ranges
+    """Fit the delay of one more tag from its ranges with calibrated ones, and leave everything else as it is."""
+    import calib
     from uwblink.output import check_output
 
     check_output(output, force=force)
-    found = run(load_ranges(recording), load_calibration(calibration), tag)
-    save(found, output, force=force)
+    found = calib.add_tag(recording, calib.load_calibration(calibration), tag)
+    found.save(output, force=force)
     half = 1.96 * found.delays_std_ns[tag]
     typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")

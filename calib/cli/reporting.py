@@ -50,8 +50,11 @@ def spread(arguments: Sequence[str]) -> list[str]:
 def report(
     recordings: Recordings,
     output: Annotated[Path, typer.Option("-o", "--output", help="Report to write (.html).")],
-    tests: Annotated[list[Path] | None, typer.Option(help="Recordings to judge the calibration by (.uwb).")] = None,
-    pdf: Annotated[Path | None, typer.Option(help="Report to write as PDF, too.")] = None,
+    tests: Annotated[
+        list[Path] | None,
+        typer.Option(help="Recordings to judge the calibration by, which the fit does not see (.uwb)."),
+    ] = None,
+    pdf: Annotated[Path | None, typer.Option(help="The same report to write as PDF.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for the figures as PDF and SVG, at paper size.")] = None,
     loss: Loss = "cauchy",
     scale: Scale = "auto",
@@ -64,7 +67,7 @@ def report(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Fit, judge and localize, and write it all as one page."""
+    """Fit, judge on other recordings, localize, and write the whole campaign as one page with tables and figures."""
     from rich.console import Console
 
     import calib

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
 
-from calib.calibration.model import Calibration, save
+from calib.calibration.model import Calibration
 from calib.ranges import Ranges
 from uwblink.arrays import Bools, Floats
 
@@ -53,7 +53,7 @@ class FitResult:
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
-        save(self.calibration, path, force=force)
+        self.calibration.save(path, force=force)
 
     def plot_bias(self, axes: Axes | None = None) -> Axes:
         """Draw medians of the delay-corrected errors over lifted power, in cm, and the fitted curve with its band."""

@@ -179,7 +179,7 @@ def _filter(problem: _Problem, measured_m: Floats, std_m: Floats, settings: Sett
     return Track(problem.time_ns, estimate, problem.place, np.sqrt(opinion), nis, nees, accepted)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
     """Over all bodies of all recordings: mean RMSE by stage, its reduction, mean NIS and NEES of the last stage.
 
@@ -207,15 +207,15 @@ def summarize(found: list[Localization]) -> Summary:
     nis = np.concatenate([track.nis[track.accepted] for track in last])
     nees = np.concatenate([track.nees for track in last])
     return Summary(
-        rmse,
-        {stage: 1 - rmse[stage] / rmse["raw"] for stage in FILTERS[1:]},
-        float(np.mean(nis)),
-        _bounds(len(nis), 1),
-        _inside(nis, 1),
-        float(np.mean(nees)),
-        _bounds(sum(_independent(track.nees) for track in last), 3),
-        _inside(nees, 3),
-        float(np.mean([np.mean(track.accepted) for track in last])),
+        rmse_m=rmse,
+        reduction={stage: 1 - rmse[stage] / rmse["raw"] for stage in FILTERS[1:]},
+        nis=float(np.mean(nis)),
+        nis_bounds=_bounds(len(nis), 1),
+        nis_inside=_inside(nis, 1),
+        nees=float(np.mean(nees)),
+        nees_bounds=_bounds(sum(_independent(track.nees) for track in last), 3),
+        nees_inside=_inside(nees, 3),
+        accepted=float(np.mean([np.mean(track.accepted) for track in last])),
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 import calib
 from calib.samples import sample_flight
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, Fault
+from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
 from uwblink.twr import COLUMNS
 
 
@@ -25,8 +25,8 @@ def full_recording(path):
         recording.append_poses(flight.poses)
         recording.append_exchanges(exchanges)
         recording.append_faults([Fault(5, "1", "time-out", "no answer")])
-        recording.append_frames([(7, "1", "in", b"\x00\xff raw"), (8, "1", "out", b"C05")])
-        recording.append_cirs([(9, 1, 1, 2, 741.25, tuple(range(1016)))])
+        recording.append_frames([FrameRow(7, "1", "in", b"\x00\xff raw"), FrameRow(8, "1", "out", b"C05")])
+        recording.append_cirs([CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))])
         recording.append_overheard([{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
     return exchanges
 

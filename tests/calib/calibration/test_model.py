@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from calib.calibration.model import Calibration, load_calibration, save
+from calib.calibration.model import Calibration, load_calibration
 from calib.errors import BadInputError
 from calib.estimation.fitting import fit
 from tests.calib.synthetic import ranges
@@ -18,7 +18,7 @@ def fitted():
 
 
 def test_json_both_ways_without_loss(fitted, tmp_path):
-    save(fitted, tmp_path / "c.json")
+    fitted.save(tmp_path / "c.json")
     again = load_calibration(tmp_path / "c.json")
     assert again == fitted
     assert again.to_json() == fitted.to_json()
