@@ -33,7 +33,7 @@ def compare(
     force: Force = False,
 ) -> None:
     """Range with every protocol in the same random world, and say what each knows and costs."""
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output, write_text
     from uwbsim.output import check_folder
     from uwbsim.pages.comparison_page import page
     from uwbsim.protocols.comparison import chosen, winners
@@ -52,7 +52,7 @@ def compare(
     won = winners(loaded, rows)
     text = page(loaded, outcomes, samples, won)
     output.mkdir(exist_ok=True)
-    files["html"].write_text(text, encoding="utf-8")
+    write_text(files["html"], text, force=force)
     table = [o.to_dict() for o in outcomes]
     write_csv(files["csv"], table)
     files["parquet"].unlink(missing_ok=True)
@@ -148,7 +148,7 @@ def optimum(
     """Find the delay of the scheduled message that gives the least variance per second of air time."""
     import math
 
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output, write_bytes
     from uwbsim.output import check_folder
     from uwbsim.protocols.comparison import chosen
     from uwbsim.protocols.reply_delay import optimum as run
@@ -167,7 +167,7 @@ def optimum(
 
         output.mkdir(exist_ok=True)
         for one in found:
-            (output / f"optimum-{one.protocol}.png").write_bytes(png(optimum_curve(one)))
+            write_bytes(output / f"optimum-{one.protocol}.png", png(optimum_curve(one)), force=force)
     if as_json:
         typer.echo(json.dumps([one.to_dict() for one in found], indent=1))
         return

@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
-from uwblink.recording.file import check_output
+from uwblink.output import check_output, write_text
 from uwblink.twr import PROTOCOLS, RangingProtocol
 from uwbsim.errors import ScenarioError
 from uwbsim.pages.scenario_figures import png, room, timing
@@ -35,7 +35,7 @@ def show(scenario: Scenario, path: Path, *, force: bool = False) -> None:
     if suffix in PICTURES:
         room(scenario).savefig(path, dpi=150)
     elif suffix == ".html":
-        path.write_text(page(scenario), encoding="utf-8")
+        write_text(path, page(scenario), force=force)
     else:
         raise ScenarioError(f"{path}: found {suffix or 'no suffix'}, expected .html, {', '.join(PICTURES)}")
 
