@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from calib.errors import BadInputError
 from uwblink.arrays import Floats
+from uwblink.errors import ArgumentError
+from uwblink.plugins import Registry
 
-Loss = Callable[[Floats], tuple[Floats, Floats]]
+Weights = Callable[[Floats], tuple[Floats, Floats]]
 """Maps residuals over scale u (n,) to the weights rho'(u)/u of reweighted least squares and to the slope of the score
 rho''(u), both (n,); a weight is 1 at u = 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobustLoss:
+    """A loss by its name; an entry point of the group `uwbcal.losses` names one, or a list of them."""
+
+    name: str
+    weights: Weights
+
+    def __call__(self, u: Floats) -> tuple[Floats, Floats]:
+        """Return weights and slopes at residuals over scale (n,)."""
+        return self.weights(u)
 
 
 def _cauchy(u: Floats) -> tuple[Floats, Floats]:
@@ -34,13 +49,6 @@ def _l2(u: Floats) -> tuple[Floats, Floats]:
     return np.ones_like(u), np.ones_like(u)
 
 
-LOSSES: Final[dict[str, Loss]] = {
-    "cauchy": _cauchy,
-    "huber": _huber,
-    "soft_l1": _soft_l1,
-    "l2": _l2,
-}
-
 MIXTURE: Final = "mixture"
 """The loss that is no loss of residuals: the likelihood of `calib.estimation.mixture_fit`, begun from a Cauchy fit."""
 
@@ -48,12 +56,13 @@ TRIED_AT: Final = np.array([-7.3, -2.1, -0.83, -0.37, 0.37, 0.83, 2.1, 7.3])
 """Residuals over scale at which a new loss must agree with its own slope; no common loss has a kink at one."""
 
 
-def register_loss(name: str, loss: Loss) -> None:
-    """Add a robust loss, which `fit`, `add_tag` and the command's `--loss` then know by its name.
+def register_loss(name: str, weights: Weights, *, replace: bool = False) -> None:
+    """Add a robust loss, which `fit`, `run_campaign`, `add_tag` and the command's `--loss` then know by its name.
 
-    `loss` maps residuals over scale u (n,), without a unit, to two arrays (n,): the weight rho'(u)/u, 1 at u = 0, and
-    the slope rho''(u) of u times the weight, from which the intervals follow. Raises `BadInputError` for a name that is
-    taken, and for a function whose weight and slope contradict each other. Geman and McClure's, as an example:
+    `weights` maps residuals over scale u (n,), without a unit, to two arrays (n,): the weight rho'(u)/u, 1 at u = 0,
+    and the slope rho''(u) of u times the weight, from which the intervals follow. `replace` puts it in the place of one
+    registered before. Raises `BadInputError` for a name that is taken, and for weights and slopes that contradict each
+    other. Geman and McClure's, as an example:
 
     >>> import calib
     >>> def geman_mcclure(u):
@@ -61,10 +70,10 @@ def register_loss(name: str, loss: Loss) -> None:
     ...     return weight, weight * (1 - 4 * u**2 / (1 + u**2))
     >>> calib.register_loss("geman-mcclure", geman_mcclure)
     """
-    if name in known_losses():
-        raise BadInputError(f"a loss {name!r} is there already; choose another name", parameter="name")
-    _check(name, loss)
-    LOSSES[name] = loss
+    try:
+        LOSSES.register(RobustLoss(name, weights), replace=replace)
+    except ArgumentError as error:
+        raise BadInputError(str(error)) from error
 
 
 def known_losses() -> list[str]:
@@ -72,23 +81,40 @@ def known_losses() -> list[str]:
     return [*LOSSES, MIXTURE]
 
 
-def _check(name: str, loss: Loss) -> None:
-    """Raise `BadInputError` where weight and slope are not those of one loss."""
+def check_robust_loss(loss: RobustLoss) -> None:
+    """Raise `ArgumentError` where a name is taken, or weights and slopes are not those of one loss."""
+    if not isinstance(loss, RobustLoss):
+        raise ArgumentError(f"loss: found {type(loss).__name__}, expected a RobustLoss")
+    if loss.name == MIXTURE:
+        raise ArgumentError(f"loss {MIXTURE!r}: is one of the project's own; choose another name")
     step = 1e-5
     u = np.concatenate([TRIED_AT - step, TRIED_AT, TRIED_AT + step, np.zeros(1)])
     try:
-        weight, slope = (np.asarray(part, dtype=np.float64) for part in loss(u))
+        weight, slope = (np.asarray(part, dtype=np.float64) for part in loss.weights(u))
     except (TypeError, ValueError) as error:
-        raise BadInputError(
-            f"loss {name!r} must return two arrays, weight and slope, as long as its argument ({error})",
-            parameter="loss",
+        raise ArgumentError(
+            f"loss {loss.name!r}: must return two arrays, weight and slope, as long as its argument ({error})"
         ) from error
     if weight.shape != u.shape or slope.shape != u.shape or not np.isfinite([weight, slope]).all():
-        raise BadInputError(f"loss {name!r}: weight and slope must be finite, one for each residual", parameter="loss")
+        raise ArgumentError(f"loss {loss.name!r}: weight and slope must be finite, one for each residual")
     count = len(TRIED_AT)
     score = u * weight
     numeric = (score[2 * count : 3 * count] - score[:count]) / (2 * step)
     wrong = np.flatnonzero(np.abs(numeric - slope[count : 2 * count]) > 1e-4)
-    if len(wrong) or abs(weight[-1] - 1) > 1e-9:
-        where = f"the slope at u = {TRIED_AT[wrong[0]]:g} is not that of u times the weight" if len(wrong) else ""
-        raise BadInputError(f"loss {name!r}: {where or 'the weight at u = 0 is not 1'}", parameter="loss")
+    if len(wrong):
+        raise ArgumentError(
+            f"loss {loss.name!r}: the slope at u = {TRIED_AT[wrong[0]]:g} is not that of u times the weight"
+        )
+    if abs(weight[-1] - 1) > 1e-9:
+        raise ArgumentError(f"loss {loss.name!r}: the weight at u = 0 is {weight[-1]:g}, expected 1")
+
+
+_OWN: Final = (
+    RobustLoss("cauchy", _cauchy),
+    RobustLoss("huber", _huber),
+    RobustLoss("soft_l1", _soft_l1),
+    RobustLoss("l2", _l2),
+)
+
+LOSSES: Final[Registry[RobustLoss]] = Registry("loss", "uwbcal.losses", _OWN, check_robust_loss)
+"""Losses by name: the project's, those of `register_loss`, and those of installed distributions."""

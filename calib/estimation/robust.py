@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.losses import LOSSES, Loss
+from calib.estimation.losses import LOSSES, Weights
 from calib.ranges import Ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
@@ -174,7 +174,7 @@ def quadratic_model(matrix: Floats, residual: Floats, loss: str, width: float) -
 
 
 def sandwich(
-    matrix: Floats, residual: Floats, function: Loss, width: float, ridge: Floats, blocks: Ints | None = None
+    matrix: Floats, residual: Floats, function: Weights, width: float, ridge: Floats, blocks: Ints | None = None
 ) -> Floats:
     """Return the covariance of parameters at the optimum, where `residual` (n,) is what is left.
 

@@ -33,7 +33,7 @@ def test_importing_it_is_quick():
 
 @pytest.mark.parametrize("name", [name for name in calib.__all__ if not name.endswith("Error")])
 def test_the_examples_run(name):
-    losses, sections = dict(LOSSES), dict(SECTIONS)
+    losses, sections = set(LOSSES), dict(SECTIONS)
     runner = doctest.DocTestRunner()
     examples = [test for test in doctest.DocTestFinder().find(getattr(calib, name), name, globs={}) if test.examples]
     assert examples, f"{name} has no example"
@@ -41,8 +41,8 @@ def test_the_examples_run(name):
         for one in examples:
             runner.run(one)
     finally:
-        LOSSES.clear()
-        LOSSES.update(losses)
+        for added in set(LOSSES) - losses:
+            LOSSES.remove(added)
         SECTIONS.clear()
         SECTIONS.update(sections)
     assert runner.summarize(verbose=False).failed == 0

@@ -1,5 +1,10 @@
 """Robust losses: their weights and slopes, and losses of one's own."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,10 +13,12 @@ from calib.errors import BadInputError
 from calib.estimation.fitting import fit
 from calib.estimation.losses import LOSSES, register_loss
 from calib.estimation.robust import design, robust_fit
+from calib.samples import sample_flight
 from tests.calib.synthetic import DELAYS_NS, ranges
+from uwblink.recording.file import Recording
 
 
-@pytest.mark.parametrize("loss", sorted(LOSSES))
+@pytest.mark.parametrize("loss", ["cauchy", "huber", "soft_l1", "l2"])
 def test_weight_and_slope_are_derivatives_of_one_score(loss):
     u = np.array([-4.0, -1.5, -0.5, 0.0, 0.3, 0.9, 2.5])
     weight, slope = LOSSES[loss](u)
@@ -30,7 +37,7 @@ def welsch(u):
 def own_loss():
     register_loss("welsch", welsch)
     yield "welsch"
-    del LOSSES["welsch"]
+    LOSSES.remove("welsch")
 
 
 def test_a_loss_of_ones_own_is_fitted_with(own_loss):
@@ -53,8 +60,8 @@ def test_a_loss_of_ones_own_is_fitted_with(own_loss):
 @pytest.mark.parametrize(
     ("name", "loss", "fragment"),
     [
-        ("cauchy", welsch, "there already"),
-        ("mixture", welsch, "there already"),
+        ("cauchy", welsch, "project's own"),
+        ("mixture", welsch, "project's own"),
         ("wrong-slope", lambda u: (1 / (1 + u**2), 1 / (1 + u**2)), "slope at u"),
         ("one-array", lambda u: 1 / (1 + u**2), "two arrays"),
         ("numbers", lambda u: (1.0, 1.0), "one for each"),
@@ -66,6 +73,67 @@ def test_a_loss_that_cannot_be_one_is_refused(name, loss, fragment):
     with np.errstate(all="ignore"), pytest.raises(BadInputError, match=fragment):
         register_loss(name, loss)
     assert name not in set(LOSSES) - {"cauchy"}
+
+
+def test_a_registered_loss_is_replaced_only_when_asked(own_loss):
+    with pytest.raises(BadInputError, match="registered already"):
+        register_loss(own_loss, welsch)
+    register_loss(own_loss, LOSSES["cauchy"].weights, replace=True)
+    np.testing.assert_array_equal(LOSSES[own_loss](np.ones(1)), LOSSES["cauchy"](np.ones(1)))
+
+
+PLUGIN = """
+import numpy as np
+from calib.estimation.losses import RobustLoss
+
+def weights(u):
+    weight = np.exp(-(u**2) / 2)
+    return weight, weight * (1 - u**2)
+
+WELSCH = RobustLoss("welsch", weights)
+BAD = RobustLoss("bad", lambda u: (u, u))
+"""
+
+
+def test_the_command_knows_losses_of_other_distributions(tmp_path):
+    (tmp_path / "my_losses.py").write_text(PLUGIN)
+    (tmp_path / "my_losses-1.0.dist-info").mkdir()
+    (tmp_path / "my_losses-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: my-losses\nVersion: 1.0\n"
+    )
+    (tmp_path / "my_losses-1.0.dist-info" / "entry_points.txt").write_text(
+        "[uwbcal.losses]\nwelsch = my_losses:WELSCH\nbad = my_losses:BAD\n"
+    )
+    flight = sample_flight()
+    with Recording.create(tmp_path / "f.uwb") as recording:
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(flight.exchanges)
+    fit_it = [str(Path(sys.executable).parent / "calib"), "fit", "f.uwb", "-o", "c.json", "--force", "--loss"]
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([*fit_it, "welsch"], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert calib.load_calibration(tmp_path / "c.json").loss == "welsch"
+    assert "'bad' of my-losses (group uwbcal.losses) is left out: loss 'bad'" in done.stderr
+    done = subprocess.run([*fit_it, "tukey"], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "error: --loss: found 'tukey', allowed: cauchy, huber, soft_l1, l2, welsch, mixture" in done.stderr
+
+
+def test_the_command_knows_losses_registered_at_run_time(own_loss, tmp_path, monkeypatch, capsys):
+    from calib.cli import main
+
+    with Recording.create(tmp_path / "f.uwb") as recording:
+        flight = sample_flight()
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(flight.exchanges)
+    words = ["calib", "fit", str(tmp_path / "f.uwb"), "-o", str(tmp_path / "c.json"), "--loss", own_loss]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0, capsys.readouterr().err
+    assert calib.load_calibration(tmp_path / "c.json") == calib.fit(tmp_path / "f.uwb", loss=own_loss).calibration
 
 
 def test_the_front_door_has_the_same_function():
