@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 SHOWN_ROWS: Final = 6
 WIDTH: Final = 79
+LONGEST_CELL: Final = 20
 
 
 def printable(value: Any) -> str:
@@ -35,7 +36,7 @@ def as_text(title: str, table: Sequence[Sequence[str]]) -> str:
     lines = ["".join(f"  {cell:>{width}}" for cell, width in zip(row[:fitting], widths, strict=False)) for row in table]
     left_out = ", ".join(table[0][fitting:])
     more = [cut(f"  and {left_out}")] if left_out else []
-    return "\n".join([title, *lines, *more])
+    return "\n".join([cut(title), *lines, *more])
 
 
 def as_html(title: str, table: Sequence[Sequence[str]]) -> str:
@@ -48,9 +49,9 @@ def as_html(title: str, table: Sequence[Sequence[str]]) -> str:
     )
 
 
-def cut(line: str) -> str:
-    """Return a line that fits on a screen."""
-    return line if len(line) <= WIDTH else line[: WIDTH - 3] + "..."
+def cut(line: str, width: int = WIDTH) -> str:
+    """Return a line that is no longer than `width`."""
+    return line if len(line) <= width else line[: width - 3] + "..."
 
 
 def first_few(items: Iterable[str], most: int = SHOWN_ROWS) -> str:
@@ -61,4 +62,4 @@ def first_few(items: Iterable[str], most: int = SHOWN_ROWS) -> str:
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float | np.floating) else printable(value)
+    return f"{value:.4g}" if isinstance(value, float | np.floating) else cut(printable(value), LONGEST_CELL)

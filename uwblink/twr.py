@@ -10,17 +10,19 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from uwblink import formulas
+from uwblink import columns, formulas
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.display import as_html, as_text, excerpt, first_few
 from uwblink.errors import ArgumentError
 from uwblink.formulas import Intervals
 from uwblink.plugins import Registry
-from uwblink.ticks import METRES_PER_TICK, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
+from uwblink.protocol_checks import check_formulas, check_messages
+from uwblink.ticks import COUNTER_BITS, METRES_PER_TICK, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 
 Role = Literal["initiator", "target"]
 
@@ -60,12 +62,129 @@ class Exchanges:
         """Return the number of exchanges."""
         return len(self.time_ns)
 
-    def __getitem__(self, rows: slice | Bools | Ints) -> Exchanges:
-        """Return the chosen rows, in their order."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+    def __getitem__(self, rows: int | slice | Bools | Ints) -> Exchanges:
+        """Return the chosen rows, in their order; one row for a number."""
+        chosen = [rows] if isinstance(rows, int | np.integer) else rows
+        return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
+
+    @classmethod
+    def from_arrays(  # noqa: PLR0913 - one parameter a column, most of which nobody needs to give
+        cls,
+        initiator: ArrayLike,
+        target: ArrayLike,
+        *,
+        tx1: ArrayLike,
+        rx1: ArrayLike,
+        tx2: ArrayLike,
+        rx2: ArrayLike,
+        tx3: ArrayLike | None = None,
+        rx3: ArrayLike | None = None,
+        protocol: ArrayLike | None = None,
+        time_ns: ArrayLike = 0,
+        reporter: ArrayLike | None = None,
+        range_m: ArrayLike | None = None,
+        fpp1_dbm: ArrayLike | None = None,
+        fpp2_dbm: ArrayLike | None = None,
+        skew1_ppm: ArrayLike | None = None,
+        skew2_ppm: ArrayLike | None = None,
+        truth_m: ArrayLike | None = None,
+        bits: int = REPORT_BITS,
+    ) -> Exchanges:
+        """Return exchanges from the columns one has, each a list, an array, a data-frame column, or one value for all.
+
+        `tx1` gives the number of rows n. What is not given is neutral: `protocol` is "ds" where `tx3` and `rx3` are
+        given and "ss" where not, `time_ns` is 0, `reporter` the initiator, `range_m` the range by the protocol's
+        formula, powers, skews and `truth_m` are NaN. Stamps of a third message are zeros where the protocol has none.
+        `bits` is 32 or 40. Raises `ArgumentError`, which names the column and the row.
+
+        >>> from uwblink import Exchanges
+        >>> x = Exchanges.from_arrays([1, 1], 2, tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
+        >>> x.protocol.tolist(), x.range_m.round(3).tolist()
+        (['ss', 'ss'], [4.69, 4.69])
+        """
+        count = columns.length("tx1", tx1)
+        if bits not in BITS:
+            raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")
+        chosen: dict[str, Any] = {
+            n: columns.whole_numbers(n, v, count, 0, LARGEST_ID) for n, v in _ends(initiator, target, reporter)
+        }
+        columns.reject(
+            "target", chosen["target"], chosen["target"] == chosen["initiator"], "another tag than the initiator"
+        )
+        names = columns.words("protocol", _protocol_of(protocol, tx3, rx3), count)
+        messages = _messages(names)
+        given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
+        hint = f"; stamps of {BITS[-1]} bits need bits={BITS[-1]}" if bits < BITS[-1] else ""
+        for name, values in given.items():
+            needed = messages >= int(name[-1])
+            if values is None and needed.any():
+                raise ArgumentError(f"{name}: is not given, but protocol {str(names[int(np.argmax(needed))])!r} has it")
+            found = columns.whole_numbers(name, 0 if values is None else values, count, 0, (1 << bits) - 1, hint)
+            chosen[name] = np.where(needed, found, 0)
+        levels = {"fpp1_dbm": fpp1_dbm, "fpp2_dbm": fpp2_dbm, "skew1_ppm": skew1_ppm, "skew2_ppm": skew2_ppm}
+        chosen |= {name: columns.numbers(name, values, count) for name, values in levels.items()}
+        exchanges = cls(
+            time_ns=columns.whole_numbers("time_ns", time_ns, count, -LATEST_NS, LATEST_NS),
+            protocol=names,
+            range_m=columns.numbers("range_m", range_m, count),
+            truth_m=columns.numbers("truth_m", truth_m, count),
+            bits=bits,
+            **chosen,
+        )
+        return exchanges if range_m is not None else replace(exchanges, range_m=raw_range(exchanges))
+
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return the columns by name, (n,) each, as `pandas.DataFrame` and `polars.DataFrame` take them.
+
+        >>> from uwblink import Exchanges
+        >>> x = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+        >>> [*x.to_dict()][:5], x.to_dict()["rx2"].tolist()
+        (['time_ns', 'initiator', 'target', 'protocol', 'reporter'], [3000])
+        """
+        return {name: getattr(self, name) for name in COLUMNS}
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        return as_text(self._title(), excerpt(self._shown()))
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook, with every column."""
+        return as_html(self._title(), excerpt(self._shown()))
+
+    def _title(self) -> str:
+        ends = np.unique(np.column_stack([self.initiator, self.target]), axis=0)
+        return f"{len(self)} exchanges of {len(ends)} pairs, protocols {first_few(np.unique(self.protocol).tolist())}"
+
+    def _shown(self) -> dict[str, NDArray[Any]]:
+        first = ("initiator", "target", "protocol", "range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "time_ns")
+        return {name: getattr(self, name) for name in dict.fromkeys((*first, *COLUMNS))}
 
 
 COLUMNS: Final = tuple(f.name for f in fields(Exchanges) if f.name != "bits")
+BITS: Final = (REPORT_BITS, COUNTER_BITS)
+LARGEST_ID: Final = 65_535
+LATEST_NS: Final = 2**62
+
+
+def _ends(initiator: ArrayLike, target: ArrayLike, reporter: ArrayLike | None) -> list[tuple[str, ArrayLike]]:
+    return [("initiator", initiator), ("target", target), ("reporter", initiator if reporter is None else reporter)]
+
+
+def _protocol_of(protocol: ArrayLike | None, tx3: ArrayLike | None, rx3: ArrayLike | None) -> ArrayLike:
+    if protocol is not None:
+        return protocol
+    if (tx3 is None) != (rx3 is None):
+        raise ArgumentError(f"{'tx3' if tx3 is None else 'rx3'}: is not given; a third message has both stamps")
+    return "ss" if tx3 is None else "ds"
+
+
+def _messages(names: NDArray[np.str_]) -> Ints:
+    """Return how many messages the protocol of each row has, (n,); raises `ArgumentError` for an unknown one."""
+    known, place = np.unique(names, return_inverse=True)
+    for name in known.tolist():
+        if name not in PROTOCOLS:
+            raise ArgumentError(f"protocol: found {name[:40]!r}, allowed: {', '.join(PROTOCOLS)}")
+    return np.array([len(PROTOCOLS[name].messages) for name in known.tolist()], dtype=np.int64)[place]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +222,8 @@ class RangingProtocol:
 
 
 _POLL = ProtocolMessage("initiator", "", "at once")
+
+_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
 
 _OWN: Final = (
     RangingProtocol(
@@ -158,79 +279,13 @@ def check_protocol(row: RangingProtocol) -> None:
         raise ArgumentError(f"protocol: name: found {row.name!r:.60}, expected a word such as 'ds-alt'")
     if not isinstance(row.title, str) or not row.title:
         raise ArgumentError(f"protocol {row.name!r}: title: found {row.title!r:.60}, expected what pages call it")
-    _check_messages(row)
-    _check_formulas(row)
-
-
-def _check_messages(row: RangingProtocol) -> None:
-    where, messages = f"protocol {row.name!r}: messages", row.messages
-    if not isinstance(messages, tuple) or not all(isinstance(m, ProtocolMessage) for m in messages):
-        raise ArgumentError(f"{where}: found {messages!r:.60}, expected a tuple of ProtocolMessage")
-    if not 2 <= len(messages) <= LONGEST_EXCHANGE:
+    if not isinstance(row.messages, tuple) or not all(isinstance(m, ProtocolMessage) for m in row.messages):
         raise ArgumentError(
-            f"{where}: found {len(messages)}, expected 2 or 3: an exchange is recorded with the six stamps of three "
-            "messages, and one message alone measures no round trip"
+            f"protocol {row.name!r}: messages: found {row.messages!r:.60}, expected a tuple of ProtocolMessage"
         )
-    for number, (message, allowed) in enumerate(zip(messages, _COURSE, strict=False), start=1):
-        if (message.sender, message.after) not in allowed:
-            choices = " or ".join(f"from the {sender} after {after or 'nothing'}" for sender, after in allowed)
-            raise ArgumentError(
-                f"{where}: {number} is from the {message.sender} after {message.after or 'nothing'}, expected {choices}"
-            )
-        if message.timing not in TIMINGS:
-            raise ArgumentError(f"{where}: {number}: timing: found {message.timing!r}, allowed: {', '.join(TIMINGS)}")
+    check_messages(row)
+    check_formulas(row)
 
-
-def _check_formulas(row: RangingProtocol) -> None:
-    where = f"protocol {row.name!r}"
-    for name in ("flight_ticks", "delay_weights"):
-        if not callable(getattr(row, name)):
-            raise ArgumentError(f"{where}: {name}: found {getattr(row, name)!r:.60}, expected a function of Intervals")
-    for delays in ((0.0, 0.0), (_TRIED_DELAY, 0.0), (0.0, _TRIED_DELAY)):
-        spans = _tried(row.third_sender, delays)
-        try:
-            flight = np.asarray(row.flight_ticks(spans), dtype=np.float64)
-            weights = np.asarray(row.delay_weights(spans), dtype=np.float64)
-        except Exception as error:
-            raise ArgumentError(f"{where}: its formulas fail on an exchange without noise: {error!r:.200}") from error
-        if flight.shape != _TRIED_FLIGHT.shape or weights.shape != (2, *_TRIED_FLIGHT.shape):
-            raise ArgumentError(
-                f"{where}: its formulas return shapes {flight.shape} and {weights.shape} for two exchanges, "
-                "expected (2,) and (2, 2)"
-            )
-        corrected = flight + weights[0] * delays[0] + weights[1] * delays[1]
-        # 1e-2 ticks is 0.05 mm; what second order leaves of the delay tried, in the project's own rows, is 2e-5.
-        if not np.allclose(corrected, _TRIED_FLIGHT, rtol=0, atol=1e-2):
-            culprit = "delay_weights leave" if any(delays) else "flight_ticks finds"
-            raise ArgumentError(
-                f"{where}: {culprit} {corrected[0]:.6g} ticks where an exchange without noise took "
-                f"{_TRIED_FLIGHT[0]:g}" + (f", with antenna delays of {delays[0]:g} and {delays[1]:g}" * any(delays))
-            )
-
-
-def _tried(third: Role | None, delays: tuple[float, float]) -> Intervals:
-    """Return the intervals of two exchanges between equal clocks, with the aggregate delay of each side in them."""
-    i, j = delays
-    flight, reply, final = _TRIED_FLIGHT, np.array([2e7, 9.8e7]), np.array([9.8e7, 3e7])
-    round_trip = 2 * flight + reply - i
-    if third == "initiator":
-        legs = final + i, 2 * flight + final - j
-    else:
-        legs = (final, final) if third else (np.zeros(2), np.zeros(2))
-    return Intervals(round_trip, reply + j, *legs, np.zeros(2))
-
-
-_TRIED_FLIGHT: Final = np.array([1000.0, 4000.0])
-_TRIED_DELAY: Final = 64.0
-_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
-LONGEST_EXCHANGE: Final = len(STAMPS) // 2
-TIMINGS: Final = ("at once", "scheduled")
-_COURSE: Final = (
-    (("initiator", ""),),
-    (("target", "rx1"),),
-    (("target", "tx2"), ("initiator", "rx2")),
-)
-"""Who may send each message of an exchange, and after which stamp: that is what dt41 to dt64 are made of."""
 
 PROTOCOLS: Final[Registry[RangingProtocol]] = Registry("protocol", "uwbcal.protocols", _OWN, check_protocol)
 """Protocols by name: the project's, those of `register_protocol`, and those of installed distributions."""

@@ -128,11 +128,7 @@ class Recording:
 
     def append_poses(self, poses: Poses) -> None:
         """Add poses, in one transaction."""
-        position, quaternion = poses.position_m.T, poses.quaternion.T
-        columns = {"time_ns": poses.time_ns, "body": poses.body}
-        columns |= dict(zip("xyz", position, strict=True))
-        columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion, strict=True))
-        self._store.insert("poses", columns)
+        self._store.insert("poses", poses.to_dict())
 
     def append_faults(self, faults: Iterable[Fault]) -> None:
         """Add faults, in one transaction."""

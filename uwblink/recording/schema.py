@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from uwblink import __version__
-from uwblink.arrays import Floats, Ints
+from uwblink import __version__, columns
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.display import as_html, as_text, excerpt, first_few, printable
 from uwblink.ticks import ANTENNA_DELAY_TICKS, REPORT_BITS, SPEED_OF_LIGHT, TICKS_PER_SECOND
-from uwblink.twr import COLUMNS
+from uwblink.twr import COLUMNS, LATEST_NS
 
 FORMAT_VERSION: Final = 1
 SUFFIX: Final = ".uwb"
@@ -92,6 +93,56 @@ class Poses:
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.time_ns)
+
+    def __getitem__(self, rows: slice | Bools | Ints) -> Poses:
+        """Return the chosen rows, in their order."""
+        return Poses(self.time_ns[rows], self.body[rows], self.position_m[rows], self.quaternion[rows])
+
+    @classmethod
+    def from_arrays(
+        cls, time_ns: ArrayLike, body: ArrayLike, position_m: ArrayLike, quaternion: ArrayLike | None = None
+    ) -> Poses:
+        """Return poses from lists or arrays, put in order of time; one body, position or attitude stands for all rows.
+
+        Without `quaternion` nothing is turned. Quaternions are brought to length 1. Raises `ArgumentError`, which names
+        the column and the row.
+
+        >>> from uwblink import Poses
+        >>> poses = Poses.from_arrays([2, 1], "drone", [[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
+        >>> poses.position_m[:, 2].tolist(), poses.quaternion[0].tolist()
+        ([2.0, 1.0], [0.0, 0.0, 0.0, 1.0])
+        """
+        count = columns.length("time_ns", time_ns)
+        time = columns.whole_numbers("time_ns", time_ns, count, -LATEST_NS, LATEST_NS)
+        attitude = columns.vectors("quaternion", (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion, count, 4)
+        norm = np.linalg.norm(attitude, axis=1)
+        columns.reject("quaternion", attitude, (norm < 0.9) | (norm > 1.1), "x y z w of length 1")
+        poses = cls(
+            time, columns.words("body", body, count), columns.vectors("position_m", position_m, count, 3), attitude
+        )
+        return replace(poses, quaternion=attitude / norm[:, None])[np.argsort(time, kind="stable")]
+
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return the columns of the table `poses` by name, (n,) each, as data frames take them.
+
+        >>> from uwblink import Poses
+        >>> [*Poses.from_arrays([0], "drone", [0.0, 0.0, 1.0]).to_dict()]
+        ['time_ns', 'body', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
+        """
+        named = {"time_ns": self.time_ns, "body": self.body}
+        named |= dict(zip("xyz", self.position_m.T, strict=True))
+        return named | dict(zip(("qx", "qy", "qz", "qw"), self.quaternion.T, strict=True))
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        return as_text(self._title(), excerpt(self.to_dict()))
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook."""
+        return as_html(self._title(), excerpt(self.to_dict()))
+
+    def _title(self) -> str:
+        return f"{len(self)} poses of {first_few(map(printable, np.unique(self.body).tolist()))}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from uwblink.errors import FrameError
-from uwblink.wire.fields import BAR, ID, INT, Kind, Malformed, NeedMore
+from uwblink.wire.fields import BAR, ID, INT, LONGEST_TEXT, Kind, Malformed, NeedMore
 from uwblink.wire.messages import (
     COMMANDS,
     TEXTS,
@@ -148,22 +148,22 @@ class Decoder:
     def _counted(self, kind: type[Message], buffer: bytes, at: int) -> tuple[Message, int]:
         """Read a message whose fields hold arbitrary bytes, one field after the other."""
         values, at = [], at + 3
-        for field in kind.FIELDS.values():
+        for number, field in enumerate(kind.FIELDS.values(), start=1):
             at = _expect(buffer, at, BAR)
-            end = self._field_end(field, buffer, at)
+            end = self._field_end(field, buffer, at, BAR if number < len(kind.FIELDS) else self._terminator)
             values.append(field.read(buffer[at:end]))
             at = end
         return kind(*values), _expect(buffer, at, self._terminator)
 
-    def _field_end(self, field: Kind, buffer: bytes, at: int) -> int:
+    def _field_end(self, field: Kind, buffer: bytes, at: int, until: bytes) -> int:
         if field.size:
             end = at + field.size(buffer, at)
             if end > len(buffer):
                 raise NeedMore
             return end
-        end = buffer.find(BAR, at, at + 201)
+        end = buffer.find(until, at, at + LONGEST_TEXT + 1 + len(until))
         if end < 0:
-            raise Malformed if len(buffer) - at > 200 else NeedMore
+            raise Malformed if len(buffer) - at > LONGEST_TEXT + len(until) else NeedMore
         return end
 
     def _next_start(self, buffer: bytes, at: int, *, final: bool) -> int:

@@ -1,15 +1,26 @@
 """Every command and report of the boards, one frozen dataclass each (firmware wire format, section 1).
 
-A class's table `FIELDS` is its layout on the wire, in order. Stamps are ticks of the low 32 bits, powers
-dBm, skews ppm (positive: the receiver's clock is the faster one), ranges metres.
+A class declares its fields once, in their order on the wire, each with its kind; codec, virtual boards and the table
+of messages follow. Stamps are ticks of the low 32 bits, powers dBm, skews ppm (positive: the receiver's clock is the
+faster one), ranges metres. A message of a firmware of your own is a class more:
+
+```python
+@message(b"R10")
+class Temperature(Message):
+    celsius: int = wire(INT)
+
+register_message(Temperature)
+```
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Final
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, ClassVar, Final, TypeVar, dataclass_transform
 
+from uwblink.errors import ArgumentError
 from uwblink.wire.fields import (
     BOOL,
     BROADCAST,
@@ -35,213 +46,184 @@ class Message:
     FIELDS: ClassVar[Layout] = {}
 
 
-@dataclass(frozen=True, slots=True)
+_Kind = TypeVar("_Kind", bound=Message)
+_KEY: Final = re.compile(rb"[CRS][0-9]{2}")
+
+
+def wire(kind: Kind, *, default: Any = MISSING) -> Any:
+    """Declare a field of a message: how it is written and read."""
+    return field(default=default, metadata={"kind": kind})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(wire,))
+def message(key: bytes) -> Callable[[type[_Kind]], type[_Kind]]:
+    """Make a class a message: a frozen dataclass whose fields declared with `wire` are its layout, in their order.
+
+    `key` is the letter of the direction (C: command to a board; R: its answer; S: sent unasked) and two digits. Raises
+    `ArgumentError` for any other.
+    """
+    if not isinstance(key, bytes) or not _KEY.fullmatch(key):
+        raise ArgumentError(f'message: key: found {key!r:.40}, expected a letter C, R or S and two digits, as b"R05"')
+
+    def decorate(plain: type[_Kind]) -> type[_Kind]:
+        made = dataclass(frozen=True, slots=True)(plain)
+        made.KEY = key
+        made.FIELDS = {f.name: f.metadata["kind"] for f in fields(made) if "kind" in f.metadata}
+        return made
+
+    return decorate
+
+
+@message(b"C00")
 class SetIdle(Message):
     """C00: does nothing but answer."""
 
-    KEY: ClassVar = b"C00"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"C01")
 class GetId(Message):
     """C01: ask for the board's id."""
 
-    KEY: ClassVar = b"C01"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"C02")
 class Reset(Message):
     """C02: reset the receiver."""
 
-    KEY: ClassVar = b"C02"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"C03")
 class DoTests(Message):
     """C03: echo one field of each kind."""
 
-    KEY: ClassVar = b"C03"
-    FIELDS: ClassVar = {"integer": INT, "text": TEXT, "flag": BOOL, "number": RAW_FLOAT, "data": BYTES}
-    integer: int
-    text: str
-    flag: bool
-    number: float
-    data: bytes
+    integer: int = wire(INT)
+    text: str = wire(TEXT)
+    flag: bool = wire(BOOL)
+    number: float = wire(RAW_FLOAT)
+    data: bytes = wire(BYTES)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"C04")
 class SetPassive(Message):
     """C04: listen to the exchanges of others, or stop to."""
 
-    KEY: ClassVar = b"C04"
-    FIELDS: ClassVar = {"on": BOOL}
-    on: bool
+    on: bool = wire(BOOL)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"C05")
 class RangeCommand(Message):
     """C05: range with a target, single-sided or double-sided."""
 
-    KEY: ClassVar = b"C05"
-    FIELDS: ClassVar = {"target": ID, "target_reports": BOOL, "double_sided": BOOL, "get_cir": BOOL}
-    target: int
-    target_reports: bool = False
-    double_sided: bool = True
-    get_cir: bool = False
+    target: int = wire(ID)
+    target_reports: bool = wire(BOOL, default=False)
+    double_sided: bool = wire(BOOL, default=True)
+    get_cir: bool = wire(BOOL, default=False)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"C06")
 class Broadcast(Message):
     """C06: send up to 92 bytes to every board in range."""
 
-    KEY: ClassVar = b"C06"
-    FIELDS: ClassVar = {"data": BROADCAST}
-    data: bytes
+    data: bytes = wire(BROADCAST)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"C07")
 class GetMaxFrame(Message):
     """C07: ask for the longest frame."""
 
-    KEY: ClassVar = b"C07"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"C08")
 class SetResponseDelay(Message):
     """C08: set the double-sided response delay, in UWB microseconds (512/499.2 us)."""
 
-    KEY: ClassVar = b"C08"
-    FIELDS: ClassVar = {"delay_uus": INT}
-    delay_uus: int
+    delay_uus: int = wire(INT)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"C09")
 class Bootloader(Message):
     """C09: jump to the bootloader; the port disappears."""
 
-    KEY: ClassVar = b"C09"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"R00")
 class IdleSet(Message):
     """R00: answer to C00."""
 
-    KEY: ClassVar = b"R00"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"R01")
 class IdReport(Message):
     """R01: the board's id."""
 
-    KEY: ClassVar = b"R01"
-    FIELDS: ClassVar = {"board": ID}
-    board: int
+    board: int = wire(ID)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"R02")
 class ResetDone(Message):
     """R02: answer to C02."""
 
-    KEY: ClassVar = b"R02"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"R03")
 class TestsDone(Message):
     """R03: the echo of C03; `error` is 1 when the chip's id disagrees with the board's."""
 
-    KEY: ClassVar = b"R03"
-    FIELDS: ClassVar = {
-        "error": INT,
-        "integer": INT,
-        "text": TEXT,
-        "flag": BOOL,
-        "number": PRINTED,
-        "data": BYTES,
-    }
-    error: int
-    integer: int
-    text: str
-    flag: bool
-    number: float
-    data: bytes
+    error: int = wire(INT)
+    integer: int = wire(INT)
+    text: str = wire(TEXT)
+    flag: bool = wire(BOOL)
+    number: float = wire(PRINTED)
+    data: bytes = wire(BYTES)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"R04")
 class PassiveSet(Message):
     """R04: answer to C04."""
 
-    KEY: ClassVar = b"R04"
 
-
-_EXCHANGE: Final[Layout] = {
-    "neighbour": ID,
-    "range_m": PRINTED,
-    **dict.fromkeys(("tx1", "rx1", "tx2", "rx2", "tx3", "rx3"), STAMP),
-    **dict.fromkeys(("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm"), PRINTED),
-}
-
-
-@dataclass(frozen=True, slots=True)
+@message(b"R05")
 class RangeReport(Message):
     """R05: the initiator's report of an exchange; `neighbour` is the target.
 
     tx3 and rx3 are zero after a single-sided exchange.
     """
 
-    KEY: ClassVar = b"R05"
-    FIELDS: ClassVar = _EXCHANGE
-    neighbour: int
-    range_m: float
-    tx1: int
-    rx1: int
-    tx2: int
-    rx2: int
-    tx3: int
-    rx3: int
-    fpp1_dbm: float
-    fpp2_dbm: float
-    skew1_ppm: float
-    skew2_ppm: float
+    neighbour: int = wire(ID)
+    range_m: float = wire(PRINTED)
+    tx1: int = wire(STAMP)
+    rx1: int = wire(STAMP)
+    tx2: int = wire(STAMP)
+    rx2: int = wire(STAMP)
+    tx3: int = wire(STAMP)
+    rx3: int = wire(STAMP)
+    fpp1_dbm: float = wire(PRINTED)
+    fpp2_dbm: float = wire(PRINTED)
+    skew1_ppm: float = wire(PRINTED)
+    skew2_ppm: float = wire(PRINTED)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"S05")
 class TargetRangeReport(RangeReport):
     """S05: the target's report of the same; `neighbour` is the initiator."""
 
-    KEY: ClassVar = b"S05"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"R06")
 class BroadcastSent(Message):
     """R06: answer to C06."""
 
-    KEY: ClassVar = b"R06"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"R07")
 class MaxFrameReport(Message):
     """R07: the longest frame, in bytes."""
 
-    KEY: ClassVar = b"R07"
-    FIELDS: ClassVar = {"length": INT}
-    length: int
+    length: int = wire(INT)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"R08")
 class ResponseDelaySet(Message):
     """R08: answer to C08."""
 
-    KEY: ClassVar = b"R08"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"R09")
 class EnteringBootloader(Message):
     """R09: answer to C09."""
 
-    KEY: ClassVar = b"R09"
 
-
-@dataclass(frozen=True, slots=True)
+@message(b"S01")
 class Overheard(Message):
     """S01: an exchange heard by a passive listener.
 
@@ -249,72 +231,55 @@ class Overheard(Message):
     Zero where there was nothing; `fpp3_dbm` and `skew3_ppm` are None after a single-sided exchange.
     """
 
-    KEY: ClassVar = b"S01"
-    FIELDS: ClassVar = {
-        **dict.fromkeys(("initiator", "target"), ID),
-        **dict.fromkeys(("rx1", "rx2", "rx3"), STAMP),
-        **dict.fromkeys(("tx1_n", "rx1_n", "tx2_n", "rx2_n", "tx3_n", "rx3_n"), STAMP),
-        **dict.fromkeys(("fpp1_dbm", "fpp2_dbm"), PRINTED),
-        "fpp3_dbm": PRINTED_OR_ZERO,
-        **dict.fromkeys(("skew1_ppm", "skew2_ppm"), PRINTED),
-        "skew3_ppm": PRINTED_OR_ZERO,
-        **dict.fromkeys(("fpp1_n_dbm", "fpp2_n_dbm", "skew1_n_ppm", "skew2_n_ppm"), PRINTED),
-    }
-    initiator: int
-    target: int
-    rx1: int
-    rx2: int
-    rx3: int
-    tx1_n: int
-    rx1_n: int
-    tx2_n: int
-    rx2_n: int
-    tx3_n: int
-    rx3_n: int
-    fpp1_dbm: float
-    fpp2_dbm: float
-    fpp3_dbm: float | None
-    skew1_ppm: float
-    skew2_ppm: float
-    skew3_ppm: float | None
-    fpp1_n_dbm: float
-    fpp2_n_dbm: float
-    skew1_n_ppm: float
-    skew2_n_ppm: float
+    initiator: int = wire(ID)
+    target: int = wire(ID)
+    rx1: int = wire(STAMP)
+    rx2: int = wire(STAMP)
+    rx3: int = wire(STAMP)
+    tx1_n: int = wire(STAMP)
+    rx1_n: int = wire(STAMP)
+    tx2_n: int = wire(STAMP)
+    rx2_n: int = wire(STAMP)
+    tx3_n: int = wire(STAMP)
+    rx3_n: int = wire(STAMP)
+    fpp1_dbm: float = wire(PRINTED)
+    fpp2_dbm: float = wire(PRINTED)
+    fpp3_dbm: float | None = wire(PRINTED_OR_ZERO)
+    skew1_ppm: float = wire(PRINTED)
+    skew2_ppm: float = wire(PRINTED)
+    skew3_ppm: float | None = wire(PRINTED_OR_ZERO)
+    fpp1_n_dbm: float = wire(PRINTED)
+    fpp2_n_dbm: float = wire(PRINTED)
+    skew1_n_ppm: float = wire(PRINTED)
+    skew2_n_ppm: float = wire(PRINTED)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"S01")
 class OverheardNothing(Message):
     """S01 with 26 fields, all zero after the ids: the listener missed the response."""
 
-    KEY: ClassVar = b"S01"
-    FIELDS: ClassVar = {"initiator": ID, "target": ID}
     ZEROS: ClassVar = 24
-    initiator: int
-    target: int
+    initiator: int = wire(ID)
+    target: int = wire(ID)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"S06")
 class BroadcastReceived(Message):
     """S06: bytes that another board sent to all; the sender is not known."""
 
-    KEY: ClassVar = b"S06"
-    FIELDS: ClassVar = {"data": BROADCAST}
-    data: bytes
+    data: bytes = wire(BROADCAST)
 
 
-@dataclass(frozen=True, slots=True)
+@message(b"S10")
 class Cir(Message):
     """S10: a channel impulse response.
 
     `first_path_milli` is the first path's index times 1000; `magnitudes` has 1016 taps, 1.0016 ns apart.
     """
 
-    KEY: ClassVar = b"S10"
     TAPS: ClassVar = 1016
-    FIELDS: ClassVar = {"initiator": ID, "target": ID}
-    initiator: int
-    target: int
+    initiator: int = wire(ID)
+    target: int = wire(ID)
     first_path_milli: int
     magnitudes: tuple[int, ...]
 
@@ -366,6 +331,24 @@ REPORTS: Final = _table(
     BroadcastReceived,
     Cir,
 )
+
+
+def register_message(kind: type[Message]) -> None:
+    """Add a message to `COMMANDS` or `REPORTS`, by its key: codecs made from now on write and read it.
+
+    Raises `ArgumentError` for a class that is no message, a key that is taken, and fields without a kind.
+    """
+    if not isinstance(kind, type) or not issubclass(kind, Message) or not _KEY.fullmatch(kind.KEY):
+        raise ArgumentError(f"message: found {kind!r:.60}, expected a class made with @message(key)")
+    table = COMMANDS if kind.KEY.startswith(b"C") else REPORTS
+    where = f"message {kind.__name__} ({kind.KEY.decode()})"
+    if kind.KEY in table:
+        raise ArgumentError(f"{where}: {kind.KEY.decode()} is {table[kind.KEY].__name__} already; choose another key")
+    for declared in fields(kind):
+        if not isinstance(kind.FIELDS.get(declared.name), Kind):
+            raise ArgumentError(f"{where}: {declared.name}: has no kind; declare it as in `count: int = wire(INT)`")
+    table[kind.KEY] = kind
+
 
 _WITH_CRLF: Final = (
     "COMMANDED TASK FAILED AFTER 5 ATTEMPTS.",
