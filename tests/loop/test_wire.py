@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from tests.boards import served
-from uwblink.boards.ranging_plan import RangingPlan, load_tags
+from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import record
 from uwblink.importers.motion_capture import add_poses
+from uwblink.recording.tags import load_tags
 from uwbsim.boards.server import extended, write_poses
 from uwbsim.scenario.loading import load
 

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from uwblink.cli.shared import AsJson, print_json
+
 if TYPE_CHECKING:
     from uwblink.wire.messages import RangeReport
 
 Port = Annotated[str, typer.Argument(help="Serial port, link to one, or pyserial URL.")]
 Target = Annotated[int, typer.Argument(min=0, max=254, help="Id of the other board.")]
 ProtocolName = Annotated[str, typer.Option(help="ss or ds.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -53,7 +54,7 @@ def ports(
             except UwblinkError as error:
                 row["error"] = str(error)
     if as_json:
-        typer.echo(json.dumps(rows, indent=1))
+        print_json(rows)
         return
     if not rows:
         typer.echo("no serial device with the boards' USB identity (0483:5740) is plugged in")
@@ -77,7 +78,7 @@ def info(port: Port, as_json: AsJson = False) -> None:
             "usb_serial_number": serial_number(port),
         }
     if as_json:
-        typer.echo(json.dumps(facts, indent=1))
+        print_json(facts)
         return
     number = facts["usb_serial_number"] or "none"
     typer.echo(
@@ -116,7 +117,7 @@ def twr(
         raise failures[-1]
     if as_json:
         rows = [{"initiator": initiator, "target": target, **_fields(r)} for r in reports]
-        typer.echo(json.dumps(rows, indent=1))
+        print_json(rows)
     elif count > 1:
         import statistics
 

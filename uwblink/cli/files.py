@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-imports = typer.Typer(help="Turn other files into recordings.", no_args_is_help=True)
+from uwblink.cli.shared import AsJson, Force, print_json
 
-Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+imports = typer.Typer(help="Turn other files into recordings.", no_args_is_help=True)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -23,7 +22,7 @@ def add_to(app: typer.Typer) -> None:
 
 def show(
     recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print what a recording holds."""
     from uwblink.recording.file import Recording
@@ -31,7 +30,7 @@ def show(
     with Recording.open(recording) as opened:
         summary = opened.show()
     if as_json:
-        typer.echo(json.dumps(summary.to_dict(), indent=1))
+        print_json(summary.to_dict())
         return
     from rich.console import Console
 
@@ -78,7 +77,7 @@ def replay(
     speed: Annotated[float, typer.Option(min=0.001, help="How much faster than it was.")] = 1.0,
     serve: Annotated[bool, typer.Option("--serve", help="Play back on pseudo-terminals.")] = False,
     link_dir: Annotated[Path | None, typer.Option(help="Folder for stable links to them.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
     force: Force = False,
 ) -> None:
     """Decode the stored bytes again, or play them back as boards would have sent them."""
@@ -97,7 +96,7 @@ def replay(
         if output:
             rewrite(opened, decoded, output, force=force)
     if as_json:
-        typer.echo(json.dumps(summary, indent=1))
+        print_json(summary)
         return
     typer.echo(f"{summary['messages']} messages, {summary['skipped_bytes']} bytes skipped")
     for table in ("exchanges", "overheard", "cirs"):

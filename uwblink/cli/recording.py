@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
     from uwblink.boards.progress import Progress
@@ -31,7 +32,7 @@ def record(
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
     cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
-    force: Annotated[bool, typer.Option(help="Replace the output if it exists.")] = False,
+    force: Force = False,
 ) -> None:
     """Play a ranging plan on boards and record everything they say."""
     from dataclasses import replace
@@ -51,7 +52,7 @@ def record(
         chosen = replace(chosen, rate_hz=rate)
     if cir:
         chosen = replace(chosen, get_cir=True)
-    with _interrupts() as stop, _watcher() as watch:
+    with interrupts() as stop, _watcher() as watch:
         progress = run(
             ports,
             output,
@@ -63,24 +64,6 @@ def record(
             watch=watch,
         )
     typer.echo(f"{output}: {_summary(progress)}")
-
-
-@contextmanager
-def _interrupts() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and a polite kill into a question to ask; a second Ctrl-C interrupts."""
-    asked: list[int] = []
-
-    def ask(number: int, _frame: Any) -> None:
-        asked.append(number)
-        if len(asked) > 1:
-            raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

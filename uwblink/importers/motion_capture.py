@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from uwblink.boards.ranging_plan import load_tags
 from uwblink.errors import ImportTableError
 from uwblink.importers.poses import read_poses
 from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
+from uwblink.recording.tags import load_tags
 from uwblink.recording.time_offset import find_offset
 
 

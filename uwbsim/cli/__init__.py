@@ -2,41 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from typing import Annotated
+from typing import NoReturn
 
-import typer
-
-import uwblink
-from uwblink.errors import UwblinkError
+from uwblink.cli import shared
 from uwbsim.cli import flights, workbench
 from uwbsim.errors import UwbsimError
 
-app = typer.Typer(
-    help="Simulate tags that range with ultra-wideband radios.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = shared.new_app("Simulate tags that range with ultra-wideband radios.")
+for room in (flights, workbench):
+    room.add_to(app)
 
 
-@app.callback(invoke_without_command=True)
-def _top(
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-) -> None:
-    if version:
-        typer.echo(uwblink.__version__)
-        raise typer.Exit
-
-
-flights.add_to(app)
-workbench.add_to(app)
-
-
-def main() -> None:
+def main() -> NoReturn:
     """Run the command; a user's mistake is one line on standard error and exit status 2."""
-    try:
-        app()
-    except (UwbsimError, UwblinkError) as error:
-        typer.echo(f"error: {error}", err=True)
-        sys.exit(2)
+    shared.run(app, UwbsimError)

@@ -10,10 +10,12 @@ from typing import Annotated
 
 import typer
 
+from uwblink.cli import shared
+
 ScenarioFile = Annotated[Path, typer.Argument(help="Scenario file (.toml).")]
 Settings = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+AsJson = shared.AsJson
+Force = shared.Force
 
 
 @contextmanager

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from uwblink.cli.shared import interrupts
 from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
 
 if TYPE_CHECKING:
@@ -83,7 +81,7 @@ def serve(
             typer.echo(f"tag {tag:3d}  {name}")
         if poses:
             write_poses(loaded, server.epoch_ns, poses)
-        with _interrupts() as stop:
+        with interrupts() as stop:
             server.run(stop, duration or float("inf"))
     finally:
         server.close()
@@ -123,19 +121,6 @@ def validate(
         return
     for line in sentences(loaded, found):
         typer.echo(line)
-
-
-@contextmanager
-def _interrupts() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and a polite kill into a question to ask."""
-    asked: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {n: signal.signal(n, lambda number, _frame: asked.append(number)) for n in numbers}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def schema() -> None:

@@ -2,9 +2,10 @@
 
 import pytest
 
-from uwblink.boards.ranging_plan import RangingPlan, load_plan, load_tags
+from uwblink.boards.ranging_plan import RangingPlan, load_plan
 from uwblink.errors import PlanError
 from uwblink.recording.schema import Tag
+from uwblink.recording.tags import load_tags
 
 
 def written(tmp_path, text):

@@ -1,0 +1,5 @@
+"""The command `uwblink`, as `python -m uwblink`."""
+
+from uwblink.cli import main
+
+main()

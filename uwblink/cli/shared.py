@@ -1,0 +1,99 @@
+"""What the three commands have in common: options, version, errors as one line, and how they end."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Annotated, Any, Final, NoReturn
+
+import typer
+
+from uwblink import __version__
+from uwblink.errors import PluginWarning, UwblinkError
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+
+MISTAKE: Final = 2
+"""Exit status of a command that cannot do what it was told."""
+
+
+def new_app(text: str) -> typer.Typer:
+    """Return a command without sub-commands yet, whose help begins with `text`, and which knows `--version`."""
+    app = typer.Typer(help=text, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+    @app.callback(invoke_without_command=True)
+    def top(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+        if version:
+            typer.echo(__version__)
+            raise typer.Exit
+
+    return app
+
+
+def run(
+    app: typer.Typer,
+    *errors: type[Exception],
+    statuses: Mapping[type[Exception], int] | None = None,
+    arguments: Sequence[str] | None = None,
+    wording: Callable[[str], str] = str,
+) -> NoReturn:
+    """Run a command and end the process: an error of `errors`, or of uwblink, is one line and status 2.
+
+    `statuses` gives kinds of errors another status; `arguments` replaces those of the process; `wording` turns what
+    the packages say, which know parameters only, into what people of the command line know.
+    """
+    mistakes: tuple[type[Exception], ...] = (UwblinkError, *errors)
+    try:
+        with _plain_warnings():
+            app(args=list(sys.argv[1:] if arguments is None else arguments))
+    except mistakes as error:
+        typer.echo(f"error: {wording(str(error))}", err=True)
+        found = (status for kind, status in (statuses or {}).items() if isinstance(error, kind))
+        sys.exit(next(found, MISTAKE))
+    sys.exit(0)
+
+
+def print_json(document: Any) -> None:
+    """Print a document as JSON."""
+    typer.echo(json.dumps(document, indent=1))
+
+
+@contextmanager
+def interrupts() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C and a polite kill into a question to ask; a second one interrupts."""
+    asked: list[int] = []
+
+    def ask(number: int, _frame: Any) -> None:
+        asked.append(number)
+        if len(asked) > 1:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Print what is wrong with plug-ins as one line, as errors are; leave other warnings as they are."""
+    shown = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, PluginWarning):
+            typer.echo(f"warning: {message}", err=True)
+        else:
+            shown(message, category, *where, **more)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown

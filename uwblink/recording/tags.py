@@ -1,0 +1,44 @@
+"""Where tags sit, from the `[[tags]]` of a ranging plan or a scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from uwblink.errors import PlanError
+from uwblink.recording.schema import Tag
+from uwblink.toml import TomlReader, is_number
+
+LARGEST_BOARD_ID: Final = 254
+
+
+def load_tags(path: Path) -> tuple[Tag, ...]:
+    """Read the `[[tags]]` of a plan or a scenario; raises `PlanError`."""
+    tags = read_tags(TomlReader(path, PlanError))
+    if not tags:
+        raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m")
+    return tags
+
+
+def read_tags(file: TomlReader) -> tuple[Tag, ...]:
+    """Return tags from the array of tables `tags` of a file, none where there is none; raises the file's error."""
+    rows = file.table.get("tags", [])
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise file.error(f"{file.path}: tags: expected [[tags]] tables with id, body and lever_arm_m")
+    tags: list[Tag] = []
+    for k, row in enumerate(rows):
+        number, body = row.get("id"), row.get("body")
+        arm = row.get("lever_arm_m", [0.0, 0.0, 0.0])
+        file.check(f"tags[{k}].id", number, is_board_id(number), f"a whole number 0 to {LARGEST_BOARD_ID}")
+        if any(tag.tag == number for tag in tags):
+            raise file.error(f"{file.path}: tags[{k}].id: found a second {number}, ids must differ")
+        file.check(f"tags[{k}].body", body, isinstance(body, str) and bool(body), "the name of a body")
+        good = isinstance(arm, list) and len(arm) == 3 and all(map(is_number, arm))
+        file.check(f"tags[{k}].lever_arm_m", arm, good, "three numbers (metres)")
+        tags.append(Tag(number, body, (float(arm[0]), float(arm[1]), float(arm[2]))))
+    return tuple(tags)
+
+
+def is_board_id(value: Any) -> bool:
+    """Whether a value can be the id of a board."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_BOARD_ID

@@ -1,0 +1,63 @@
+"""Reads TOML files: one opener, and the checks of what people write into them, with the key in every message."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+
+class TomlReader:
+    """Reads one file and checks its values; raises `error`, whose text begins with the path and the key."""
+
+    def __init__(self, path: Path, error: type[Exception], what: str = "file") -> None:
+        """Read `path`, which holds a `what`."""
+        self.path, self.error = path, error
+        self.text = self._text(what)
+        try:
+            self.table: dict[str, Any] = tomllib.loads(self.text)
+        except tomllib.TOMLDecodeError as problem:
+            raise error(f"{path}: not valid TOML: {problem}") from problem
+
+    def _text(self, what: str) -> str:
+        if self.path.is_dir():
+            raise self.error(f"{self.path}: is a directory, expected a {what} (.toml)")
+        try:
+            return self.path.read_text(encoding="utf-8")
+        except FileNotFoundError as problem:
+            raise self.error(f"{self.path}: no such {what}") from problem
+        except (OSError, UnicodeDecodeError) as problem:
+            raise self.error(f"{self.path}: cannot be read as a {what} (.toml)") from problem
+
+    def known(self, table: dict[str, Any], names: Iterable[str], prefix: str = "") -> None:
+        """Raise for a key that is none of `names`."""
+        listed = list(names)
+        for key in table:
+            if key not in listed:
+                raise self.error(f"{self.path}: {prefix}{key}: unknown key; known are {', '.join(listed)}")
+
+    def section(self, name: str) -> dict[str, Any]:
+        """Return a table of the file, empty where there is none."""
+        found = self.table.get(name, {})
+        self.check(name, found, isinstance(found, dict), "a table")
+        return dict(found)
+
+    def choice(self, key: str, value: Any, allowed: Iterable[Any]) -> Any:
+        """Return a value that is one of `allowed`; None among them stands for a key that is not there."""
+        listed = list(allowed)
+        if isinstance(value, bool | list | dict) or value not in listed:
+            names = ", ".join(str(a) for a in listed if a is not None)
+            raise self.error(f"{self.path}: {key}: found {value!r}, allowed: {names}")
+        return value
+
+    def check(self, key: str, value: Any, good: bool, expected: str) -> None:
+        """Raise where a value is not good."""
+        if not good:
+            raise self.error(f"{self.path}: {key}: found {value!r}, expected {expected}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of a TOML file is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,5 @@
+"""The command `uwbsim`, as `python -m uwbsim`."""
+
+from uwbsim.cli import main
+
+main()
