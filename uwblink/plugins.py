@@ -10,11 +10,15 @@ my-protocol = "my_package.ranging:MY_PROTOCOL"
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from uwblink.errors import ArgumentError, PluginWarning
+
+NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
+"""What a row can be called: people type it, and it stands in files."""
 
 
 class Named(Protocol):

@@ -7,7 +7,6 @@ stamp of the third message are in the initiator's clock, the others in the targe
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Literal
@@ -20,7 +19,7 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, as_text, excerpt, first_few
 from uwblink.errors import ArgumentError
 from uwblink.formulas import Intervals
-from uwblink.plugins import Registry
+from uwblink.plugins import NAME, Registry
 from uwblink.protocol_checks import check_formulas, check_messages
 from uwblink.ticks import COUNTER_BITS, METRES_PER_TICK, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 
@@ -223,8 +222,6 @@ class RangingProtocol:
 
 _POLL = ProtocolMessage("initiator", "", "at once")
 
-_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
-
 _OWN: Final = (
     RangingProtocol(
         "ss",
@@ -275,7 +272,7 @@ def check_protocol(row: RangingProtocol) -> None:
     """
     if not isinstance(row, RangingProtocol):
         raise ArgumentError(f"protocol: found {row!r:.60}, expected a RangingProtocol")
-    if not isinstance(row.name, str) or not _NAME.fullmatch(row.name):
+    if not isinstance(row.name, str) or not NAME.fullmatch(row.name):
         raise ArgumentError(f"protocol: name: found {row.name!r:.60}, expected a word such as 'ds-alt'")
     if not isinstance(row.title, str) or not row.title:
         raise ArgumentError(f"protocol {row.name!r}: title: found {row.title!r:.60}, expected what pages call it")

@@ -7,17 +7,23 @@ from typing import Annotated
 
 import typer
 
+from uwblink.cli.imports import ImportGroup
 from uwblink.cli.shared import AsJson, Force, print_json
 
-imports = typer.Typer(help="Turn other files into recordings.", no_args_is_help=True)
+imports = typer.Typer(cls=ImportGroup, help="Turn other files into recordings.", no_args_is_help=True)
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
     app.command()(show)
+    imports.callback()(_imports)
     app.add_typer(imports, name="import")
     app.command()(poses)
     app.command()(replay)
+
+
+def _imports() -> None:
+    """Hold one command for each importer; a group of typer must have something of its own."""
 
 
 def show(
@@ -37,21 +43,6 @@ def show(
     from uwblink.cli.tables import print_summary
 
     print_summary(summary, Console(highlight=False))
-
-
-@imports.command("csv")
-def import_csv(
-    table: Annotated[Path, typer.Argument(help="Table of exchanges (.csv or .csv.gz).")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
-    column_map: Annotated[Path | None, typer.Option("--map", help="Names, units and constants (.toml).")] = None,
-    force: Force = False,
-) -> None:
-    """Import ranging exchanges from a table."""
-    from uwblink.importers.column_map import ColumnMap, load_map
-    from uwblink.importers.exchanges_csv import import_csv as run
-
-    count = run(table, output, load_map(column_map) if column_map else ColumnMap(), force=force)
-    typer.echo(f"{output}: {count} exchanges")
 
 
 def poses(

@@ -1,1 +1,128 @@
-"""Turns other people's files into recordings."""
+"""Turns other people's files into recordings: one row a kind of file, to which anyone can add.
+
+A reader of a kind of one's own takes a path and returns `Contents`; writing, and refusing to overwrite, is done here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from uwblink.errors import ArgumentError, ImportTableError
+from uwblink.importers.exchanges_csv import read_csv
+from uwblink.plugins import NAME, Registry
+from uwblink.recording.contents import Contents
+from uwblink.recording.file import check_output
+
+
+@dataclass(frozen=True, slots=True)
+class Importer:
+    """A kind of file that can become a recording.
+
+    `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
+    file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
+    small letters; `name` is that of the command `uwblink import NAME`, and `help` its line.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    read: Callable[[Path, Path | None], Contents]
+    help: str
+    map_help: str | None = None
+
+
+def check_importer(row: Any) -> None:
+    """Raise `ArgumentError` for a row that cannot be an importer."""
+    if not isinstance(row, Importer):
+        raise ArgumentError(f"importer: found {row!r:.60}, expected an Importer")
+    if not isinstance(row.name, str) or not NAME.fullmatch(row.name):
+        raise ArgumentError(f"importer: name: found {row.name!r:.60}, expected a word such as 'csv'")
+    where = f"importer {row.name!r}"
+    if not isinstance(row.suffixes, tuple) or not all(isinstance(s, str) and s[:1] == "." for s in row.suffixes):
+        raise ArgumentError(
+            f"{where}: suffixes: found {row.suffixes!r:.60}, expected a tuple such as ('.csv', '.csv.gz')"
+        )
+    if not callable(row.read):
+        raise ArgumentError(f"{where}: read: found {row.read!r:.60}, expected a function of a path and a map's path")
+    for name in ("help", *(["map_help"] if row.map_help is not None else [])):
+        if not isinstance(getattr(row, name), str) or not getattr(row, name):
+            raise ArgumentError(f"{where}: {name}: found {getattr(row, name)!r:.60}, expected a line of text")
+
+
+_OWN: Final = (
+    Importer(
+        "csv",
+        (".csv", ".csv.gz"),
+        read_csv,
+        "Import ranging exchanges from a table.",
+        map_help="Names, units and constants (.toml).",
+    ),
+)
+
+IMPORTERS: Final[Registry[Importer]] = Registry("importer", "uwbcal.importers", _OWN, check_importer)
+"""Importers by name: the project's, those of `register_importer`, and those of installed distributions."""
+
+
+def register_importer(row: Importer, *, replace: bool = False) -> None:
+    """Add a kind of file to `IMPORTERS`: `import_recording` and the command `uwblink import` then know it.
+
+    `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken, and for a row
+    that cannot work.
+
+    >>> import uwblink
+    >>> from uwblink.importers import IMPORTERS, Importer
+    >>> def read(source, _map):
+    ...     rows = [[int(cell) for cell in line.split()] for line in source.read_text().splitlines()]
+    ...     one, other, *stamps = zip(*rows)
+    ...     columns = dict(zip(("tx1", "rx1", "tx2", "rx2"), stamps))
+    ...     return uwblink.Contents(exchanges=uwblink.Exchanges.from_arrays(one, other, **columns))
+    >>> uwblink.register_importer(Importer("blanks", (".ranges",), read, "Import six numbers a line."))
+    >>> IMPORTERS.remove("blanks")
+    """
+    IMPORTERS.register(row, replace=replace)
+
+
+def import_recording(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    importer: str | None = None,
+    map_file: str | os.PathLike[str] | None = None,
+    force: bool = False,
+) -> int:
+    """Make a recording of somebody else's file; returns how many exchanges it has.
+
+    `importer` names a row of `IMPORTERS`; without it the name of the file decides. `map_file` explains a table's
+    columns. Raises `ArgumentError`, `ImportTableError` and what `Recording.create` raises; nothing is written then.
+
+    >>> import pathlib, tempfile, uwblink
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> size = (folder / "t.csv").write_text("time_s,from_id,to_id,tx1,rx1,tx2,rx2\\n0.5,1,2,0,5,1005,3000\\n")
+    >>> uwblink.import_recording(folder / "t.csv", folder / "t.uwb")
+    1
+    """
+    check_output(Path(output), force=force)
+    row = _importer(Path(source), importer)
+    if map_file is not None and row.map_help is None:
+        raise ArgumentError(f"map_file: importer {row.name!r} takes none")
+    contents = row.read(Path(source), None if map_file is None else Path(map_file))
+    if not isinstance(contents, Contents):
+        raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
+    contents.save(output, force=force)
+    return len(contents.exchanges)
+
+
+def _importer(source: Path, name: str | None) -> Importer:
+    if name is not None:
+        if name not in IMPORTERS:
+            raise ArgumentError(f"importer: found {name!r:.40}, allowed: {', '.join(IMPORTERS)}")
+        return IMPORTERS[name]
+    ending = source.name.lower()
+    for row in IMPORTERS.values():
+        if ending.endswith(row.suffixes):
+            return row
+    known = ", ".join(suffix for row in IMPORTERS.values() for suffix in row.suffixes)
+    raise ImportTableError(f"{source}: no importer for such a file; known are {known}; or name one with importer=")

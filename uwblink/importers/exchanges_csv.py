@@ -1,6 +1,6 @@
-"""Exchanges from a CSV file, plain or gzipped, into a recording.
+"""Exchanges from a CSV file, plain or gzipped.
 
-Every row is checked before anything is written; a mistake names file, row and column. Ranges are
+Every row is checked; a mistake names file, row and column. Ranges are
 recomputed from the stamps. `gt_range_m`, or the distance between the two antenna positions
 (`from_x_m` ... `to_z_m`), is stored beside the exchange as its measured truth.
 """
@@ -19,30 +19,24 @@ import numpy as np
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import LEVELS, POSITIONS, STAMP_UNITS, TIME_UNITS, ColumnMap
-from uwblink.recording.file import Recording, check_output
+from uwblink.importers.column_map import LEVELS, POSITIONS, STAMP_UNITS, TIME_UNITS, ColumnMap, load_map
+from uwblink.recording.contents import Contents
 from uwblink.recording.schema import Tag
-from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, raw_range
+from uwblink.twr import LARGEST_ID, LATEST_NS, PROTOCOLS, STAMPS, Exchanges, raw_range
 
 REQUIRED: Final = ("time_s", "from_id", "to_id", *STAMPS[:4])
-LARGEST_ID: Final = 65_535
-LATEST_NS: Final = 2**62
 
 
-def import_csv(source: Path, output: Path, column_map: ColumnMap, *, force: bool = False) -> int:
-    """Write the exchanges of a table as a recording; returns how many.
+def read_csv(source: Path, map_file: Path | None = None) -> Contents:
+    """Return the exchanges of a table, in the order of its rows, and a tag at the origin of a body each.
 
-    Rows keep the order of the file. Raises `ImportTableError`, and what `Recording.create` raises;
-    nothing is written then.
+    `map_file` says what its columns are called (see `column_map`). Raises `ImportTableError`.
     """
-    check_output(output, force=force)
+    column_map = load_map(map_file) if map_file else ColumnMap()
     exchanges = _Table(source, column_map).exchanges()
     ids = sorted({*exchanges.initiator.tolist(), *exchanges.target.tolist()})
     meta = {"source": "import csv", "imported_from": source.name, "timestamp_bits": column_map.bits}
-    with Recording.create(output, meta=meta, force=force) as recording:
-        recording.append_tags(Tag(i, f"tag{i}", (0.0, 0.0, 0.0)) for i in ids)
-        recording.append_exchanges(exchanges)
-    return len(exchanges)
+    return Contents(exchanges=exchanges, tags=[Tag(i, f"tag{i}", (0.0, 0.0, 0.0)) for i in ids], meta=meta)
 
 
 @contextmanager

@@ -175,9 +175,8 @@ def test_the_offset_is_estimated(flight, tmp_path):
 def test_power_and_distance_are_confounded_outdoors(tmp_path):
     """Two boards on tripods, 2 to 60 m apart: within one distance, power says nothing of the bias."""
     from tests.shared_data import ROOT, shared
-    from uwblink.importers.column_map import load_map
-    from uwblink.importers.exchanges_csv import import_csv
+    from uwblink.importers import import_recording
 
     table = shared("hanyang_sstwr.csv.gz")
-    import_csv(table, tmp_path / "h.uwb", load_map(ROOT / "docs" / "maps" / "hanyang.toml"))
+    import_recording(table, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
     assert {f.fault for f in examine(tmp_path / "h.uwb")} == {"too few pairs", "power confounded with distance"}

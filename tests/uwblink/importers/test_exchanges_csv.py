@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from tests.shared_data import shared
-from uwblink.importers.column_map import ColumnMap, load_map
-from uwblink.importers.exchanges_csv import import_csv
+from uwblink.importers import import_recording
 from uwblink.recording.file import Recording
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import raw_range
@@ -18,10 +17,10 @@ DS = "time_s,from_id,to_id,tx1,rx1,tx2,rx2,tx3,rx3,fpp1,fpp2,skew1,skew2,gt_rang
 ROW = "0.5,1,2,2334148660,1211574983,1233803316,2356378373,1332123700,2454699099,-87.4977,-87.5239,-3.4971,3.5222,3.0\n"
 
 
-def imported(tmp_path, text, column_map=None, name="t.csv"):
+def imported(tmp_path, text, map_file=None, name="t.csv"):
     path = tmp_path / name
     path.write_bytes(gzip.compress(text.encode()) if name.endswith("gz") else text.encode())
-    import_csv(path, tmp_path / "o.uwb", column_map or ColumnMap())
+    import_recording(path, tmp_path / "o.uwb", map_file=map_file)
     with Recording.open(tmp_path / "o.uwb") as recording:
         return recording.exchanges()
 
@@ -43,7 +42,7 @@ def test_columns_in_nanoseconds_by_a_map(tmp_path):
         "bits = 40\n[columns]\ntime_s = 'when'\ntx1 = 'a'\nrx1 = 'b'\ntx2 = 'c'\nrx2 = 'd'\n"
         "[units]\nstamps = 'ns'\ntime = 'ms'\n[constants]\nfrom_id = 3\nto_id = 4\n"
     )
-    e = imported(tmp_path, text, load_map(tmp_path / "m.toml"))
+    e = imported(tmp_path, text, tmp_path / "m.toml")
     assert [int(getattr(e, n)[0]) for n in ("tx1", "rx1", "tx2", "rx2")] == list(ticks)
     assert (e.bits, e.time_ns[0], e.initiator[0], e.protocol[0]) == (40, 7_000_000, 3, "ss")
 
@@ -58,7 +57,7 @@ def test_pose_columns_become_the_true_distance(tmp_path):
 
 def test_hanyang_comes_in_whole_and_makes_sense(tmp_path):
     source = shared("hanyang_sstwr.csv.gz")
-    count = import_csv(source, tmp_path / "h.uwb", load_map(ROOT / "docs" / "maps" / "hanyang.toml"))
+    count = import_recording(source, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
     assert count == 9876
     with Recording.open(tmp_path / "h.uwb") as recording:
         e = recording.exchanges()

@@ -1,0 +1,71 @@
+"""`uwblink import NAME`: a command for each row of the table of importers, made when it is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from uwblink.cli.shared import Force
+
+if TYPE_CHECKING:
+    from uwblink.importers import Importer
+
+Output = Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")]
+
+
+class ImportGroup(TyperGroup):
+    """A group whose commands are the importers, those of other distributions included."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the importers."""
+        from uwblink.importers import IMPORTERS
+
+        return list(IMPORTERS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of one importer, None where there is none of the name."""
+        from uwblink.importers import IMPORTERS
+
+        return _command(IMPORTERS[cmd_name]) if cmd_name in IMPORTERS else None
+
+
+def _command(row: Importer) -> Any:
+    app = typer.Typer(add_completion=False)
+    app.command(row.name, help=row.help)(_with_map(row) if row.map_help else _without_map(row))
+    return typer.main.get_command(app)
+
+
+def _with_map(row: Importer) -> Any:
+    def run(table: Path, output: Output, map_file: Path | None = None, force: Force = False) -> None:
+        _import(row, table, output, map_file, force=force)
+
+    # typer reads annotations, and these depend on the row.
+    run.__annotations__ |= {
+        "table": _argument(row),
+        "output": Output,
+        "map_file": Annotated[Path | None, typer.Option("--map", help=row.map_help)],
+        "force": Force,
+    }
+    return run
+
+
+def _without_map(row: Importer) -> Any:
+    def run(table: Path, output: Output, force: Force = False) -> None:
+        _import(row, table, output, None, force=force)
+
+    run.__annotations__ |= {"table": _argument(row), "output": Output, "force": Force}
+    return run
+
+
+def _argument(row: Importer) -> Any:
+    return Annotated[Path, typer.Argument(help=f"File to import ({' or '.join(row.suffixes)}).")]
+
+
+def _import(row: Importer, source: Path, output: Path, map_file: Path | None, *, force: bool) -> None:
+    from uwblink.importers import import_recording
+
+    count = import_recording(source, output, importer=row.name, map_file=map_file, force=force)
+    typer.echo(f"{output}: {count} exchanges")
