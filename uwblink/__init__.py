@@ -1,4 +1,10 @@
-"""The language of DWM1000 ranging boards: device time, wire messages, formulas, recordings."""
+"""The language of DWM1000 ranging boards: device time, wire messages, formulas, recordings.
+
+>>> import uwblink
+>>> x = uwblink.Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+>>> uwblink.raw_range(x).round(3).tolist()
+[4.69]
+"""
 
 from typing import TYPE_CHECKING, Final
 
@@ -10,10 +16,13 @@ if TYPE_CHECKING:
     from uwblink.boards.ranging_plan import RangingPlan
     from uwblink.boards.recorder import record
     from uwblink.errors import UwblinkError
+    from uwblink.importers import import_recording, register_importer
+    from uwblink.recording.contents import Contents, load
     from uwblink.recording.file import Recording
     from uwblink.recording.schema import Poses, Tag
     from uwblink.ticks import SPEED_OF_LIGHT
-    from uwblink.twr import PROTOCOLS, Exchanges, raw_range
+    from uwblink.twr import PROTOCOLS, Exchanges, raw_range, register_protocol
+    from uwblink.wire.messages import register_message
 
 __version__ = "0.1.0"
 
@@ -21,6 +30,7 @@ __all__ = [
     "PROTOCOLS",
     "SPEED_OF_LIGHT",
     "Board",
+    "Contents",
     "Exchanges",
     "Heard",
     "Listener",
@@ -29,14 +39,20 @@ __all__ = [
     "Recording",
     "Tag",
     "UwblinkError",
+    "import_recording",
+    "load",
     "raw_range",
     "record",
+    "register_importer",
+    "register_message",
+    "register_protocol",
 ]
 
 _HOMES: Final = {
     "PROTOCOLS": "uwblink.twr",
     "SPEED_OF_LIGHT": "uwblink.ticks",
     "Board": "uwblink.boards.board",
+    "Contents": "uwblink.recording.contents",
     "Exchanges": "uwblink.twr",
     "Heard": "uwblink.boards.listeners",
     "Listener": "uwblink.boards.listeners",
@@ -45,8 +61,13 @@ _HOMES: Final = {
     "Recording": "uwblink.recording.file",
     "Tag": "uwblink.recording.schema",
     "UwblinkError": "uwblink.errors",
+    "import_recording": "uwblink.importers",
+    "load": "uwblink.recording.contents",
     "raw_range": "uwblink.twr",
     "record": "uwblink.boards.recorder",
+    "register_importer": "uwblink.importers",
+    "register_message": "uwblink.wire.messages",
+    "register_protocol": "uwblink.twr",
 }
 
 if not TYPE_CHECKING:

@@ -22,6 +22,6 @@ def offer(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any],
         return value
 
     def listed() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *homes})
+        return sorted(homes)
 
     return get, listed

@@ -293,6 +293,20 @@ def register_protocol(row: RangingProtocol, *, replace: bool = False) -> None:
 
     `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken, for messages
     that a recording has no place for, and for formulas that are not exact without noise.
+
+    >>> import numpy as np, uwblink
+    >>> from uwblink.twr import ProtocolMessage, RangingProtocol
+    >>> poll = ProtocolMessage("initiator", "", "at once")
+    >>> reply = ProtocolMessage("target", "rx1", "scheduled")
+    >>> mine = RangingProtocol(
+    ...     "my-ss", "SS-TWR of mine", (poll, reply),
+    ...     flight_ticks=lambda t: (t.dt41 - t.dt32) / 2,
+    ...     delay_weights=lambda t: (np.full_like(t.dt41, 0.5), np.full_like(t.dt41, 0.5)),
+    ... )
+    >>> uwblink.register_protocol(mine)
+    >>> "my-ss" in uwblink.PROTOCOLS
+    True
+    >>> uwblink.PROTOCOLS.remove("my-ss")
     """
     PROTOCOLS.register(row, replace=replace)
 
@@ -342,7 +356,12 @@ def time_of_flight(exchanges: Exchanges) -> Floats:
 
 
 def raw_range(exchanges: Exchanges) -> Floats:
-    """Uncalibrated range in metres, shape (n,), at full resolution (no rounding as on the board)."""
+    """Uncalibrated range in metres, shape (n,), at full resolution (no rounding as on the board).
+
+    >>> from uwblink import Exchanges, raw_range
+    >>> raw_range(Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])).round(3).tolist()
+    [4.69]
+    """
     return time_of_flight(exchanges) * SPEED_OF_LIGHT
 
 

@@ -10,7 +10,9 @@ from calib.cli.flags import with_flags
 from calib.errors import CalibError, UnanswerableError
 from uwblink.cli import shared
 
-app = shared.new_app("Fit antenna delays and power curves to ultra-wideband ranges, apply them, and say how good they are.")
+app = shared.new_app(
+    "Fit antenna delays and power curves to ultra-wideband ranges, apply them, and say how good they are."
+)
 for room in (fitting, evaluating, reporting, files):
     room.add_to(app)
 

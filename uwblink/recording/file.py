@@ -38,7 +38,22 @@ if TYPE_CHECKING:
 
 
 class Recording:
-    """An open recording. Use `create` to write and `open` to read; both are context managers."""
+    """An open recording. Use `create` to write and `open` to read; both are context managers.
+
+    >>> import pathlib, tempfile
+    >>> from uwblink import Exchanges, Recording, Tag
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "mine.uwb"
+    >>> with Recording.create(path, meta={"place": "roof"}) as recording:
+    ...     recording.append_tags([Tag(1, "mast", (0.0, 0.0, 2.0)), Tag(2, "drone", (0.1, 0.0, 0.0))])
+    ...     recording.append_exchanges(Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000]))
+    >>> with Recording.open(path) as recording:
+    ...     print(recording.show())
+    mine.uwb: 1 exchanges in 0.0 s, protocols ss 1
+      tags: 1 on mast, 2 on drone
+      poses: none
+      faults: none
+          1 -> 2             1 exchanges
+    """
 
     def __init__(self, store: Store, partial: Path | None = None) -> None:
         """Wrap an open store; `partial` is the file that takes the store's name when writing went well."""

@@ -70,7 +70,12 @@ ADDED_LATER: Final = {"faults": frozenset({"initiator", "target"})}
 
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """Where a tag sits: its body, and its lever arm in that body's frame in metres."""
+    """Where a tag sits: its body, and its lever arm in that body's frame in metres.
+
+    >>> from uwblink import Tag
+    >>> Tag(1, "drone", (0.17, -0.17, -0.05)).body
+    'drone'
+    """
 
     tag: int
     body: str

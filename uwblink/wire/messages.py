@@ -337,6 +337,18 @@ def register_message(kind: type[Message]) -> None:
     """Add a message to `COMMANDS` or `REPORTS`, by its key: codecs made from now on write and read it.
 
     Raises `ArgumentError` for a class that is no message, a key that is taken, and fields without a kind.
+
+    >>> from uwblink import register_message
+    >>> from uwblink.wire.codec import encode
+    >>> from uwblink.wire.fields import PRINTED
+    >>> from uwblink.wire.messages import REPORTS, Message, message, wire
+    >>> @message(b"R77")
+    ... class Temperature(Message):
+    ...     celsius: float = wire(PRINTED)
+    >>> register_message(Temperature)
+    >>> encode(Temperature(21.5))
+    b'R77|21.5000\\r\\n'
+    >>> del REPORTS[b"R77"]
     """
     if not isinstance(kind, type) or not issubclass(kind, Message) or not _KEY.fullmatch(kind.KEY):
         raise ArgumentError(f"message: found {kind!r:.60}, expected a class made with @message(key)")
