@@ -1,0 +1,118 @@
+"""A kind of file that somebody adds: from Python and from the command line, and what is refused."""
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from uwblink.cli import main
+from uwblink.errors import ArgumentError, ImportTableError, RecordingExistsError
+from uwblink.importers import IMPORTERS, Importer, import_recording, register_importer
+from uwblink.recording.contents import Contents, load
+from uwblink.twr import Exchanges
+
+
+def read_blanks(source, map_file):
+    rows = [[int(cell) for cell in line.split()] for line in source.read_text().splitlines()]
+    if any(len(row) != 6 for row in rows):
+        raise ImportTableError(f"{source}: expected six numbers a line")
+    one, other, tx1, rx1, tx2, rx2 = np.array(rows).T
+    more = {"map": map_file.read_text()} if map_file else {}
+    return Contents(exchanges=Exchanges.from_arrays(one, other, tx1=tx1, rx1=rx1, tx2=tx2, rx2=rx2), meta=more)
+
+
+BLANKS = Importer("blanks", (".ranges", ".ranges.txt"), read_blanks, "Import six numbers a line.", "What they mean.")
+
+
+@pytest.fixture
+def source(tmp_path):
+    register_importer(BLANKS)
+    (tmp_path / "my.Ranges").write_text("1 2 0 5 1005 3000\n2 3 9 3 1003 3009\n")
+    yield tmp_path / "my.Ranges"
+    IMPORTERS.remove("blanks")
+
+
+def test_python_knows_it_by_suffix_and_by_name(source, tmp_path):
+    assert import_recording(source, tmp_path / "a.uwb") == 2
+    (tmp_path / "note.txt").write_text("ticks")
+    assert import_recording(source, tmp_path / "b.uwb", importer="blanks", map_file=tmp_path / "note.txt") == 2
+    assert load(tmp_path / "b.uwb").meta["map"] == "ticks"
+    np.testing.assert_allclose(load(tmp_path / "a.uwb").exchanges.range_m, 4.690357, rtol=1e-6)
+
+
+def test_the_command_line_has_it(source, tmp_path, monkeypatch, capsys):
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["uwblink", "import", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, capsys.readouterr()
+
+    code, said = run("blanks", source, "-o", tmp_path / "c.uwb")
+    assert (code, said.out) == (0, f"{tmp_path / 'c.uwb'}: 2 exchanges\n")
+    code, said = run("--help")
+    assert "blanks" in said.out
+    assert "six numbers a line" in said.out
+    code, said = run("blanks", "--help")
+    assert "What they mean." in said.out
+    code, said = run("blanks", source, "-o", tmp_path / "c.uwb")
+    assert code == 2
+    assert said.err.startswith("error: ")
+    assert said.err.count("\n") == 1
+    source.write_text("1 2 3\n")
+    code, said = run("blanks", source, "-o", tmp_path / "d.uwb")
+    assert (code, said.err) == (2, f"error: {source}: expected six numbers a line\n")
+    assert not (tmp_path / "d.uwb").exists()
+
+
+def test_without_a_map_there_is_no_option_for_one(tmp_path, monkeypatch, capsys):
+    register_importer(replace(BLANKS, name="plain", map_help=None))
+    try:
+        monkeypatch.setattr(sys, "argv", ["uwblink", "import", "plain", "--help"])
+        with pytest.raises(SystemExit):
+            main()
+        assert "--map" not in capsys.readouterr().out
+        with pytest.raises(ArgumentError, match="map_file: importer 'plain' takes none"):
+            import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb", importer="plain", map_file=tmp_path / "m")
+    finally:
+        IMPORTERS.remove("plain")
+
+
+def test_what_cannot_be_imported_says_so(source, tmp_path):
+    with pytest.raises(
+        ImportTableError, match=r"t\.xls: no importer for such a file; known are \.csv, \.csv\.gz, \.ranges"
+    ):
+        import_recording(tmp_path / "t.xls", tmp_path / "x.uwb")
+    with pytest.raises(ArgumentError, match="importer: found 'xls', allowed: csv"):
+        import_recording(source, tmp_path / "x.uwb", importer="xls")
+    (tmp_path / "old.uwb").write_text("")
+    with pytest.raises(RecordingExistsError):
+        import_recording(source, tmp_path / "old.uwb")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"name": "a b"}, "name: found 'a b', expected a word"),
+        ({"name": "csv"}, "importer 'csv': is one of the project's own"),
+        ({"suffixes": ".csv"}, "suffixes: found '.csv', expected a tuple"),
+        ({"suffixes": ("csv",)}, "suffixes: found .*, expected a tuple"),
+        ({"read": None}, "read: found None, expected a function"),
+        ({"help": ""}, "help: found '', expected a line of text"),
+        ({"map_help": 3}, "map_help: found 3, expected a line of text"),
+    ],
+)
+def test_rows_that_cannot_work_are_refused(change, expected):
+    with pytest.raises(ArgumentError, match=expected):
+        register_importer(replace(BLANKS, **change))
+
+
+def test_a_reader_must_return_contents(tmp_path):
+    read: Any = lambda _source, _map: [1, 2]  # noqa: E731 - untyped on purpose
+    register_importer(replace(BLANKS, name="broken", read=read))
+    try:
+        with pytest.raises(ArgumentError, match=r"importer 'broken': returned \[1, 2\], expected Contents"):
+            import_recording(tmp_path / "x.ranges", tmp_path / "x.uwb")
+    finally:
+        IMPORTERS.remove("broken")
