@@ -27,6 +27,23 @@ class VirtualPorts:
     """The ports of a scenario's boards. Time passes only while somebody reads or waits.
 
     `names` are what `open` takes, by tag; `lost_share` of all frames on the air are lost besides the weak ones.
+
+    >>> import uwblink, uwbsim
+    >>> near, far = ({"model": "static", "position_m": [x, 0.0, 1.0]} for x in (0.0, 3.0))
+    >>> ports = uwbsim.VirtualPorts(
+    ...     uwbsim.load(
+    ...         {
+    ...             "run": {"duration_s": 10.0},
+    ...             "ranging": {"rate_hz": 50.0},
+    ...             "bodies": [{"name": "near", "motion": near}, {"name": "far", "motion": far}],
+    ...             "tags": [{"id": 10, "body": "near"}, {"id": 20, "body": "far"}],
+    ...         }
+    ...     )
+    ... )
+    >>> with uwblink.Board(ports.port(10)) as board:
+    ...     report = board.range(20)
+    >>> report.neighbour, abs(report.range_m - 3.0) < 0.2
+    (20, True)
     """
 
     def __init__(self, scenario: Scenario, lost_share: float = 0.0, *, epoch_ns: int = 0) -> None:

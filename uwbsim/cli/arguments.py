@@ -13,7 +13,7 @@ import typer
 from uwblink.cli import shared
 
 ScenarioFile = Annotated[Path, typer.Argument(help="Scenario file (.toml).")]
-Settings = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")]
 AsJson = shared.AsJson
 Force = shared.Force
 

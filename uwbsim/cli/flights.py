@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwblink.cli.shared import interrupts
-from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
+from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
     from uwblink.recording.schema import FrameRow
@@ -25,7 +25,7 @@ def run(
     scenario: ScenarioFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
     seed: Annotated[int | None, typer.Option(min=0, help="Seed instead of the file's.")] = None,
-    settings: Settings = None,
+    overrides: Overrides = None,
     wire: Annotated[
         bool, typer.Option("--through-wire", help="Encode and decode every report, and record the bytes.")
     ] = False,
@@ -42,7 +42,7 @@ def run(
     from uwbsim.simulation.through_wire import through_wire
 
     check_output(output, force=force)
-    loaded = load(scenario, settings or (), seed)
+    loaded = load(scenario, overrides or (), seed)
     with progress(loaded.run.name) as report:
         simulated = simulate(loaded, report, contention=contention)
     frames: list[FrameRow] = []
@@ -62,7 +62,7 @@ def serve(
     faults: Annotated[Path | None, typer.Option(help="What goes wrong (.toml).")] = None,
     poses: Annotated[Path | None, typer.Option(help="Motion capture to write (.csv), in host time.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
-    settings: Settings = None,
+    overrides: Overrides = None,
     force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
@@ -73,7 +73,7 @@ def serve(
 
     if poses:
         check_output(poses, force=force)
-    loaded = load(scenario, settings or ())
+    loaded = load(scenario, overrides or ())
     wrong = fault_files.load(faults, [tag.id for tag in loaded.tags]) if faults else None
     server = Server(extended(loaded, duration), link_dir, wrong)
     try:
@@ -90,7 +90,7 @@ def serve(
 def show(
     scenario: ScenarioFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Page (.html) or picture (.png, .svg, .pdf).")],
-    settings: Settings = None,
+    overrides: Overrides = None,
     force: Force = False,
 ) -> None:
     """Draw the room, the flights, and one exchange of each protocol."""
@@ -99,13 +99,13 @@ def show(
     from uwbsim.scenario.loading import load
 
     check_output(output, force=force)
-    draw(load(scenario, settings or ()), output, force=force)
+    draw(load(scenario, overrides or ()), output, force=force)
     typer.echo(f"{output}")
 
 
 def validate(
     scenario: ScenarioFile,
-    settings: Settings = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what a scenario will do, without running it."""
@@ -114,7 +114,7 @@ def validate(
     from uwbsim.pages.scenario_summary import preview, sentences
     from uwbsim.scenario.loading import load
 
-    loaded = load(scenario, settings or ())
+    loaded = load(scenario, overrides or ())
     found = preview(loaded)
     if as_json:
         typer.echo(json.dumps(asdict(found), indent=1))

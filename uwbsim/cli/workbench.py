@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwbsim.cli.arguments import AsJson, Force, ScenarioFile, Settings, progress
+from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
     from uwbsim.protocols.comparison import ProtocolErrors
@@ -28,7 +28,7 @@ def compare(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for compare.html, .csv and .parquet.")],
     protocols: Protocols = "all",
     count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
-    settings: Settings = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -42,7 +42,7 @@ def compare(
     from uwbsim.sweep.results import write_csv, write_parquet
 
     rows = chosen(_names(protocols))
-    loaded = load(scenario, settings or ())
+    loaded = load(scenario, overrides or ())
     check_folder(output)
     files = {kind: output / f"compare.{kind}" for kind in ("html", "csv", "parquet")}
     for path in files.values() if output.is_dir() else ():
@@ -141,7 +141,7 @@ def optimum(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for pictures of the curves (.png).")
     ] = None,
-    settings: Settings = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -155,7 +155,7 @@ def optimum(
     from uwbsim.scenario.loading import load
 
     rows = chosen(_names(protocols))
-    loaded = load(scenario, settings or ())
+    loaded = load(scenario, overrides or ())
     if output:
         check_folder(output)
         for row in rows if output.is_dir() else ():

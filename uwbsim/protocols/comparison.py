@@ -11,7 +11,7 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
 from uwblink.twr import PROTOCOLS, RangingProtocol
-from uwbsim.errors import ScenarioError
+from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
@@ -59,13 +59,13 @@ class ProtocolErrors:
         return asdict(self)
 
 
-def chosen(names: Sequence[str]) -> list[RangingProtocol]:
-    """Return the rows of protocols by name; raises `ScenarioError` that lists what there is."""
+def chosen(names: Sequence[str], parameter: str = "protocols") -> list[RangingProtocol]:
+    """Return the rows of protocols by name; raises `ParameterError` that lists what there is."""
     for name in names:
         if name not in PROTOCOLS:
-            raise ScenarioError(f"--protocols: found {name!r}, allowed: {', '.join(PROTOCOLS)}")
+            raise ParameterError(parameter, f"found {name!r}, allowed: {', '.join(PROTOCOLS)}")
     if not names:
-        raise ScenarioError(f"--protocols: found none, allowed: {', '.join(PROTOCOLS)}")
+        raise ParameterError(parameter, f"found none, allowed: {', '.join(PROTOCOLS)}")
     return [PROTOCOLS[name] for name in dict.fromkeys(names)]
 
 
@@ -77,7 +77,7 @@ def compare(
 ) -> tuple[list[ProtocolErrors], dict[str, Floats]]:
     """Range `count` times with each protocol in one world; return what came out, and a sample of each one's errors."""
     if not 1 <= count <= MOST:
-        raise ScenarioError(f"-n: found {count}, expected 1 to {MOST}")
+        raise ParameterError("count", f"found {count}, expected 1 to {MOST}")
     conditions = conditions_of(scenario)
     outcomes, samples = [], {}
     for number, protocol in enumerate(protocols):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Final
 
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.errors import ScenarioError
+from uwbsim.errors import ParameterError
 from uwbsim.protocols.comparison import chosen
 from uwbsim.protocols.conditions import Conditions
 from uwbsim.protocols.prediction import predict
@@ -43,15 +43,15 @@ class State:
 def predict_state(q: State) -> dict[str, Any]:
     """Return bias and standard deviation of a range, in metres and as time of flight, and the parts of the latter.
 
-    Raises `ScenarioError` for a number that cannot be, and for an unknown protocol.
+    Raises `ParameterError` for a number that cannot be, and for an unknown protocol.
     """
-    (protocol,) = chosen([q.protocol])
+    (protocol,) = chosen([q.protocol], "protocol")
     for field in fields(q):
         value = getattr(q, field.name)
         if isinstance(value, float) and not (math.isfinite(value) and abs(value) < LARGEST):
-            raise ScenarioError(f"--{field.name.replace('_', '-')}: found {value}, expected a number below {LARGEST:g}")
+            raise ParameterError(field.name, f"found {value}, expected a number below {LARGEST:g}")
     if q.final_delay_us < SHORTEST_US:
-        raise ScenarioError(f"--final-delay-us: found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}")
+        raise ParameterError("final_delay_us", f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}")
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
     target_waits = timings[1] == "scheduled"

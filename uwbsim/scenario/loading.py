@@ -5,90 +5,149 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, Final, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from uwbsim.errors import ScenarioError
+from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
 from uwbsim.scenario.linked_files import fill_in
 from uwbsim.scenario.model import Scenario
 
+NO_FILE: Final = Path("scenario")
+"""What messages name where a scenario has no file."""
 
-def load(path: str | os.PathLike[str], overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
-    """Read and validate a scenario; `overrides` are `key.path=value` with a TOML value.
 
-    Raises `ScenarioError`.
+Source = str | os.PathLike[str] | Mapping[str, Any]
+"""A scenario before it is checked: a file, TOML text (more than one line), or the same as nested tables."""
+
+Overrides = Sequence[str] | Mapping[str, Any]
+
+
+def load(source: Source, overrides: Overrides = (), seed: int | None = None) -> Scenario:
+    """Read and validate a scenario from a file, from TOML text of more than one line, or from nested tables.
+
+    `overrides` change single values: a mapping of key paths to values, or words `key.path=value` with TOML values;
+    `seed` replaces `run.seed`. Files that a scenario names lie beside its file, or in the working folder where it has
+    none. Raises `ScenarioError`, one line that says where, what was found and what is allowed.
+
+    >>> import uwbsim
+    >>> scenario = uwbsim.load(
+    ...     '''
+    ...     run = { duration_s = 1.0 }
+    ...     ranging = { rate_hz = 50 }
+    ...     bodies = [
+    ...         { name = "mast", motion = { model = "static", position_m = [0.0, 0.0, 2.0] } },
+    ...         { name = "drone", motion = { model = "static", position_m = [3.0, 0.0, 2.0] } },
+    ...     ]
+    ...     tags = [{ id = 1, body = "mast" }, { id = 2, body = "drone", delay_ns = -0.3 }]
+    ...     ''',
+    ...     {"ranging.protocol": "ss", "radio.rx_noise_ps": 0.0},
+    ...     seed=3,
+    ... )
+    >>> scenario.run.seed, scenario.ranging.protocol, scenario.pairs()
+    (3, 'ss', [(1, 2)])
     """
-    table = _parse(Path(path))
-    for text in overrides:
-        _override(table, text)
+    table, where = _table(source)
+    pairs = overrides.items() if isinstance(overrides, Mapping) else map(_split, overrides)
+    for key, value in pairs:
+        _override(table, key, value)
     if seed is not None:
-        table.setdefault("run", {})["seed"] = seed
-    fill_in(table, Path(path))
+        _override(table, "run.seed", seed)
+    fill_in(table, where)
     try:
         return Scenario.model_validate(table)
     except ValidationError as error:
-        raise ScenarioError(f"{path}: {_explain(error)}") from error
+        raise _mistake(where, error) from error
+
+
+def as_scenario(source: Scenario | Source) -> Scenario:
+    """Return a scenario as it is, or `load` it."""
+    return source if isinstance(source, Scenario) else load(source)
+
+
+def _table(source: Source) -> tuple[dict[str, Any], Path]:
+    """Return a table of its own, and the file that it is of (for messages, and for what lies beside it)."""
+    if isinstance(source, Mapping):
+        return deepcopy(dict(source)), NO_FILE
+    if isinstance(source, str) and "\n" in source:
+        return _toml(source, NO_FILE), NO_FILE
+    return _parse(Path(source)), Path(source)
 
 
 def _parse(path: Path) -> dict[str, Any]:
     if path.is_dir():
         raise ScenarioError(f"{path}: is a directory, expected a scenario file (.toml)")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return _toml(path.read_text(encoding="utf-8"), path)
     except FileNotFoundError as error:
         raise ScenarioError(f"{path}: no such scenario file") from error
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path}: not a text file in UTF-8 (byte {error.start})") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}") from error
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _override(table: dict[str, Any], text: str) -> None:
-    key, equals, value = text.partition("=")
-    keys = [k.strip() for k in key.split(".")]
-    if not equals or not all(keys):
-        raise ScenarioError(f"--set {text}: expected key.path=value, as in ranging.rate_hz=50")
+def _toml(text: str, path: Path) -> dict[str, Any]:
     try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{path}: not valid TOML: {error}") from error
+
+
+def _split(text: str) -> tuple[str, Any]:
+    """Return key path and value of `key.path=value`."""
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ParameterError("overrides", f"found {text!r}, expected key.path=value, as in ranging.rate_hz=50")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
-        parsed = value.strip()  # a word without quotes is meant as text
+        return key, value.strip()  # a word without quotes is meant as text
+
+
+def _override(table: dict[str, Any], key: str, value: Any) -> None:
+    keys = [k.strip() for k in key.split(".")]
+    if not all(keys):
+        raise ParameterError("overrides", f"found key {key!r}, expected key.path=value, as in ranging.rate_hz=50")
     node: Any = table
     for step in keys[:-1]:
-        node = _step(node, step, text)
+        node = _step(node, step, key)
     last: Any = keys[-1]
     if isinstance(node, list):
-        last = _index(node, last, text)
+        last = _index(node, last, key)
     elif not isinstance(node, dict):
-        raise ScenarioError(f"--set {text}: {keys[-2]} is not a table")
-    node[last] = parsed
+        raise UnknownKeyError(f"{key}: {keys[-2]} is not a table")
+    node[last] = value
 
 
-def _step(node: Any, step: str, text: str) -> Any:
+def _step(node: Any, step: str, key: str) -> Any:
     if isinstance(node, list):
-        return node[_index(node, step, text)]
+        return node[_index(node, step, key)]
     if isinstance(node, dict):
         return node.setdefault(step, {})
-    raise ScenarioError(f"--set {text}: nothing lies below {step!r}")
+    raise UnknownKeyError(f"{key}: nothing lies below {step!r}")
 
 
-def _index(node: list[Any], step: str, text: str) -> int:
+def _index(node: list[Any], step: str, key: str) -> int:
     if step.isdecimal() and int(step) < len(node):
         return int(step)
-    raise ScenarioError(f"--set {text}: found {step!r}, expected an index 0 to {len(node) - 1}")
+    raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}")
 
 
-def _explain(error: ValidationError) -> str:
+def _mistake(path: Path, error: ValidationError) -> ScenarioError:
     # An unknown key explains a missing one better than the other way round.
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    where = _key_path(first["loc"])
     if first["type"] == "extra_forbidden":
-        return f"{where}: unknown key{_suggestion(first['loc'])}"
+        return UnknownKeyError(f"{path}: {_key_path(first['loc'])}: unknown key{_suggestion(first['loc'])}")
+    return ScenarioError(f"{path}: {_explain(first)}")
+
+
+def _explain(first: Mapping[str, Any]) -> str:
+    where = _key_path(first["loc"])
     if first["type"] == "missing":
         return f"{where}: missing, and it must be given"
     message = str(first["msg"]).removeprefix("Value error, ")

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, Final, Protocol
 
-from uwbsim.errors import UwbsimError
+from uwbsim.errors import ParameterError
 from uwbsim.sweep.task import Task, run_chunk
 
 Chunk = list[Task]
@@ -115,16 +115,16 @@ class Cluster:
     """A Dask cluster by the address of its scheduler; `distributed` moves the work of a dead worker to another."""
 
     def __init__(self, address: str) -> None:
-        """Connect; raises `UwbsimError` where nobody answers within ten seconds."""
+        """Connect; raises `ParameterError` where nobody answers within ten seconds."""
         try:
             self._dask: Any = import_module("distributed")
         except ImportError as error:
-            raise UwbsimError("--scheduler: needs the extra 'cluster': pip install 'uwbcal[cluster]'") from error
+            raise ParameterError("scheduler", "needs the extra 'cluster': pip install 'uwbcal[cluster]'") from error
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         try:
             self._client = self._dask.Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
-            raise UwbsimError(f"--scheduler: {address} does not answer within {CONNECT_S} s") from error
+            raise ParameterError("scheduler", f"{address} does not answer within {CONNECT_S} s") from error
         self.size = max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
         self._running: dict[Any, Chunk] = {}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import uwblink
-from uwbsim.errors import ScenarioError
+from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.output import check_folder
 from uwbsim.scenario.loading import load
 from uwbsim.sweep.design import SweepDesign
@@ -50,7 +50,7 @@ def run_sweep(
     """Run what is not done yet, and write results.csv and results.parquet in the order of the runs.
 
     Raises `ScenarioError` where the folder holds another sweep's results, or the same one's without `resume`, and
-    `UwbsimError` where the scheduler does not answer; nothing is written then.
+    `ParameterError` where the scheduler does not answer; nothing is written then.
     """
     check_folder(folder)
     _check(plan, folder, resume=resume)
@@ -75,7 +75,7 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
     path = folder / STORE
     if not Store.begun(path):
         if resume and not path.exists():
-            raise ScenarioError(f"--resume: {folder} holds no sweep to go on with")
+            raise ParameterError("resume", f"{folder} holds no sweep to go on with")
         if folder.is_dir() and any(item.name != STORE for item in folder.iterdir()):
             raise ScenarioError(f"{folder}: holds other files; give an empty folder or a new one")
         return
@@ -93,7 +93,7 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
             "give another folder"
         )
     if not resume:
-        raise ScenarioError(f"{folder}: holds results of this sweep; go on with --resume, or give another folder")
+        raise ParameterError("resume", f"{folder} holds results of this sweep; go on with it, or give another folder")
 
 
 def _work(

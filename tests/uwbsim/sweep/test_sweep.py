@@ -200,7 +200,7 @@ def test_calibrations_are_swept_too(tmp_path):
 
 def test_folders_and_files_that_do_not_fit_are_refused(alone, tmp_path):
     p, out = alone
-    with pytest.raises(ScenarioError, match="--resume"):
+    with pytest.raises(ScenarioError, match=r"^resume: .* holds results of this sweep"):
         run_sweep(p, out, workers=1)
     with pytest.raises(ScenarioError, match=r"another sweep, plan\.toml"):
         run_sweep(plan(tmp_path, name="other.toml"), out, workers=1, resume=True)

@@ -1,0 +1,89 @@
+import doctest
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import uwbsim
+from uwblink import Recording
+from uwblink.twr import COLUMNS
+
+NOISELESS = Path(__file__).parents[2] / "scenarios" / "noiseless.toml"
+SHORT = {"run.duration_s": 2.0}
+
+
+def test_the_names_are_sorted_and_there():
+    assert sorted(uwbsim.__all__) == list(uwbsim.__all__)
+    assert set(uwbsim.__all__) <= set(dir(uwbsim))
+    for name in uwbsim.__all__:
+        assert getattr(uwbsim, name).__name__ == name
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    code = "import sys, uwbsim; dir(uwbsim); print({'numpy', 'scipy', 'pydantic', 'simpy'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+# Errors, and what is made from a file: its docstring is the description in the JSON Schema, and `load` has the example.
+EXEMPT = {"UwbsimError", "ScenarioError", "ParameterError", "Scenario"}
+
+
+@pytest.mark.parametrize("name", sorted(set(uwbsim.__all__) - EXEMPT))
+def test_every_name_has_an_example_that_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tests = [t for t in doctest.DocTestFinder(recurse=False).find(getattr(uwbsim, name), name) if t.examples]
+    assert tests, f"{name} has no example"
+    for test in tests:
+        result = doctest.DocTestRunner().run(test)
+        assert result.failed == 0
+
+
+def test_a_scenario_is_a_file_a_text_tables_or_itself():
+    text = NOISELESS.read_text(encoding="utf-8").replace("duration_s = 60.0", "duration_s = 2.0")
+    tables = tomllib.loads(text)
+    before = tomllib.loads(text)
+    loaded = uwbsim.load(NOISELESS, SHORT)
+    flights = [uwbsim.simulate(source) for source in (loaded, text, tables)]
+    assert tables == before
+    assert len(flights[0].exchanges) == 320
+    for flight in flights[1:]:
+        for name in COLUMNS:
+            np.testing.assert_array_equal(getattr(flight.exchanges, name), getattr(flights[0].exchanges, name))
+    assert uwbsim.load(str(NOISELESS), SHORT) == uwbsim.load(NOISELESS, ["run.duration_s=2.0"]) == loaded
+
+
+def test_mistakes_say_where():
+    with pytest.raises(uwbsim.ScenarioError, match=r"^scenario: not valid TOML"):
+        uwbsim.load("run = {\n")
+    with pytest.raises(uwbsim.ScenarioError, match=r"^scenario: run: missing"):
+        uwbsim.simulate({"ranging": {"rate_hz": 1.0}})
+    with pytest.raises(uwbsim.ScenarioError, match=r"nowhere\.toml: no such scenario file"):
+        uwbsim.simulate("nowhere.toml")
+    with pytest.raises(uwbsim.ParameterError, match=r"^overrides: found 'run' *, expected key"):
+        uwbsim.load(NOISELESS, ["run"])
+    with pytest.raises(uwbsim.ScenarioError, match=r"^run\.seed\.x: seed is not a table"):
+        uwbsim.load(NOISELESS, {"run.seed.x": 1})
+
+
+def test_what_a_flight_prints_fits_and_is_true():
+    flight = uwbsim.simulate(uwbsim.load(NOISELESS, SHORT))
+    lines = repr(flight).splitlines()
+    assert str(flight) == repr(flight)
+    assert 2 <= len(lines) <= 6
+    assert max(map(len, lines)) <= 100
+    assert "320 exchanges (ds) of 6 tags on 3 bodies in 2 s" in lines[0]
+
+
+def test_saving_writes_the_recording(tmp_path):
+    flight = uwbsim.simulate(uwbsim.load(NOISELESS, SHORT))
+    flight.save(tmp_path / "f.uwb")
+    with Recording.open(tmp_path / "f.uwb") as recording:
+        np.testing.assert_array_equal(recording.exchanges().rx2, flight.exchanges.rx2)
+        assert recording.meta()["planted"] == flight.planted
+    with pytest.raises(FileExistsError):
+        flight.save(tmp_path / "f.uwb")
+    flight.save(tmp_path / "f.uwb", force=True)
