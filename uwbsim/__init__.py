@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from uwbsim.scenario.loading import load
     from uwbsim.scenario.model import Scenario
     from uwbsim.simulation.run import Simulated, simulate
+    from uwbsim.world.channel import register_channel_effect
 
 __all__ = [
     "ParameterError",
@@ -19,6 +20,7 @@ __all__ = [
     "UwbsimError",
     "VirtualPorts",
     "load",
+    "register_channel_effect",
     "simulate",
 ]
 
@@ -30,6 +32,7 @@ _HOMES: Final = {
     "UwbsimError": "uwbsim.errors",
     "VirtualPorts": "uwbsim.boards.virtual_port",
     "load": "uwbsim.scenario.loading",
+    "register_channel_effect": "uwbsim.world.channel",
     "simulate": "uwbsim.simulation.run",
 }
 

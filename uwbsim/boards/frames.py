@@ -12,14 +12,14 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, UUS_TICKS
+from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, REPORT_BITS, TICK_S, UUS_TICKS
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import FINAL_BYTES, POLL_BYTES, RESPONSE_BYTES
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.timestamps import draw_reply_s, reception
+from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.lookahead import SampledWorld
-from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
+from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import World
 
 MASK: Final = (1 << REPORT_BITS) - 1
@@ -120,17 +120,17 @@ class Radios:
         self.scenario = scenario
         self.world = World.of(scenario)
         self.sampled_world = SampledWorld(self.world)
-        self.clocks = Clocks.of(scenario)
+        self.medium = Medium(scenario, self.sampled_world, Clocks.of(scenario))
         self.lost_share = lost_share
         self.place = {tag.id: k for k, tag in enumerate(scenario.tags)}
         self._all = np.arange(len(scenario.tags))
-        self._delays = np.array([t.delays_ns() for t in scenario.tags]) * 1e-9 * SUBTICKS_PER_SECOND
+        self._delays = self.medium.delays()
         self._chance = stream(scenario.run.seed, "boards")
 
     def next_stamp(self, board: int, time: int) -> int:
         """Return the first transmit stamp that a board's clock allows at or after a true time (sub-ticks)."""
         me = self._one(board)
-        ready = -(-int(self.clocks.read(me, np.array([time]))[0]) // SUBTICKS)
+        ready = -(-int(self.medium.clocks.read(me, np.array([time]))[0]) // SUBTICKS)
         return _on_grid(ready) + ANTENNA_DELAY_TICKS
 
     def reply_stamp(self, received: int) -> int:
@@ -150,7 +150,7 @@ class Radios:
         jitter = self._chance.normal() * self.scenario.radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
         place = self.place[sender]
         left = stamp * SUBTICKS + round(jitter - self._delays[place, 0])
-        departure = int(self.clocks.when(self._one(sender), np.array([left]))[0])
+        departure = int(self.medium.clocks.when(self._one(sender), np.array([left]))[0])
         excess = np.zeros(len(self._all))
         if receiver in self.place:
             excess[self.place[receiver]] = excess_m
@@ -166,20 +166,15 @@ class Radios:
         return self.world.echoes(self.place[sender], self.place[receiver], time)
 
     def _receptions(self, sender: int, departure: int, excess_m: Floats) -> Receptions:
-        radio, chance, count = self.scenario.radio, self._chance, len(self._all)
-        link = self.sampled_world.from_sender(sender, departure)
+        chance, count = self._chance, len(self._all)
+        frames = Frames(sender=np.full(count, sender), receiver=self._all, departure=np.full(count, departure))
         noise = chance.normal(size=(4, count))
-        heard = link.power_dbm + noise[0] * radio.power_noise_db >= radio.sensitivity_dbm
-        heard &= chance.random(count) >= self.lost_share
-        late_s = reception_bias_s(radio, link.power_dbm, link.total_dbm)
-        late_s = late_s + noise[1] * reception_noise_s(radio, link.power_dbm)
-        way = link.distance_m + link.excess_m + excess_m
-        arrival = departure + np.rint(way / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND).astype(np.int64)
-        stamp = reception(self.clocks, self._all, arrival, late_s, self._delays[:, 1])
-        rate = self.clocks.rate(self._all, np.full(count, departure))
-        power = printed_power_dbm(radio, link.power_dbm, noise[2])
-        skew = printed_skew_ppm(radio, (rate - rate[sender]) * 1e6, noise[3])
-        return Receptions(link.power_dbm, heard, stamp, power, skew)
+        arrives = chance.random(count) >= self.lost_share
+        received = self.medium.receive(frames, noise[1], excess_m)
+        power_dbm = received.link.power_dbm
+        printed_dbm, skew_ppm = self.medium.readings(frames, power_dbm, noise[2], noise[3])
+        heard = self.medium.heard(power_dbm, noise[0]) & arrives
+        return Receptions(power_dbm, heard, received.stamp, printed_dbm, skew_ppm)
 
     def _one(self, board: int) -> Ints:
         return np.array([self.place[board]])

@@ -15,8 +15,9 @@ from uwblink.twr import PROTOCOLS, RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.timestamps import Draws, Stamped, draw_reply_s, stamp
+from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw_reply_s, stamp
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.reception import Medium
 from uwbsim.world.world import World
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
@@ -78,13 +79,13 @@ def timing(scenario: Scenario, name: str) -> Figure:
     lanes = {"initiator": 1.0, "target": 0.0}
     lengths = message_bytes(protocol)
     symbols = scenario.radio.preamble_symbols
-    start = stamped.departure[0][0]
+    start = stamped.frames[0].departure[0]
     figure = Figure(figsize=(11, 2.6), layout="constrained")
     axes = figure.subplots()
     for level in lanes.values():
         axes.axhline(level, color="0.6", lw=1)
     for k, message in enumerate(protocol.messages):
-        at_us = (stamped.departure[k][0] - start) / SUBTICKS_PER_SECOND * 1e6
+        at_us = (stamped.frames[k].departure[0] - start) / SUBTICKS_PER_SECOND * 1e6
         y = lanes[message.sender]
         other = 1.0 - y
         begin, length = at_us - before_marker_s(symbols) * 1e6, after_marker_s(lengths[k]) * 1e6
@@ -130,7 +131,7 @@ def _spans(protocol: RangingProtocol) -> list[tuple[str, str, str, str]]:
 
 
 def _marker(stamped: Stamped, which: str) -> int:
-    return int(stamped.departure[int(which[-1]) - 1][0])
+    return int(stamped.frames[int(which[-1]) - 1].departure[0])
 
 
 def _one_exchange(scenario: Scenario, protocol: RangingProtocol) -> tuple[Stamped, tuple[int, int]]:
@@ -140,6 +141,10 @@ def _one_exchange(scenario: Scenario, protocol: RangingProtocol) -> tuple[Stampe
     zeros = np.zeros((count, 1))
     reply = stream(scenario.run.seed, "timing diagram")
     draws = Draws(zeros, zeros, draw_reply_s(scenario, reply, 1), np.zeros(1))
-    i, j = np.array([place[first]]), np.array([place[second]])
-    at = np.array([SUBTICKS_PER_SECOND // 100])
-    return stamp(scenario, protocol, World.of(scenario), Clocks.of(scenario), at, i, j, draws), (first, second)
+    begun = Begun(
+        start=np.array([SUBTICKS_PER_SECOND // 100]),
+        initiator=np.array([place[first]]),
+        target=np.array([place[second]]),
+    )
+    medium = Medium(scenario, World.of(scenario), Clocks.of(scenario))
+    return stamp(medium, protocol, begun, draws), (first, second)

@@ -15,7 +15,7 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.schedule import schedule
 from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
-from uwbsim.world.radio import reception_bias_s, reception_noise_s
+from uwbsim.world.reception import arrive
 from uwbsim.world.world import World
 
 STATES: Final = 16_384
@@ -98,18 +98,18 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     world, clocks, radio = World.of(scenario), Clocks.of(scenario), scenario.radio
     link = world.link(i, j, start)
     later = world.link(i, j, start + round(STEP_S * SUBTICKS_PER_SECOND))
-    path = link.distance_m + link.excess_m
+    arrival = arrive(radio, link)
     delays = np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9
     nothing = np.zeros(len(rows))
     return Conditions(
-        flight=path / SPEED_OF_LIGHT,
+        flight=arrival.flight_s,
         flight_rate=(later.distance_m - link.distance_m) / STEP_S / SPEED_OF_LIGHT,
         rate_initiator=clocks.rate(i, start),
         rate_target=clocks.rate(j, start),
         drift_initiator=nothing,
         drift_target=nothing,
-        late=reception_bias_s(radio, link.power_dbm, link.total_dbm),
-        rx_std=reception_noise_s(radio, link.power_dbm),
+        late=arrival.bias_s,
+        rx_std=arrival.std_s,
         tx_std=np.full(len(rows), radio.tx_noise_ps * 1e-12),
         tx_delay_initiator=delays[i, 0],
         rx_delay_initiator=delays[i, 1],

@@ -24,10 +24,11 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.simulation import air
 from uwbsim.simulation.overhearing import overhear, responses
 from uwbsim.simulation.schedule import Schedule, schedule
-from uwbsim.simulation.timestamps import Draws, Stamped, draw, stamp
+from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw, stamp
+from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
 from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.lookahead import SampledWorld
-from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm
+from uwbsim.world.reception import Medium
 from uwbsim.world.world import World
 
 
@@ -99,7 +100,7 @@ class _Run:
     scenario: Scenario
     protocol: RangingProtocol
     world: World
-    clocks: Clocks
+    medium: Medium
 
 
 def simulate(
@@ -131,7 +132,8 @@ def simulate(
     if scenario.run.duration_s > LONGEST_RUN_S:
         raise ScenarioError(f"run.duration_s: at most {LONGEST_RUN_S:g} (36 h)")
     protocol = PROTOCOLS[scenario.ranging.protocol]
-    run = _Run(scenario, protocol, World.of(scenario), Clocks.of(scenario))
+    world = World.of(scenario)
+    run = _Run(scenario, protocol, world, Medium(scenario, world, Clocks.of(scenario)))
     plan = schedule(scenario)
     draws = draw(scenario, len(plan.start), len(protocol.messages))
     if contention:
@@ -142,17 +144,15 @@ def simulate(
     lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
-    rows = (begun[kept], plan.initiator[kept], plan.target[kept])
-    stamped = stamp(scenario, protocol, run.world, run.clocks, *rows, draws[kept])
+    rows = Begun(start=begun[kept], initiator=plan.initiator[kept], target=plan.target[kept])
+    stamped = stamp(run.medium, protocol, rows, draws[kept])
     exchanges = _exchanges(run, kept, len(plan.start), rows, stamped)
     return Simulated(
         exchanges=exchanges,
         poses=run.world.motion_capture(),
         tags=[Tag(t.id, t.body, t.lever_arm_m) for t in scenario.tags],
         faults=_faults(run, begun, plan, outcomes),
-        overheard=overhear(
-            scenario, protocol, run.world, run.clocks, plan.initiator[kept], plan.target[kept], stamped, exchanges
-        ),
+        overheard=overhear(run.medium, stamped, exchanges),
         cirs=responses(scenario, run.world, protocol, exchanges, stamped) if scenario.ranging.get_cir else [],
         truth_m=(stamped.distance_m[0] + stamped.distance_m[1]) / 2,
         meta=_provenance(scenario),
@@ -199,7 +199,7 @@ def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
     """Give the event loop what it needs, as plain integers, a list a host: it does no arithmetic of its own."""
     scenario, messages = run.scenario, run.protocol.messages
     power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
-    heard = _heard(scenario, power, len(messages))
+    heard = _heard(run, power)
     scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
     at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
     delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in messages]
@@ -222,7 +222,7 @@ def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
 def _undisturbed(run: _Run, plan: Schedule) -> air.Outcomes:
     """What becomes of exchanges that do not meet: only a message too weak to be heard is lost."""
     power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
-    heard = _heard(run.scenario, power, len(run.protocol.messages))
+    heard = _heard(run, power)
     lost = np.where(heard.all(axis=0), -1, np.argmin(heard, axis=0))
     marker = round(before_marker_s(run.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
     reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
@@ -253,24 +253,23 @@ def _rules(scenario: Scenario) -> air.Rules:
     return air.Rules(radio.sensitivity_dbm, radio.capture_db, radio.preamble_symbols)
 
 
-def _heard(scenario: Scenario, power_dbm: Floats, messages: int) -> Bools:
+def _heard(run: _Run, power_dbm: Floats) -> Bools:
     """Whether each message (messages, n) is received; a little fading makes the edge soft."""
-    fading = stream(scenario.run.seed, "fading").normal(size=(messages, len(power_dbm)))
-    level = power_dbm + fading * scenario.radio.power_noise_db
-    return level >= scenario.radio.sensitivity_dbm
+    shape = (len(run.protocol.messages), len(power_dbm))
+    return run.medium.heard(power_dbm, stream(run.scenario.run.seed, "fading").normal(size=shape))
 
 
-def _exchanges(run: _Run, kept: Ints, planned: int, rows: tuple[Ints, Ints, Ints], stamped: Stamped) -> Exchanges:
-    _, initiator, target = rows
+def _exchanges(run: _Run, kept: Ints, planned: int, rows: Begun, stamped: Stamped) -> Exchanges:
+    initiator, target = rows.initiator, rows.target
     ids = np.array([tag.id for tag in run.scenario.tags], dtype=np.int64)
     mask = (1 << REPORT_BITS) - 1
     none = np.zeros(len(kept), dtype=np.int64)
     stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & mask for name in STAMPS}
-    fpp1, skew1 = _readings(run, 1, kept, planned, (initiator, target), stamped)
-    fpp2, skew2 = _readings(run, 2, kept, planned, (target, initiator), stamped)
+    fpp1, skew1 = _readings(run, 1, kept, planned, stamped)
+    fpp2, skew2 = _readings(run, 2, kept, planned, stamped)
     nan = np.full(len(kept), np.nan)
     exchanges = Exchanges(
-        time_ns=np.rint(stamped.departure[0] * (1e9 / SUBTICKS_PER_SECOND)).astype(np.int64),
+        time_ns=np.rint(stamped.frames[0].departure * (1e9 / SUBTICKS_PER_SECOND)).astype(np.int64),
         initiator=ids[initiator],
         target=ids[target],
         protocol=np.full(len(kept), run.protocol.name),
@@ -288,20 +287,12 @@ def _exchanges(run: _Run, kept: Ints, planned: int, rows: tuple[Ints, Ints, Ints
     return replace(exchanges, range_m=printed(exchanges))
 
 
-def _readings(
-    run: _Run, number: int, kept: Ints, planned: int, ends: tuple[Ints, Ints], stamped: Stamped
-) -> tuple[Floats, Floats]:
+def _readings(run: _Run, number: int, kept: Ints, planned: int, stamped: Stamped) -> tuple[Floats, Floats]:
     """What the receiver of message `number` prints: first-path power and relative skew."""
-    radio, seed = run.scenario.radio, run.scenario.run.seed
-    sender, receiver = ends
-    time = stamped.departure[number - 1]
+    seed = run.scenario.run.seed
     power_noise = stream(seed, "power reading", number).normal(size=planned)[kept]
     skew_noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
-    skew = (run.clocks.rate(receiver, time) - run.clocks.rate(sender, time)) * 1e6
-    return (
-        printed_power_dbm(radio, stamped.power_dbm[number - 1], power_noise),
-        printed_skew_ppm(radio, skew, skew_noise),
-    )
+    return run.medium.readings(stamped.frames[number - 1], stamped.power_dbm[number - 1], power_noise, skew_noise)
 
 
 def _faults(run: _Run, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
@@ -324,10 +315,12 @@ def _faults(run: _Run, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> l
 
 
 def _provenance(scenario: Scenario) -> dict[str, Any]:
+    # A scenario's text does not say what strangers added to the channel, and the flight cannot be repeated without.
+    added = [name for name in CHANNEL_EFFECTS if name not in OWN_EFFECTS]
     return {
         "source": "simulation",
         "scenario": scenario.model_dump(mode="json"),
         "scenario_name": scenario.run.name,
         "seed": scenario.run.seed,
         "planted": scenario.planted(),
-    }
+    } | ({"channel_effects": added} if added else {})

@@ -7,7 +7,7 @@ arrive, and which integers do the two boards write down.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -15,26 +15,16 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import (
     ANTENNA_DELAY_TICKS,
     DELAYED_TX_GRID,
-    SPEED_OF_LIGHT,
     TICK_S,
     UUS_TICKS,
 )
 from uwblink.twr import ProtocolMessage, RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
-from uwbsim.world.propagation import Link
-from uwbsim.world.radio import reception_bias_s, reception_noise_s
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND
+from uwbsim.world.reception import Frames, Medium
 
 GRID: Final = DELAYED_TX_GRID
-
-
-class Links(Protocol):
-    """What knows how far apart tags are and how strongly they hear each other: a `World`, or `SampledWorld` of one."""
-
-    def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
-        """Return what reaches one tag from another (n,) at true times (n,)."""
-        ...
 
 
 @dataclass(slots=True)
@@ -55,12 +45,24 @@ class Draws:
         return Draws(self.transmit[:, rows], self.receive[:, rows], self.reply_s[rows], self.excess_m[rows])
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Begun:
+    """Exchanges that begin: true times in sub-ticks, and the places of the tags, (n,) each."""
+
+    start: Ints
+    initiator: Ints
+    target: Ints
+
+
 @dataclass(slots=True)
 class Stamped:
-    """Stamps in whole ticks, not wrapped, and what the messages met on their way, shape (n,)."""
+    """Stamps in whole ticks, not wrapped, and what the messages met on their way, (n,) each; one list item a message.
+
+    `frames` are the messages with their senders, receivers and departures.
+    """
 
     stamps: dict[str, Ints]
-    departure: list[Ints]
+    frames: list[Frames]
     distance_m: list[Floats]
     power_dbm: list[Floats]
 
@@ -99,55 +101,33 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
     return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * 1e-6)
 
 
-def stamp(  # noqa: PLR0913 - the columns of one flight
-    scenario: Scenario,
-    protocol: RangingProtocol,
-    world: Links,
-    clocks: Clocks,
-    start: Ints,
-    initiator: Ints,
-    target: Ints,
-    draws: Draws,
-    response_delay_uus: int | None = None,
+def stamp(
+    medium: Medium, protocol: RangingProtocol, begun: Begun, draws: Draws, response_delay_uus: int | None = None
 ) -> Stamped:
-    """Execute exchanges that start at true times `start` (n,) between tags given by their places.
-
-    `response_delay_uus` replaces the scenario's.
-    """
+    """Execute exchanges (n,), message after message; `response_delay_uus` replaces the scenario's."""
+    scenario, clocks = medium.scenario, medium.clocks
     delay_uus = scenario.ranging.response_delay_uus if response_delay_uus is None else response_delay_uus
-    radio = scenario.radio
-    delays = np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9 * SUBTICKS_PER_SECOND
-    excess = draws.excess_m / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
+    delays = medium.delays()
     result = Stamped({}, [], [], [])
-    ready = clocks.read(initiator, start)
+    ready = clocks.read(begun.initiator, begun.start)
     for k, message in enumerate(protocol.messages):
-        sender, receiver = (initiator, target) if message.sender == "initiator" else (target, initiator)
+        ends = (begun.initiator, begun.target)
+        sender, receiver = ends if message.sender == "initiator" else ends[::-1]
         if message.after:
             reference = result.stamps[message.after]
             printed = _transmission(message, reference, draws.reply_s, delay_uus)
         else:
             printed = _next_grid(-(-ready // SUBTICKS)) + ANTENNA_DELAY_TICKS
-        jitter = draws.transmit[k] * radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
+        jitter = draws.transmit[k] * scenario.radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
         left = np.rint(jitter - delays[sender, 0]).astype(np.int64) + printed * SUBTICKS
-        departure = clocks.when(sender, left)
-        link = world.link(initiator, target, departure)
-        power = link.power_dbm
-        flight = np.rint((link.distance_m + link.excess_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND + excess)
-        late_s = reception_bias_s(radio, power, link.total_dbm)
-        late_s = late_s + draws.receive[k] * reception_noise_s(radio, power)
-        arrival = departure + flight.astype(np.int64)
+        frames = Frames(sender=sender, receiver=receiver, departure=clocks.when(sender, left))
+        received = medium.receive(frames, draws.receive[k], draws.excess_m)
         result.stamps[f"tx{k + 1}"] = printed
-        result.stamps[f"rx{k + 1}"] = reception(clocks, receiver, arrival, late_s, delays[receiver, 1])
-        result.departure.append(departure)
-        result.distance_m.append(link.distance_m)
-        result.power_dbm.append(power)
+        result.stamps[f"rx{k + 1}"] = received.stamp
+        result.frames.append(frames)
+        result.distance_m.append(received.link.distance_m)
+        result.power_dbm.append(received.link.power_dbm)
     return result
-
-
-def reception(clocks: Clocks, receiver: Ints, arrival: Ints, late_s: Floats, delay_subticks: Floats) -> Ints:
-    """Return the stamps in whole ticks of frames that reach antennas at true times `arrival` (n,)."""
-    shift = np.rint(late_s * SUBTICKS_PER_SECOND + delay_subticks).astype(np.int64)
-    return (clocks.read(receiver, arrival) + shift + SUBTICKS // 2) // SUBTICKS
 
 
 def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, delay_uus: int) -> Ints:

@@ -15,9 +15,10 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
+from uwbsim.world.channel import Ends, PlacedShadow, link_between
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
-from uwbsim.world.propagation import Link, ellipsoid_chord_m, first_path, reflected_lengths_m, through
-from uwbsim.world.radio import gain_db, path_gain_db, shadowing_phases
+from uwbsim.world.propagation import Link, reflected_lengths_m
+from uwbsim.world.radio import path_gain_db, shadowing_phases
 from uwbsim.world.trajectories import Trajectory, sample
 
 SEPARATION_STEP_S: Final = 0.05
@@ -52,17 +53,6 @@ class World:
             columns[:, rows] = found.distance_m, found.excess_m, found.power_dbm, found.total_dbm
         return Link(*columns)
 
-    def between(self, i: int, j: int, spots: tuple[Floats, Floats], turns: tuple[Floats, Floats]) -> Link:
-        """Return the link of two tags at known places (n, 3) with known rotations body to world (n, 3, 3)."""
-        radio = self.scenario.radio
-        apart = spots[1] - spots[0]
-        distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
-        towards = apart / np.maximum(distance, 1e-9)[:, None]
-        gain = np.zeros(len(distance))
-        for k, turn, sign in ((i, turns[0], 1.0), (j, turns[1], -1.0)):
-            gain = gain + gain_db(radio, self.phases[k], np.einsum("ni,nij->nj", sign * towards, turn))
-        return self.surroundings(distance, gain, spots)
-
     def echoes(self, sender: int, receiver: int, time: int) -> list[tuple[float, float]]:
         """Return the paths after the first at one instant: delays in seconds, amplitudes as shares of the first's."""
         room, radio = self.scenario.room, self.scenario.radio
@@ -78,46 +68,33 @@ class World:
         share = 10 ** ((power - direct) / 20)
         return [(x / SPEED_OF_LIGHT, a) for x, a in zip(later.tolist(), share.tolist(), strict=True) if x > 0.01]
 
-    def surroundings(self, distance: Floats, gain: Floats, spots: tuple[Floats, Floats]) -> Link:
-        """Return the link over a distance with known antenna gains, obstacles and reflections included."""
-        scenario, radio = self.scenario, self.scenario.radio
-        power = path_gain_db(radio, distance) + gain
-        link = Link(distance, np.zeros_like(distance), power, power)
-        if scenario.obstacles:
-            loss, excess = through(scenario.obstacles, *spots)
-            link = Link(distance, excess, power - loss, power - loss)
-        room = scenario.room
-        if room is None or room.reflection_loss_db is None:
-            return link
-        lengths = reflected_lengths_m(room, *spots)
-        echoes = path_gain_db(radio, lengths) + gain[:, None] - room.reflection_loss_db
-        return first_path(link, lengths, echoes, radio.dynamic_range_db)
-
     def _pair(self, i: int, j: int, time_s: Floats) -> Link:
-        spots, turns = zip(*(self._tag(k, time_s) for k in (i, j)), strict=True)
-        link = self.between(i, j, spots, turns)
-        loss = self._shadows_db(time_s, spots)
-        return link if loss is None else Link(
-            link.distance_m, link.excess_m, link.power_dbm - loss, link.total_dbm - loss
-        )  # fmt: skip
+        (one, turn), (other, turned) = (self._tag(k, time_s) for k in (i, j))
+        return link_between(
+            Ends(
+                scenario=self.scenario,
+                phases=self.phases,
+                time_s=time_s,
+                places=(np.full(len(time_s), i), np.full(len(time_s), j)),
+                antennas_m=(one, other),
+                rotations=(turn, turned),
+                shadows=self._shadows(time_s),
+            )
+        )
 
-    def _shadows_db(self, time_s: Floats, spots: tuple[Floats, Floats]) -> Floats | None:
-        """Loss by the bodies that stand in the way, None where no body has a shadow."""
-        loss = None
-        for body in self.scenario.bodies:
-            if body.shadow is None:
-                continue
-            trajectory = self.trajectories[body.name]
-            place, back = trajectory.position_m(time_s), Rotation.from_quat(trajectory.quaternion(time_s)).inv()
-            ends = [back.apply(spot - place) for spot in spots]
-            chord = ellipsoid_chord_m(body.shadow, *ends) * body.shadow.loss_db_per_m
-            loss = chord if loss is None else loss + chord
-        return loss
+    def _shadows(self, time_s: Floats) -> list[PlacedShadow]:
+        """Place the bodies that have a shadow."""
+        return [
+            PlacedShadow(shadow=body.shadow, position_m=path.position_m(time_s), rotation=_matrices(path, time_s))
+            for body in self.scenario.bodies
+            for path in [self.trajectories[body.name]]
+            if body.shadow is not None
+        ]
 
     def _tag(self, index: int, time_s: Floats) -> tuple[Floats, Floats]:
         tag = self.scenario.tags[index]
         body = self.trajectories[tag.body]
-        turn = np.asarray(Rotation.from_quat(body.quaternion(time_s)).as_matrix())
+        turn = _matrices(body, time_s)
         return body.position_m(time_s) + turn @ np.array(tag.lever_arm_m), turn
 
     def motion_capture(self) -> Poses:
@@ -156,6 +133,11 @@ class World:
         position = body.position_m(time_s) + rng.normal(0, 1, (len(time_s), 3)) * mocap.position_noise_m
         wobble = Rotation.from_rotvec(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
         return position, (Rotation.from_quat(body.quaternion(time_s)) * wobble).as_quat()
+
+
+def _matrices(path: Trajectory, time_s: Floats) -> Floats:
+    """Return rotations body to world, (n, 3, 3)."""
+    return np.asarray(Rotation.from_quat(path.quaternion(time_s)).as_matrix())
 
 
 def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:

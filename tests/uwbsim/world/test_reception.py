@@ -1,0 +1,155 @@
+"""One reception for all: what happens to waves shows in flights, served boards, listeners and the workbench alike."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import uwbsim
+from uwblink import PROTOCOLS, Board, raw_range
+from uwblink.ticks import METRES_PER_TICK
+from uwblink.wire.codec import Decoder
+from uwblink.wire.messages import REPORTS, Overheard
+from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.prediction import predict
+from uwbsim.world.channel import CHANNEL_EFFECTS
+
+PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8), "post": (2.0, 0.25, 1.1)}
+# Wide enough that the delayed transmissions of the firmware, 512 ticks apart, shift by whole steps.
+TICKS, LOSS_DB = 512, 3.0
+TAG_OF_LOSS = 2
+
+
+def scenario(**more):
+    """Two tags that range and one that listens, nothing moves; the power readings have no noise."""
+    shadow = {"semi_axes_m": [0.3, 0.3, 1.0], "loss_db_per_m": 20.0}
+    return uwbsim.load(
+        {
+            "run": {"duration_s": 1.0, "seed": 4},
+            "ranging": {"rate_hz": 20.0, "pairs": [[1, 2]]},
+            "radio": {"quantize": False, "first_path_at_1m_dbm": -75.0, "skew_noise_ppm": 0.0, "antenna": "dipole"},
+            "room": {"min_m": [-2.0, -2.0, 0.0], "max_m": [6.0, 5.0, 3.0], "reflection_loss_db": 8.0},
+            "obstacles": [{"min_m": [0.9, -1.0, 0.0], "max_m": [1.1, 4.0, 2.5], "material": "drywall"}],
+            "bodies": [
+                {"name": name, "motion": {"model": "static", "position_m": place}}
+                | ({"shadow": shadow} if name == "post" else {})
+                for name, place in PLACES.items()
+            ],
+            "tags": [{"id": k + 1, "body": name, "passive": k == 2} for k, name in enumerate("abc")],
+        },
+        more,
+    )
+
+
+def served(world):
+    """Range once; return what the initiator and the listener print."""
+    ports = uwbsim.VirtualPorts(world)
+    Board(ports.port(3)).set_passive(True)
+    report = Board(ports.port(1)).range(2)
+    ports.bench.advance(int(ports.bench.env.now) + 50_000_000)
+    heard = b"".join(data for _, tag, data in ports.transfers if tag == 3)
+    (overheard,) = (event for event in Decoder(REPORTS).feed(heard) if isinstance(event, Overheard))
+    return report, overheard
+
+
+@pytest.fixture
+def louder():
+    """A stranger's effect: what reaches or leaves one tag is weaker, and late by a whole step of the boards' grid."""
+
+    def effect(link, ends):
+        hit = (np.array(ends.tags()) == TAG_OF_LOSS).any(axis=0)
+        loss, way = LOSS_DB * hit, TICKS * METRES_PER_TICK * hit
+        return replace(
+            link,
+            excess_m=link.excess_m + way,
+            power_dbm=link.power_dbm - loss,
+            total_dbm=link.total_dbm - loss,
+        )
+
+    uwbsim.register_channel_effect("louder", effect)
+    yield
+    del CHANNEL_EFFECTS["louder"]
+
+
+@pytest.fixture
+def without():
+    """The same world without the effect, by all four ways."""
+    world = scenario()
+    return uwbsim.simulate(world), served(world), conditions_of(world)
+
+
+def test_a_strangers_effect_shows_in_flights_draw_for_draw(without, louder):
+    before, after = without[0], uwbsim.simulate(scenario())
+    for name in ("fpp1_dbm", "fpp2_dbm"):
+        drop = getattr(before.exchanges, name) - getattr(after.exchanges, name)
+        np.testing.assert_allclose(drop, LOSS_DB, atol=1e-9)
+    # Stamps are whole ticks, and the flight is rounded to sub-ticks: the same draws give the same range, but for one.
+    longer = raw_range(after.exchanges) - raw_range(before.exchanges)
+    np.testing.assert_allclose(longer, TICKS * METRES_PER_TICK, atol=1.01 * METRES_PER_TICK)
+    assert after.meta["channel_effects"] == ["louder"]
+    assert "channel_effects" not in before.meta
+
+
+def test_it_shows_in_what_listeners_overhear(without, louder):
+    before, after = without[0].overheard, uwbsim.simulate(scenario()).overheard
+    np.testing.assert_allclose(before["fpp1_dbm"], after["fpp1_dbm"], atol=1e-9)
+    np.testing.assert_allclose(before["fpp2_dbm"] - after["fpp2_dbm"], LOSS_DB, atol=1e-9)
+    # The response leaves later by the poll's way more, and is on its way longer by as much.
+    shift = (after["rx2"] - after["rx1"]) - (before["rx2"] - before["rx1"])
+    np.testing.assert_allclose(shift, 2 * TICKS, atol=1)
+
+
+def test_it_shows_in_served_boards_and_their_listeners(without, louder):
+    (before, heard_before), (after, heard_after) = without[1], served(scenario())
+    for name in ("fpp1_dbm", "fpp2_dbm"):
+        assert getattr(before, name) - getattr(after, name) == pytest.approx(LOSS_DB, abs=2e-4), "four decimals"
+    assert after.range_m - before.range_m == pytest.approx(TICKS * METRES_PER_TICK, abs=2 * METRES_PER_TICK)
+    assert heard_before.fpp1_dbm == heard_after.fpp1_dbm
+    assert heard_before.fpp2_dbm - heard_after.fpp2_dbm == pytest.approx(LOSS_DB, abs=2e-4)
+
+
+def test_it_shows_in_the_workbench_draw_for_draw(without, louder):
+    before, after = without[2], conditions_of(scenario())
+    np.testing.assert_allclose(before.power_dbm - after.power_dbm, LOSS_DB, atol=1e-9)
+    ranged, predicted = [], []
+    for conditions in (before, after):
+        ranged.append(range_errors_m(PROTOCOLS["ds"], conditions, 1, 500) + conditions.distance_m[0])
+        predicted.append(predict(PROTOCOLS["ds"], conditions).mean_m[0] + conditions.distance_m[0])
+    np.testing.assert_allclose(ranged[1] - ranged[0], TICKS * METRES_PER_TICK, atol=1e-6)
+    assert predicted[1] - predicted[0] == pytest.approx(TICKS * METRES_PER_TICK, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "more", [{}, {"obstacles": []}, {"room.reflection_loss_db": None}, {"bodies.3.shadow": None}], ids=str
+)
+def test_flights_boards_listeners_and_workbench_agree_on_every_power(more):
+    """Each part of the world is taken away in turn, so that none of the four can leave it out."""
+    world = scenario(**more)
+    flight, (report, overheard), conditions = uwbsim.simulate(world), served(world), conditions_of(world)
+    power = flight.exchanges.fpp1_dbm[0]
+    np.testing.assert_allclose(flight.exchanges.fpp1_dbm, power, atol=1e-9)
+    np.testing.assert_allclose(conditions.power_dbm, power, atol=1e-9)
+    assert report.fpp1_dbm == pytest.approx(power, abs=2e-4)
+    assert overheard.fpp1_dbm == pytest.approx(flight.overheard["fpp1_dbm"][0], abs=2e-4)
+    if more:
+        whole = uwbsim.simulate(scenario()).exchanges.fpp1_dbm[0]
+        assert power - whole > 0.5 or more == {"room.reflection_loss_db": None}
+
+
+def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
+    powers = [
+        served(scenario(**more))[0].fpp1_dbm for more in ({"room": None}, {"room": None, "bodies.3.shadow": None})
+    ]
+    # Through an ellipsoid whose height hardly matters: twice its half axis, 20 dB a metre.
+    assert powers[1] - powers[0] == pytest.approx(20.0 * 0.6, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "fragment"),
+    [("shadows", lambda link, _: link, "name: found 'shadows', which is taken"), ("x", 3, "effect: found 3, expected")],
+)
+def test_effects_that_cannot_be_are_refused(name, effect, fragment):
+    with pytest.raises(uwbsim.ParameterError, match=fragment):
+        uwbsim.register_channel_effect(name, effect)
+    assert "x" not in CHANNEL_EFFECTS

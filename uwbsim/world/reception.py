@@ -1,0 +1,101 @@
+"""How a frame is received: when it arrives, what its receiver stamps, hears and prints.
+
+Flight loop, served boards and passive listeners call `Medium.receive`; the protocol workbench, which needs the
+distribution and no draw of it, calls `arrive`, on which `receive` is built.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.radio import Radio
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.propagation import Link
+from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
+
+
+class Links(Protocol):
+    """What knows how far apart tags are and how strongly they hear each other: a `World`, or `SampledWorld` of one."""
+
+    def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
+        """Return what reaches one tag from another (n,) at true times (n,)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arrival:
+    """How n frames arrive apart from chance: seconds of flight, and bias and noise of their stamps, (n,) each."""
+
+    flight_s: Floats
+    bias_s: Floats
+    std_s: Floats
+
+
+def arrive(radio: Radio, link: Link) -> Arrival:
+    """Return what a link does to the stamps of frames that take it."""
+    return Arrival(
+        flight_s=(link.distance_m + link.excess_m) / SPEED_OF_LIGHT,
+        bias_s=reception_bias_s(radio, link.power_dbm, link.total_dbm),
+        std_s=reception_noise_s(radio, link.power_dbm),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frames:
+    """n frames on the air: places of their senders and receivers, and true sub-ticks at which they leave, (n,) each."""
+
+    sender: Ints
+    receiver: Ints
+    departure: Ints
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reception:
+    """How n frames are received: stamps in whole ticks of the receivers' clocks, not wrapped, and the links taken."""
+
+    stamp: Ints
+    link: Link
+
+
+@dataclass(frozen=True, slots=True)
+class Medium:
+    """Everything a frame goes through: the links and the clocks of a scenario."""
+
+    scenario: Scenario
+    links: Links
+    clocks: Clocks
+
+    def receive(self, frames: Frames, noise: Floats, detour_m: Floats | float = 0.0) -> Reception:
+        """Receive frames (n,); `noise` is standard normal, (n,), `detour_m` how much further they travel by chance."""
+        link = self.links.link(frames.sender, frames.receiver, frames.departure)
+        arrival = arrive(self.scenario.radio, link)
+        detour = np.asarray(detour_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
+        flight = np.rint(arrival.flight_s * SUBTICKS_PER_SECOND + detour).astype(np.int64)
+        late_s = arrival.bias_s + noise * arrival.std_s
+        delay = self.delays()[frames.receiver, 1]
+        shift = np.rint(late_s * SUBTICKS_PER_SECOND + delay).astype(np.int64)
+        reading = self.clocks.read(frames.receiver, frames.departure + flight)
+        return Reception(stamp=(reading + shift + SUBTICKS // 2) // SUBTICKS, link=link)
+
+    def delays(self) -> Floats:
+        """Return what every tag's antenna adds to transmit and to receive stamps, in sub-ticks, (tags, 2)."""
+        return np.array([tag.delays_ns() for tag in self.scenario.tags]) * 1e-9 * SUBTICKS_PER_SECOND
+
+    def heard(self, power_dbm: Floats, fading: Floats | float = 0.0) -> Bools:
+        """Say which frames are strong enough; `fading` is standard normal, and makes the edge soft."""
+        radio = self.scenario.radio
+        return np.asarray(power_dbm + fading * radio.power_noise_db >= radio.sensitivity_dbm)
+
+    def readings(
+        self, frames: Frames, power_dbm: Floats, power_noise: Floats, skew_noise: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return first-path power in dBm and relative skew in ppm as receivers print them; noises standard normal."""
+        radio, clocks, time = self.scenario.radio, self.clocks, frames.departure
+        skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * 1e6
+        return printed_power_dbm(radio, power_dbm, power_noise), printed_skew_ppm(radio, skew, skew_noise)
