@@ -124,7 +124,7 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
     symbols = scenario.radio.preamble_symbols
     scheduled = scheduled_s or scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S
     reply = scenario.ranging.reply
-    at_once = reply.delay_us * 1e-6 if reply.model == "fixed" else MEDIAN_REPLY_S
+    at_once = reply.delay_s if reply.model == "fixed" else MEDIAN_REPLY_S
     lengths = message_bytes(protocol)
     marker, end = 0.0, after_marker_s(lengths[0])
     radio = 2 * frame_s(lengths[0], symbols)

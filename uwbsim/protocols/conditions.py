@@ -99,7 +99,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     link = world.link(i, j, start)
     later = world.link(i, j, start + round(STEP_S * SUBTICKS_PER_SECOND))
     arrival = arrive(radio, link)
-    delays = np.array([tag.delays_ns() for tag in scenario.tags]) * 1e-9
+    delays = np.array([tag.antenna_delays_s for tag in scenario.tags])
     nothing = np.zeros(len(rows))
     return Conditions(
         flight=arrival.flight_s,
@@ -110,7 +110,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         drift_target=nothing,
         late=arrival.bias_s,
         rx_std=arrival.std_s,
-        tx_std=np.full(len(rows), radio.tx_noise_ps * 1e-12),
+        tx_std=np.full(len(rows), radio.tx_noise_s),
         tx_delay_initiator=delays[i, 0],
         rx_delay_initiator=delays[i, 1],
         tx_delay_target=delays[j, 0],

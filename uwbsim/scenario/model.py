@@ -1,4 +1,4 @@
-"""The scenario: what a TOML file may say, validated. Units are in the key names and leave here.
+"""The scenario: what a TOML file may say, validated. Units are in the key names, and leave here as SI properties.
 
 `uwbsim.scenario.loading.load` turns every mistake into one `ScenarioError` line; the models here and in `radio` and
 `motion` are the whole schema.
@@ -17,6 +17,7 @@ from uwbsim.scenario.airtime import exchange_air_s
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints
 from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline
+from uwbsim.units import MS, NS, PPM, US
 
 ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
 PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
@@ -48,6 +49,11 @@ class FixedReply(Section):
 
     model: Literal["fixed"]
     delay_us: Annotated[float, Field(ge=180, le=6000)]
+
+    @property
+    def delay_s(self) -> float:
+        """Return the latency in seconds."""
+        return self.delay_us * US
 
 
 class PlanFile(Section):
@@ -90,6 +96,16 @@ class Ranging(Section):
             )
         return self
 
+    @property
+    def sync_error_s(self) -> float:
+        """Return the standard deviation of hosts' clocks in seconds."""
+        return self.sync_error_ms * MS
+
+    @property
+    def list_timeout_s(self) -> float:
+        """Return in seconds how long a robot waits for an exchange that it cannot hear."""
+        return self.list_timeout_ms * MS
+
     def fastest_hz(self) -> float:
         """Return how many exchanges a second one after the other allow."""
         scheduled = sum(message.timing == "scheduled" for message in PROTOCOLS[self.protocol].messages)
@@ -112,6 +128,11 @@ class Mocap(Section):
     latency_ms: float = 0.0
     gaps_per_min: NotNegative = 0.0
     gap_s: Positive = 0.5
+
+    @property
+    def latency_s(self) -> float:
+        """Return in seconds how late its times are."""
+        return self.latency_ms * MS
 
 
 class Body(Section):
@@ -151,8 +172,34 @@ class Tag(Section):
             raise ValueError("delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
         return self
 
+    @property
+    def antenna_delays_s(self) -> tuple[float, float]:
+        """Return what the antenna adds to a transmit and to a receive stamp, in seconds."""
+        transmit, receive = self.delays_ns()
+        return transmit * NS, receive * NS
+
+    @property
+    def skew(self) -> float:
+        """Return how much faster than true time the clock runs at first, as a fraction."""
+        return self.skew_ppm * PPM
+
+    @property
+    def drift_per_sqrt_s(self) -> float:
+        """Return the random walk of the clock's rate, as a fraction per root of a second."""
+        return self.drift_ppm_per_sqrt_s * PPM
+
+    @property
+    def white_sqrt_s(self) -> float:
+        """Return the white noise of the clock's rate, as a fraction times the root of a second."""
+        return self.white_ppm_sqrt_s * PPM
+
+    @property
+    def ramp_per_s(self) -> float:
+        """Return what a change of temperature adds to the clock's rate, as a fraction per second."""
+        return self.ramp_ppm_per_s * PPM
+
     def delays_ns(self) -> tuple[float, float]:
-        """Return what the antenna adds to a transmit and to a receive stamp."""
+        """Return what the antenna adds to a transmit and to a receive stamp, in nanoseconds."""
         if self.tx_delay_ns is not None and self.rx_delay_ns is not None:
             return self.tx_delay_ns, self.rx_delay_ns
         aggregate = self.delay_ns or 0.0

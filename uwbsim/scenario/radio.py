@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from uwbsim.scenario.base import NotNegative, Positive, Section, Share, Vector
 from uwbsim.scenario.published_curves import BIAS, SIGMA
+from uwbsim.units import PS
 
 MATERIALS: Final = {
     "air": (0.0, 1.0),
@@ -133,6 +134,16 @@ class Radio(Section):
     bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = None
     sigma: Annotated[SigmaSpline | None, _named(SIGMA)] = None
     multipath: Multipath | None = None
+
+    @property
+    def tx_noise_s(self) -> float:
+        """Return the standard deviation of transmissions about their stamps, in seconds."""
+        return self.tx_noise_ps * PS
+
+    @property
+    def rx_noise_s(self) -> float:
+        """Return the standard deviation of receive stamps that does not depend on power, in seconds."""
+        return self.rx_noise_ps * PS
 
 
 class Material(Section):

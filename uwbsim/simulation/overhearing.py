@@ -14,7 +14,7 @@ from uwblink.twr import Exchanges, RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.timestamps import Stamped
-from uwbsim.world.impulse_response import impulse_response
+from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import World
 
@@ -87,5 +87,5 @@ def responses(
     for time_ns, initiator, target, rx, departure in zip(*(c.tolist() for c in columns), strict=True):
         echoes = world.echoes(place[target], place[initiator], departure)
         index, taps = impulse_response(rng, rx, echoes)
-        rows.append(CirRow(time_ns, initiator, initiator, target, index / 1000, taps))
+        rows.append(CirRow(time_ns, initiator, initiator, target, index / INDEX_STEPS, taps))
     return rows

@@ -25,6 +25,7 @@ from uwbsim.simulation import air
 from uwbsim.simulation.overhearing import overhear, responses
 from uwbsim.simulation.schedule import Schedule, schedule
 from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw, stamp
+from uwbsim.units import NS_PER_S
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
 from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.lookahead import SampledWorld
@@ -239,7 +240,7 @@ def _pauses(run: _Run, plan: Schedule) -> list[int]:
     mine = plan.initiator[1:]
     other = np.flatnonzero(before != mine)
     power[other + 1] = run.world.link(before[other], mine[other], plan.start[other + 1]).power_dbm
-    timeout = round(scenario.ranging.list_timeout_ms * 1e-3 * SUBTICKS_PER_SECOND)
+    timeout = round(scenario.ranging.list_timeout_s * SUBTICKS_PER_SECOND)
     return [timeout if weak else 0 for weak in (power < scenario.radio.sensitivity_dbm).tolist()]
 
 
@@ -269,7 +270,7 @@ def _exchanges(run: _Run, kept: Ints, planned: int, rows: Begun, stamped: Stampe
     fpp2, skew2 = _readings(run, 2, kept, planned, stamped)
     nan = np.full(len(kept), np.nan)
     exchanges = Exchanges(
-        time_ns=np.rint(stamped.frames[0].departure * (1e9 / SUBTICKS_PER_SECOND)).astype(np.int64),
+        time_ns=np.rint(stamped.frames[0].departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64),
         initiator=ids[initiator],
         target=ids[target],
         protocol=np.full(len(kept), run.protocol.name),
@@ -303,7 +304,7 @@ def _faults(run: _Run, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> l
         reason = outcomes.reason[k]
         faults.append(
             Fault(
-                round(int(begun[k]) * (1e9 / SUBTICKS_PER_SECOND)),
+                round(int(begun[k]) * (NS_PER_S / SUBTICKS_PER_SECOND)),
                 str(a),
                 "lost frame" if reason == air.WEAK else reason,
                 f"{a} ranged with {b}: message {outcomes.lost[k] + 1} {reason}",

@@ -50,7 +50,7 @@ def _tdma(scenario: Scenario, pairs: Ints) -> Schedule:
     """The same turns, but every initiator has a host of its own, whose clock is off by `sync_error_ms`."""
     start, turn = _turns(scenario, pairs)
     error_s = stream(scenario.run.seed, "sync error").normal(size=len(scenario.tags))
-    late = error_s * scenario.ranging.sync_error_ms * 1e-3
+    late = error_s * scenario.ranging.sync_error_s
     return _schedule(np.maximum(start + late[turn[:, 0]], 0), turn, turn[:, 0])
 
 

@@ -15,6 +15,7 @@ from uwblink.wire.codec import encode
 from uwblink.wire.messages import RangeReport
 from uwbsim.errors import ScenarioError
 from uwbsim.simulation.run import Simulated
+from uwbsim.units import NS_PER_S
 
 
 def frames_of(simulated: Simulated) -> list[FrameRow]:
@@ -29,7 +30,7 @@ def frames_of(simulated: Simulated) -> list[FrameRow]:
             f"ranging.protocol: found {strange[0]!r}, but the boards report only {', '.join(ON_BOARDS)}"
         )
     last = np.where(e.rx3 != 0, e.rx3, e.rx2)
-    time_ns = e.time_ns + np.rint(elapsed(last, e.tx1) * (TICK_S * 1e9)).astype(np.int64)
+    time_ns = e.time_ns + np.rint(elapsed(last, e.tx1) * (TICK_S * NS_PER_S)).astype(np.int64)
     names = [name for name in RangeReport.FIELDS if name != "neighbour"]
     columns = [e.target.tolist(), *(getattr(e, name).tolist() for name in names)]
     reports = (encode(RangeReport(*row)) for row in zip(*columns, strict=True))

@@ -21,6 +21,7 @@ from uwblink.ticks import (
 from uwblink.twr import ProtocolMessage, RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
+from uwbsim.units import US
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.reception import Frames, Medium
 
@@ -91,14 +92,14 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
     """
     reply = scenario.ranging.reply
     if reply.model == "fixed":
-        return np.full(count, reply.delay_us * 1e-6)
+        return np.full(count, reply.delay_s)
     kind = rng.random(count)
     microseconds = np.select(
         [kind < 0.41, kind < 0.86, kind < 0.91],
         [rng.normal(0.6, 0.3, count), rng.normal(2.4, 0.7, count), rng.normal(4.8, 0.7, count)],
         rng.uniform(6.5, 83.0, count),
     )
-    return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * 1e-6)
+    return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * US)
 
 
 def stamp(
@@ -118,7 +119,7 @@ def stamp(
             printed = _transmission(message, reference, draws.reply_s, delay_uus)
         else:
             printed = _next_grid(-(-ready // SUBTICKS)) + ANTENNA_DELAY_TICKS
-        jitter = draws.transmit[k] * scenario.radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
+        jitter = draws.transmit[k] * scenario.radio.tx_noise_s * SUBTICKS_PER_SECOND
         left = np.rint(jitter - delays[sender, 0]).astype(np.int64) + printed * SUBTICKS
         frames = Frames(sender=sender, receiver=receiver, departure=clocks.when(sender, left))
         received = medium.receive(frames, draws.receive[k], draws.excess_m)

@@ -19,7 +19,7 @@ from uwbsim.scenario.radio import Shadow
 from uwbsim.world.propagation import Link, ellipsoid_chord_m, first_path, reflected_lengths_m, through
 from uwbsim.world.radio import gain_db, path_gain_db
 
-SHORTEST_M: Final = 1e-9
+SHORTEST_M: Final = 1e-10
 """Nearer than this two antennas have no direction."""
 
 

@@ -48,19 +48,19 @@ class Clocks:
             if tag.clock_offset_s is not None:
                 drawn = np.int64(round(tag.clock_offset_s * TICKS_PER_SECOND))
             offsets.append(drawn * SUBTICKS + rng.integers(0, SUBTICKS))
-            sigma = tag.drift_ppm_per_sqrt_s * 1e-6 * np.sqrt(WALK_STEP_S)
+            sigma = tag.drift_per_sqrt_s * np.sqrt(WALK_STEP_S)
             walk = np.concatenate([[0.0], np.cumsum(rng.normal(0, 1, steps) * sigma)])
-            ramp = tag.ramp_ppm_per_s * 1e-6 * WALK_STEP_S * np.arange(steps + 1)
+            ramp = tag.ramp_per_s * WALK_STEP_S * np.arange(steps + 1)
             rates.append(walk + ramp)
             # White noise of the rate is a random walk of the phase.
-            white = tag.white_ppm_sqrt_s * 1e-6 / np.sqrt(WALK_STEP_S)
+            white = tag.white_sqrt_s / np.sqrt(WALK_STEP_S)
             phases.append(stream(seed, "clock white", tag.id).normal(0, 1, steps) * white)
         rate = np.array(rates)
         rate[:, :-1] += np.array(phases)
         step = WALK_STEP_S * SUBTICKS_PER_SECOND
         phase = np.cumsum(rate[:, :-1] * step, axis=1)
         walk = np.concatenate([np.zeros((len(rate), 1)), phase], axis=1)
-        skew = np.array([tag.skew_ppm * 1e-6 for tag in scenario.tags])
+        skew = np.array([tag.skew for tag in scenario.tags])
         return cls(np.array(offsets, dtype=np.int64), skew, rate, walk)
 
     def read(self, tag: Ints, time: Ints) -> Ints:

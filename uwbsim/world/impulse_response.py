@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from uwblink.wire.messages import Cir
+from uwbsim.units import NS
 
 FIRST_PATH: Final = 745.0
 """Where the chip puts the first path, give or take a tap (DW1000 User Manual, 7.2.40.1)."""
@@ -19,9 +20,11 @@ PULSE_TAPS: Final = 1.2
 EDGE_TO_PEAK: Final = 1.5
 DIFFUSE: Final = 12
 TICKS_A_TAP: Final = 64
-TAP_NS: Final = 1.0016
+TAP_S: Final = 1.0016 * NS
 VALUES_A_TRANSFER: Final = 50
 HEADER_FIELDS: Final = 5
+INDEX_STEPS: Final = 1000
+"""The boards print the first path in thousandths of a tap."""
 
 
 Echo = tuple[float, float]
@@ -36,16 +39,16 @@ def impulse_response(
     With a receive `stamp` (ticks) the index has its fraction; `echoes` are known paths, besides the diffuse ones.
     """
     fraction = rng.uniform() if stamp is None else stamp % TICKS_A_TAP / TICKS_A_TAP
-    index = int(1000 * (FIRST_PATH + rng.integers(-1, 2) + fraction))
+    index = int(INDEX_STEPS * (FIRST_PATH + rng.integers(-1, 2) + fraction))
     taps = np.arange(Cir.TAPS)
     # The chip reports the leading edge; the peak of the pulse follows it.
-    peak = index / 1000 + EDGE_TO_PEAK
+    peak = index / INDEX_STEPS + EDGE_TO_PEAK
     wave = AMPLITUDE * np.exp(-(((taps - peak) / PULSE_TAPS) ** 2)) + 0j
     count = rng.poisson(DIFFUSE)
     later = rng.exponential(DECAY_TAPS, count)
     strength = 0.25 * np.exp(-later / DECAY_TAPS) * rng.rayleigh(size=count)
     paths = [*zip(later.tolist(), strength.tolist(), strict=True)]
-    paths += [(delay_s * 1e9 / TAP_NS, share) for delay_s, share in echoes or []]
+    paths += [(delay_s / TAP_S, share) for delay_s, share in echoes or []]
     for (place, share), phase in zip(paths, rng.uniform(0, 2 * np.pi, len(paths)), strict=True):
         wave += AMPLITUDE * share * np.exp(1j * phase - ((taps - peak - place) / PULSE_TAPS) ** 2)
     wave += NOISE * (rng.normal(size=Cir.TAPS) + 1j * rng.normal(size=Cir.TAPS))

@@ -102,7 +102,7 @@ def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:
 
     The curve gives the range's; a range has c sqrt(s^2/2 (1 + r + r^2)) (docs/theory.md).
     """
-    white = radio.rx_noise_ps * 1e-12
+    white = radio.rx_noise_s
     ratio = radio.sigma.reply_ratio if radio.sigma else 0.0
     factor = SPEED_OF_LIGHT * np.sqrt((1 + ratio + ratio**2) / 2)
     return np.asarray(np.hypot(white, _spline(radio.sigma, power_dbm) / factor))

@@ -15,6 +15,7 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
+from uwbsim.units import PPM_PER_ONE
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.propagation import Link
 from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
@@ -85,7 +86,7 @@ class Medium:
 
     def delays(self) -> Floats:
         """Return what every tag's antenna adds to transmit and to receive stamps, in sub-ticks, (tags, 2)."""
-        return np.array([tag.delays_ns() for tag in self.scenario.tags]) * 1e-9 * SUBTICKS_PER_SECOND
+        return np.array([tag.antenna_delays_s for tag in self.scenario.tags]) * SUBTICKS_PER_SECOND
 
     def heard(self, power_dbm: Floats, fading: Floats | float = 0.0) -> Bools:
         """Say which frames are strong enough; `fading` is standard normal, and makes the edge soft."""
@@ -97,5 +98,5 @@ class Medium:
     ) -> tuple[Floats, Floats]:
         """Return first-path power in dBm and relative skew in ppm as receivers print them; noises standard normal."""
         radio, clocks, time = self.scenario.radio, self.clocks, frames.departure
-        skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * 1e6
+        skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * PPM_PER_ONE
         return printed_power_dbm(radio, power_dbm, power_noise), printed_skew_ppm(radio, skew, skew_noise)

@@ -15,6 +15,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
+from uwbsim.units import NS, NS_PER_S
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.propagation import Link, reflected_lengths_m
@@ -102,14 +103,14 @@ class World:
         mocap, settings = self.scenario.mocap, self.scenario.run
         # A little longer than the run, so that the last exchange lies between two poses.
         count = int(np.ceil((settings.duration_s + 0.05) * mocap.rate_hz)) + 2
-        time_ns = np.rint(np.arange(count) * 1e9 / mocap.rate_hz).astype(np.int64)
+        time_ns = np.rint(np.arange(count) * NS_PER_S / mocap.rate_hz).astype(np.int64)
         parts = [
             (name, rows, *self._seen(name, time_ns))
             for name in self.trajectories
             for rows in [self._gaps(name, time_ns)]
         ]
         names = np.concatenate([np.full(np.count_nonzero(rows), name) for name, rows, _, _ in parts])
-        times = np.concatenate([time_ns[rows] for _, rows, _, _ in parts]) + round(mocap.latency_ms * 1e6)
+        times = np.concatenate([time_ns[rows] for _, rows, _, _ in parts]) + round(mocap.latency_s * NS_PER_S)
         position = np.concatenate([p[rows] for _, rows, p, _ in parts])
         quaternion = np.concatenate([q[rows] for _, rows, _, q in parts])
         order = np.argsort(times, kind="stable")
@@ -121,15 +122,15 @@ class World:
         seen = np.ones(len(time_ns), dtype=bool)
         if mocap.gaps_per_min:
             rng = stream(self.scenario.run.seed, "motion capture gaps", name)
-            duration = float(time_ns[-1]) * 1e-9
+            duration = float(time_ns[-1]) * NS
             for begin in rng.uniform(0, duration, rng.poisson(mocap.gaps_per_min * duration / 60)):
-                seen &= (time_ns < begin * 1e9) | (time_ns > (begin + mocap.gap_s) * 1e9)
+                seen &= (time_ns < begin * NS_PER_S) | (time_ns > (begin + mocap.gap_s) * NS_PER_S)
         return seen
 
     def _seen(self, name: str, time_ns: Ints) -> tuple[Floats, Floats]:
         mocap, body = self.scenario.mocap, self.trajectories[name]
         rng = stream(self.scenario.run.seed, "motion capture", name)
-        time_s = np.asarray(time_ns * 1e-9, dtype=np.float64)
+        time_s = np.asarray(time_ns * NS, dtype=np.float64)
         position = body.position_m(time_s) + rng.normal(0, 1, (len(time_s), 3)) * mocap.position_noise_m
         wobble = Rotation.from_rotvec(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
         return position, (Rotation.from_quat(body.quaternion(time_s)) * wobble).as_quat()

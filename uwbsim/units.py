@@ -1,0 +1,16 @@
+"""Units of what is stored and printed, where they meet SI: nanoseconds in recordings, parts per million on boards.
+
+What a scenario says in other units its models give in SI (`Tag.antenna_delays_s`, `Radio.rx_noise_s`), so that no
+module between these edges converts anything.
+"""
+
+from typing import Final
+
+PS: Final = 1e-12
+NS: Final = 1e-9
+US: Final = 1e-6
+MS: Final = 1e-3
+PPM: Final = 1e-6
+
+NS_PER_S: Final = 1e9
+PPM_PER_ONE: Final = 1e6
