@@ -80,7 +80,7 @@ class Simulated:
         self,
         path: str | os.PathLike[str],
         *,
-        frames: Sequence[tuple[int, str, str, bytes]] = (),
+        frames: Sequence[FrameRow] = (),
         force: bool = False,
     ) -> None:
         """Write a recording (.uwb), with the bytes of boards where there are any (`through_wire`).
