@@ -147,7 +147,7 @@ class Radios:
 
     def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
         """Return a frame that leaves at a transmit stamp of its sender's clock, and how every board receives it."""
-        jitter = self._chance.normal() * self.scenario.radio.tx_noise_ps * 1e-12 * SUBTICKS_PER_SECOND
+        jitter = self._chance.normal() * self.scenario.radio.tx_noise_s * SUBTICKS_PER_SECOND
         place = self.place[sender]
         left = stamp * SUBTICKS + round(jitter - self._delays[place, 0])
         departure = int(self.medium.clocks.when(self._one(sender), np.array([left]))[0])
