@@ -10,10 +10,11 @@ from importlib import import_module
 from typing import Any, Final, Protocol
 
 from uwbsim.errors import ParameterError
-from uwbsim.sweep.task import Task, run_chunk
+from uwbsim.sweep.extensions import Extensions
+from uwbsim.sweep.task import Result, Task, run_chunk
 
 Chunk = list[Task]
-Done = tuple[Chunk, list[tuple[int, list[dict[str, Any]]]] | None, float]
+Done = tuple[Chunk, list[Result] | None, float]
 """A chunk, its rows by number (None: its worker died), and the seconds that it took."""
 
 CONNECT_S: Final = 10
@@ -43,8 +44,9 @@ class InProcess:
 
     size = 1
 
-    def __init__(self) -> None:
+    def __init__(self, extensions: Extensions) -> None:
         """Have nothing to do."""
+        self._extensions = extensions
         self._waiting: list[Chunk] = []
 
     def submit(self, chunk: Chunk) -> None:
@@ -54,7 +56,7 @@ class InProcess:
     def finished(self) -> Sequence[Done]:
         """Do one chunk."""
         chunk = self._waiting.pop(0)
-        rows, seconds = run_chunk(chunk)
+        rows, seconds = run_chunk(chunk, self._extensions)
         return [(chunk, rows, seconds)]
 
     def close(self) -> None:
@@ -64,9 +66,10 @@ class InProcess:
 class Processes:
     """Processes of this machine; when one dies the pool is made anew, and its chunks come back as lost."""
 
-    def __init__(self, size: int) -> None:
-        """Start `size` processes."""
-        self.size = size
+    def __init__(self, size: int, extensions: Extensions) -> None:
+        """Start `size` processes; raises `ParameterError` for extensions that they could not import."""
+        extensions.check()
+        self.size, self._extensions = size, extensions
         self._pool = self._new()
         self._running: dict[Any, Chunk] = {}
 
@@ -85,10 +88,10 @@ class Processes:
         from concurrent.futures.process import BrokenProcessPool
 
         try:
-            future = self._pool.submit(run_chunk, chunk)
+            future = self._pool.submit(run_chunk, chunk, self._extensions)
         except BrokenProcessPool:
             self._pool = self._new()
-            future = self._pool.submit(run_chunk, chunk)
+            future = self._pool.submit(run_chunk, chunk, self._extensions)
         self._running[future] = chunk
 
     def finished(self) -> Sequence[Done]:
@@ -114,8 +117,10 @@ class Processes:
 class Cluster:
     """A Dask cluster by the address of its scheduler; `distributed` moves the work of a dead worker to another."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, extensions: Extensions) -> None:
         """Connect; raises `ParameterError` where nobody answers within ten seconds."""
+        extensions.check()
+        self._extensions = extensions
         try:
             self._dask: Any = import_module("distributed")
         except ImportError as error:
@@ -130,7 +135,7 @@ class Cluster:
 
     def submit(self, chunk: Chunk) -> None:
         """Take on a chunk."""
-        self._running[self._client.submit(run_chunk, chunk, pure=False)] = chunk
+        self._running[self._client.submit(run_chunk, chunk, self._extensions, pure=False)] = chunk
 
     def finished(self) -> Sequence[Done]:
         """Wait for the first chunk that is done."""
@@ -152,12 +157,12 @@ class Cluster:
         self._client.close()
 
 
-def workers_for(count: int | None, scheduler: str | None) -> Workers:
+def workers_for(count: int | None, scheduler: str | None, extensions: Extensions) -> Workers:
     """Return the workers that were asked for: a cluster by address, or processes, or this one if one is enough."""
     if scheduler:
-        return Cluster(scheduler)
+        return Cluster(scheduler, extensions)
     size = count or _cores()
-    return InProcess() if size == 1 else Processes(size)
+    return InProcess(extensions) if size == 1 else Processes(size, extensions)
 
 
 def _cores() -> int:

@@ -7,7 +7,7 @@ chunks are out at a time and every result goes to the store at once, so memory d
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,8 +17,9 @@ from uwbsim.output import check_folder
 from uwbsim.scenario.loading import load
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.executors import Chunk, Workers, workers_for
+from uwbsim.sweep.extensions import Evaluate, Extensions, evaluator
 from uwbsim.sweep.results import Store, export
-from uwbsim.sweep.task import Task, failure
+from uwbsim.sweep.task import Result, Task, failure
 
 STORE: Final = "results.duckdb"
 CHUNK_S: Final = 1.0
@@ -45,16 +46,29 @@ def run_sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     resume: bool = False,
+    evaluate: Evaluate | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Summary:
     """Run what is not done yet, and write results.csv and results.parquet in the order of the runs.
+
+    Runs of kind `compare` compare protocols; those of kind `calibrate` simulate a flight and have `evaluate(flight)`
+    return its figures, a mapping of column to number, text or None. Where that is not given it is what an installed
+    distribution offers as entry point `calibrate` of the group `uwbcal.evaluators`. The work is done by so many
+    `workers` (processes; None: all cores), or by the Dask cluster whose `scheduler` has this address; both import
+    `evaluate` by its name. `progress` is called with the done fraction, 0 to 1.
 
     Raises `ScenarioError` where the folder holds another sweep's results, or the same one's without `resume`, and
     `ParameterError` where the scheduler does not answer; nothing is written then.
     """
     check_folder(folder)
     _check(plan, folder, resume=resume)
-    team = workers_for(workers, scheduler)
+    if plan.kind == "calibrate":
+        evaluate = evaluate or evaluator(plan.kind)
+    elif evaluate is not None:
+        raise ParameterError("evaluate", f"goes with a sweep of kind 'calibrate', and this one's is {plan.kind!r}")
+    if workers is not None and workers < 1:
+        raise ParameterError("workers", f"found {workers}, expected 1 or more")
+    team = workers_for(workers, scheduler, Extensions.of_here(evaluate))
     try:
         folder.mkdir(exist_ok=True)
         path = folder / STORE
@@ -130,11 +144,11 @@ def _take(numbers: Iterator[int], count: int) -> list[int]:
     return [number for _, number in zip(range(count), numbers, strict=False)]
 
 
-def _lost(chunk: Chunk, attempts: dict[int, int], again: list[Chunk]) -> list[tuple[int, list[dict[str, Any]]]]:
+def _lost(chunk: Chunk, attempts: dict[int, int], again: list[Chunk]) -> list[Result]:
     """Queue the runs of a lost chunk one by one; return the rows of those that were lost too often."""
     rows = []
     for task in chunk:
-        number = task["number"]
+        number = task.number
         attempts[number] = attempts.get(number, 0) + 1
         if attempts[number] >= ATTEMPTS:
             rows.append((number, [failure(task, f"its worker died {ATTEMPTS} times")]))
@@ -146,20 +160,17 @@ def _lost(chunk: Chunk, attempts: dict[int, int], again: list[Chunk]) -> list[tu
 def _task(plan: SweepDesign, number: int) -> Task:
     """Return a run as plain data; a scenario that cannot be is an error that travels with it."""
     run = plan.run(number)
-    task: Task = {
-        "number": number,
-        "seed": run.seed,
-        "values": run.values,
-        "kind": plan.kind,
-        "protocols": list(plan.protocols),
-        "ranges": plan.ranges,
-        "name": plan.scenario.stem,
-        "scenario": "",
-        "error": "",
-    }
+    task = Task(
+        number=number,
+        seed=run.seed,
+        values=run.values,
+        kind=plan.kind,
+        protocols=plan.protocols,
+        ranges=plan.ranges,
+        name=plan.scenario.stem,
+    )
     try:
-        task["scenario"] = load(plan.scenario, run.settings(), run.seed).model_dump_json()
+        return replace(task, scenario=load(plan.scenario, run.settings(), run.seed).model_dump_json())
     except ScenarioError as error:
         # Where the file lies is no part of a result.
-        task["error"] = str(error).removeprefix(f"{plan.scenario}: ")
-    return task
+        return replace(task, error=str(error).removeprefix(f"{plan.scenario}: "))

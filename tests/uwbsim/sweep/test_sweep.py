@@ -1,6 +1,7 @@
 """Sweeps: the same results whoever does the work, whatever dies on the way, and nothing twice."""
 
 import csv
+import importlib
 import os
 import signal
 import subprocess
@@ -13,11 +14,12 @@ import duckdb
 import numpy as np
 import pytest
 
-from uwbsim.errors import ScenarioError, UwbsimError
+from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
 from uwbsim.sweep.design import load_plan, toml_value
 from uwbsim.sweep.executors import Processes
 from uwbsim.sweep.results import Store
 from uwbsim.sweep.runner import run_sweep
+from uwbsim.world.channel import CHANNEL_EFFECTS, register_channel_effect
 
 ROOT = Path(__file__).parents[3]
 BIN = Path(sys.executable).parent
@@ -152,7 +154,7 @@ def test_a_process_that_dies_is_replaced(alone, tmp_path, monkeypatch):
                 killed.append(victim.pid)
                 os.kill(victim.pid, signal.SIGKILL)
 
-    monkeypatch.setattr("uwbsim.sweep.runner.workers_for", lambda count, scheduler: Fragile(2))
+    monkeypatch.setattr("uwbsim.sweep.runner.workers_for", lambda count, scheduler, known: Fragile(2, known))
     run_sweep(p, tmp_path / "out")
     assert len(killed) == 2
     assert (tmp_path / "out" / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
@@ -196,6 +198,78 @@ def test_calibrations_are_swept_too(tmp_path):
     assert float(good["full_robust_std_m"]) < float(good["raw_robust_std_m"])
     assert float(good["delays_rms_ns"]) < 0.3
     assert "too few" in bad["error"]
+
+
+CALIBRATE = HEAD.replace('["ss-cfo", "ds"]', '["ds"]') + 'kind = "calibrate"\n[vary]\n"run.duration_s" = [1, 2]\n'
+
+STRANGER = """
+from dataclasses import replace
+
+def figures(flight):
+    return {"count": len(flight.exchanges), "weakest_dbm": float(flight.exchanges.fpp1_dbm.min())}
+
+def failing(flight):
+    raise KeyError("no such figure")
+
+def weaker(link, ends):
+    return replace(link, power_dbm=link.power_dbm - 3.0)
+"""
+
+
+@pytest.fixture
+def stranger(tmp_path, monkeypatch):
+    """A module of somebody else, which other processes of this machine find on the same path."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "stranger.py").write_text(STRANGER)
+    monkeypatch.syspath_prepend(folder)
+    yield importlib.import_module("stranger")
+    del sys.modules["stranger"]
+
+
+def test_a_strangers_function_judges_the_flights_the_same_in_other_processes(tmp_path, stranger):
+    p = plan(tmp_path, CALIBRATE)
+    run_sweep(p, tmp_path / "one", workers=1, evaluate=stranger.figures)
+    run_sweep(p, tmp_path / "two", workers=2, evaluate=stranger.figures)
+    assert [int(row["count"]) for row in rows(tmp_path / "one")] == [166, 332]
+    assert (tmp_path / "one" / "results.csv").read_bytes() == (tmp_path / "two" / "results.csv").read_bytes()
+
+
+def test_what_it_raises_fails_its_run_only(tmp_path, stranger):
+    summary = run_sweep(plan(tmp_path, CALIBRATE), tmp_path / "out", workers=1, evaluate=stranger.failing)
+    assert (summary.done, summary.failed) == (2, 2)
+    assert {row["error"] for row in rows(tmp_path / "out")} == {"'no such figure'"}
+
+
+def test_effects_of_the_channel_reach_other_processes(tmp_path, stranger):
+    p = plan(tmp_path, CALIBRATE)
+    run_sweep(p, tmp_path / "without", workers=2, evaluate=stranger.figures)
+    register_channel_effect("weaker", stranger.weaker)
+    try:
+        run_sweep(p, tmp_path / "with", workers=2, evaluate=stranger.figures)
+    finally:
+        del CHANNEL_EFFECTS["weaker"]
+    before, after = ([float(row["weakest_dbm"]) for row in rows(tmp_path / name)] for name in ("without", "with"))
+    # Boards print powers of whole counts: at -97 dBm a step is 0.015 dB.
+    np.testing.assert_allclose(np.subtract(before, after), 3.0, atol=0.03)
+
+
+def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stranger):
+    p = plan(tmp_path, CALIBRATE)
+    with pytest.raises(ParameterError, match=r"^evaluate: found <function .*lambda.* cannot import"):
+        run_sweep(p, tmp_path / "out", workers=2, evaluate=lambda flight: {})
+    with pytest.raises(ParameterError, match=r"^workers: found 0"):
+        run_sweep(p, tmp_path / "out", workers=0, evaluate=stranger.figures)
+    with pytest.raises(ParameterError, match=r"^evaluate: goes with a sweep of kind 'calibrate'"):
+        run_sweep(plan(tmp_path), tmp_path / "out", evaluate=stranger.figures)
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_a_function_and_without_a_distribution_that_offers_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("uwbsim.sweep.extensions.entry_points", lambda **_: ())
+    with pytest.raises(ParameterError, match="no installed distribution offers one"):
+        run_sweep(plan(tmp_path, CALIBRATE), tmp_path / "out", workers=1)
+    assert not (tmp_path / "out").exists()
 
 
 def test_folders_and_files_that_do_not_fit_are_refused(alone, tmp_path):

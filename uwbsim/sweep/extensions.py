@@ -1,0 +1,76 @@
+"""What strangers added to this process, to be there in the workers of a sweep as well.
+
+Workers are other processes, perhaps on other machines: functions reach them by module and name.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any, Final
+
+from uwbsim.errors import ParameterError
+from uwbsim.simulation.run import Simulated
+from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
+
+Evaluate = Callable[[Simulated], Mapping[str, Any]]
+"""Returns the figures of a flight as columns of one row: numbers, texts or None."""
+
+GROUP: Final = "uwbcal.evaluators"
+"""Entry points of this group offer functions of kind `Evaluate`, by the name of a sweep's kind."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Extensions:
+    """What a worker needs besides its tasks: the function that evaluates flights, and effects of the channel."""
+
+    evaluate: Evaluate | None = None
+    effects: tuple[tuple[str, ChannelEffect], ...] = ()
+
+    @classmethod
+    def of_here(cls, evaluate: Evaluate | None) -> Extensions:
+        """Return what this process has."""
+        added = {name: effect for name, effect in CHANNEL_EFFECTS.items() if name not in OWN_EFFECTS}
+        return cls(evaluate=evaluate, effects=tuple(added.items()))
+
+    def install(self) -> None:
+        """Have a process know what is in here; what it knows already stays."""
+        for name, effect in self.effects:
+            CHANNEL_EFFECTS.setdefault(name, effect)
+
+    def check(self) -> None:
+        """Raise `ParameterError` where another process would not find a function by its name."""
+        named: dict[str, object] = {f"channel effect {name!r}": effect for name, effect in self.effects}
+        if self.evaluate is not None:
+            named["evaluate"] = self.evaluate
+        for what, function in named.items():
+            if not _found_by_name(function):
+                raise ParameterError(
+                    what,
+                    f"found {function!r}, which other processes cannot import; "
+                    "give a function at the top of a module, or work in this process (workers = 1)",
+                )
+
+
+def _found_by_name(function: object) -> bool:
+    module = sys.modules.get(getattr(function, "__module__", None) or "")
+    return getattr(module, getattr(function, "__qualname__", ""), None) is function
+
+
+def evaluator(kind: str) -> Evaluate:
+    """Return the function that installed distributions offer for a kind of sweep; raises `ParameterError`."""
+    for entry in entry_points(group=GROUP, name=kind):
+        try:
+            found: Evaluate = entry.load()
+        except (ImportError, AttributeError) as error:
+            raise ParameterError(
+                "evaluate", f"{entry.value}, which {GROUP} names, cannot be imported: {error}"
+            ) from error
+        return found
+    raise ParameterError(
+        "evaluate",
+        f"a sweep of kind {kind!r} needs a function that evaluates a flight, and no installed distribution offers one "
+        f"(entry point {kind!r} of the group {GROUP})",
+    )
