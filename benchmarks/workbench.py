@@ -109,13 +109,13 @@ def variances() -> str:
 
 def sweep(workers: str, seeds: str = "60") -> str:
     """Seconds of a sweep."""
-    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
         path.write_text(SWEEP.format(scenario=TEST1, seeds=seeds))
-        plan = load_plan(path)
+        plan = load_design(path)
         start = time.perf_counter()
         run_sweep(plan, Path(folder) / "out", workers=int(workers))
         return f"{time.perf_counter() - start:.2f}"
@@ -125,14 +125,14 @@ def dask() -> str:
     """How much longer a chunk of a second takes when Dask hands it out, measured on chunks alone."""
     from distributed import Client, LocalCluster
 
-    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import _task
     from uwbsim.sweep.task import run_chunk
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
         path.write_text(SWEEP.format(scenario=TEST1, seeds=40))
-        plan = load_plan(path)
+        plan = load_design(path)
         _, once = run_chunk([_task(plan, 0)])
         _, once = run_chunk([_task(plan, 1)])
         size = max(int(1 / once), 1)
@@ -151,13 +151,13 @@ def dask() -> str:
 
 def memory(seeds: str) -> str:
     """Peak memory of a sweep in this process, in MB."""
-    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
         path.write_text(SWEEP.format(scenario=TEST1, seeds=int(seeds) // 2).replace("200_000", "20_000"))
-        run_sweep(load_plan(path), Path(folder) / "out", workers=1)
+        run_sweep(load_design(path), Path(folder) / "out", workers=1)
     return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}"
 
 

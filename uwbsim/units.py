@@ -12,5 +12,6 @@ US: Final = 1e-6
 MS: Final = 1e-3
 PPM: Final = 1e-6
 
+PS_PER_S: Final = 1e12
 NS_PER_S: Final = 1e9
 PPM_PER_ONE: Final = 1e6

@@ -53,7 +53,31 @@ def write_poses(scenario: Scenario, epoch_ns: int, path: Path) -> None:
 
 
 class Server:
-    """Serves the boards of a scenario. `names` maps tags to what clients open."""
+    """Serves the boards of a scenario. `names` maps tags to what clients open.
+
+    >>> import threading
+    >>> import uwblink, uwbsim
+    >>> near, far = ({"model": "static", "position_m": [x, 0.0, 1.0]} for x in (0.0, 3.0))
+    >>> server = uwbsim.Server(
+    ...     uwbsim.load(
+    ...         {
+    ...             "run": {"duration_s": 10.0},
+    ...             "ranging": {"rate_hz": 50.0},
+    ...             "bodies": [{"name": "near", "motion": near}, {"name": "far", "motion": far}],
+    ...             "tags": [{"id": 10, "body": "near"}, {"id": 20, "body": "far"}],
+    ...         }
+    ...     )
+    ... )
+    >>> stop = threading.Event()
+    >>> serving = threading.Thread(target=server.run, args=(stop.is_set,))
+    >>> serving.start()
+    >>> with uwblink.Board.open(server.names[10]) as board:
+    ...     board.id
+    10
+    >>> stop.set()
+    >>> serving.join()
+    >>> server.close()
+    """
 
     def __init__(self, scenario: Scenario, link_dir: Path | None = None, faults: Faults | None = None) -> None:
         """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made."""

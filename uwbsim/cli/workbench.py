@@ -108,20 +108,20 @@ def predict(
 
     found = predict_state(
         State(
-            protocol,
-            skew_ppm,
-            reply_delay_us,
-            final_delay_us,
-            distance_m,
-            speed_mps,
-            drift_ppm_per_s,
-            tx_noise_ps,
-            rx_noise_ps,
-            carrier_noise_ppm,
-            carrier_bias_ppm,
-            delay_initiator_ns,
-            delay_target_ns,
-            whole_ticks,
+            protocol=protocol,
+            skew_ppm=skew_ppm,
+            reply_delay_us=reply_delay_us,
+            final_delay_us=final_delay_us,
+            distance_m=distance_m,
+            speed_mps=speed_mps,
+            drift_ppm_per_s=drift_ppm_per_s,
+            tx_noise_ps=tx_noise_ps,
+            rx_noise_ps=rx_noise_ps,
+            carrier_noise_ppm=carrier_noise_ppm,
+            carrier_bias_ppm=carrier_bias_ppm,
+            delay_initiator_ns=delay_initiator_ns,
+            delay_target_ns=delay_target_ns,
+            whole_ticks=whole_ticks,
         )
     )
     if as_json:
@@ -187,10 +187,10 @@ def sweep(
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a killed sweep ended.")] = False,
 ) -> None:
     """Run a scenario many times with other settings and seeds; killed and resumed it repeats nothing."""
-    from uwbsim.sweep.design import load_plan
+    from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
 
-    loaded = load_plan(plan)
+    loaded = load_design(plan)
     with progress(loaded.name, eta=True) as report:
         summary = run_sweep(loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=report)
     typer.echo(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -16,11 +16,15 @@ from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, exchange_air_s, frame_s, message_bytes
+from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.air import RECEIVER_ON_S, TURNAROUND_S
 
 MOST: Final = 50_000_000
 """Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""
+
+SAMPLE: Final = 200_000
+"""Errors of each protocol that are kept."""
 
 MEDIAN_REPLY_S: Final = 305e-6
 """Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
@@ -28,7 +32,7 @@ MEDIAN_REPLY_S: Final = 305e-6
 WINNER_DELAYS_US: Final = (300, 600, 1000, 1500, 2000, 3000, 5000)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ProtocolErrors:
     """One protocol in a world: errors of raw ranges in metres, simulated and predicted, and what an exchange costs.
 
@@ -59,37 +63,89 @@ class ProtocolErrors:
         return asdict(self)
 
 
-def chosen(names: Sequence[str], parameter: str = "protocols") -> list[RangingProtocol]:
-    """Return the rows of protocols by name; raises `ParameterError` that lists what there is."""
-    for name in names:
-        if name not in PROTOCOLS:
-            raise ParameterError(parameter, f"found {name!r}, allowed: {', '.join(PROTOCOLS)}")
-    if not names:
+class Comparison(NamedTuple):
+    """Protocols beside each other: what came out, and a sample of each one's errors in metres, by name."""
+
+    outcomes: list[ProtocolErrors]
+    samples: dict[str, Floats]
+
+    def __repr__(self) -> str:
+        """Return a line a protocol."""
+        lines = [
+            f"{'protocol':10s}{'bias (cm)':>11s}{'predicted':>11s}{'std (cm)':>11s}{'predicted':>11s}{'air (us)':>10s}"
+        ]
+        for one in self.outcomes:
+            errors = (one.bias_m, one.predicted_bias_m, one.std_m, one.predicted_std_m)
+            lines.append(
+                f"{one.protocol:10s}" + "".join(f"{100 * e:11.3f}" for e in errors) + f"{1e6 * one.air_s:10.0f}"
+            )
+        return "\n".join(lines)
+
+
+Protocols = Sequence[str | RangingProtocol]
+
+
+def chosen(protocols: Protocols | None, parameter: str = "protocols") -> list[RangingProtocol]:
+    """Return rows of protocols, given as rows or by name, each once; None is all that there are.
+
+    Raises `ParameterError` that lists what there is.
+    """
+    wanted = list(PROTOCOLS) if protocols is None else protocols
+    rows: dict[str, RangingProtocol] = {}
+    for one in wanted:
+        if not isinstance(one, RangingProtocol) and one not in PROTOCOLS:
+            raise ParameterError(parameter, f"found {one!r}, allowed: {', '.join(PROTOCOLS)}")
+        row = one if isinstance(one, RangingProtocol) else PROTOCOLS[one]
+        rows.setdefault(row.name, row)
+    if not rows:
         raise ParameterError(parameter, f"found none, allowed: {', '.join(PROTOCOLS)}")
-    return [PROTOCOLS[name] for name in dict.fromkeys(names)]
+    return list(rows.values())
 
 
 def compare(
-    scenario: Scenario,
-    protocols: Sequence[RangingProtocol],
-    count: int,
+    scenario: Scenario | Source,
+    protocols: Protocols | None = None,
+    count: int = 1_000_000,
     progress: Callable[[float], None] | None = None,
-) -> tuple[list[ProtocolErrors], dict[str, Floats]]:
-    """Range `count` times with each protocol in one world; return what came out, and a sample of each one's errors."""
+) -> Comparison:
+    """Range `count` times with each protocol in one random world, with the same noise; say how raw ranges err.
+
+    `scenario` is whatever `load` takes, or a `Scenario`; `protocols` are names or rows of `PROTOCOLS`, None for all,
+    those included that were registered. `progress` is called with the done fraction, 0 to 1. Raises `ParameterError`
+    for an unknown protocol, and for a `count` that is not 1 to 50 million.
+
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> found = uwbsim.compare(
+    ...     {
+    ...         "run": {"duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0, "response_delay_uus": 1500},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast", "skew_ppm": 2.0}, {"id": 2, "body": "drone", "skew_ppm": -2.0}],
+    ...     },
+    ...     ["ss", "ds"],
+    ...     count=10_000,
+    ... )
+    >>> [(one.protocol, round(abs(one.bias_m), 1)) for one in found.outcomes]
+    [('ss', 0.9), ('ds', 0.0)]
+    >>> found.samples["ds"].shape
+    (10000,)
+    """
+    scenario, rows = as_scenario(scenario), chosen(protocols)
     if not 1 <= count <= MOST:
         raise ParameterError("count", f"found {count}, expected 1 to {MOST}")
     conditions = conditions_of(scenario)
     outcomes, samples = [], {}
-    for number, protocol in enumerate(protocols):
+    for number, protocol in enumerate(rows):
 
         def report(share: float, number: int = number) -> None:
             if progress:
-                progress((number + share) / len(protocols))
+                progress((number + share) / len(rows))
 
         errors = range_errors_m(protocol, conditions, scenario.run.seed, count, report)
         outcomes.append(_outcome(scenario, protocol, conditions, errors))
-        samples[protocol.name] = errors[:200_000].copy()
-    return outcomes, samples
+        samples[protocol.name] = errors[:SAMPLE].copy()
+    return Comparison(outcomes, samples)
 
 
 def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditions, errors: Floats) -> ProtocolErrors:
@@ -97,22 +153,22 @@ def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditio
     bias, variance = predict(protocol, conditions).pooled()
     cost = costs(scenario, protocol)
     return ProtocolErrors(
-        protocol.name,
-        protocol.title,
-        len(errors),
-        float(np.mean(errors)),
-        float(np.std(errors)),
-        float(np.sqrt(np.mean(errors**2))),
-        float(low),
-        float(median),
-        float(high),
-        bias,
-        float(np.sqrt(variance)),
-        len(protocol.messages),
-        cost["air_s"],
-        cost["duration_s"],
-        cost["radio_on_s"],
-        1 / (cost["duration_s"] + TURNAROUND_S),
+        protocol=protocol.name,
+        title=protocol.title,
+        ranges=len(errors),
+        bias_m=float(np.mean(errors)),
+        std_m=float(np.std(errors)),
+        rmse_m=float(np.sqrt(np.mean(errors**2))),
+        low_m=float(low),
+        median_m=float(median),
+        high_m=float(high),
+        predicted_bias_m=bias,
+        predicted_std_m=float(np.sqrt(variance)),
+        messages=len(protocol.messages),
+        air_s=cost["air_s"],
+        duration_s=cost["duration_s"],
+        radio_on_s=cost["radio_on_s"],
+        rate_hz=1 / (cost["duration_s"] + TURNAROUND_S),
     )
 
 
@@ -143,8 +199,6 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
 
 def calibrated(conditions: Conditions) -> Conditions:
     """Return the same world as a calibration leaves it: no antenna delays, no bias by power, no reflections."""
-    from dataclasses import replace
-
     delays = {f"{end}_delay_{side}": 0.0 for end in ("tx", "rx") for side in ("initiator", "target")}
     return replace(conditions.with_columns(late=0.0, **delays), multipath=0.0)
 

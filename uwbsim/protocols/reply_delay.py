@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
@@ -9,9 +10,11 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.twr import RangingProtocol
-from uwbsim.protocols.comparison import calibrated, costs
+from uwbsim.errors import ParameterError
+from uwbsim.protocols.comparison import calibrated, chosen, costs
 from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.prediction import predict
+from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 
 SHORTEST_S: Final = 287e-6
@@ -21,7 +24,7 @@ LONGEST_S: Final = 6.6e-3
 POINTS: Final = 121
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Optimum:
     """The best delay, and the curve: delays in seconds, variance of a range in m^2, and variance times time in m^2 s.
 
@@ -38,21 +41,46 @@ class Optimum:
     variance_m2: Floats
     scores_m2s: Floats
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        edge = " (the edge of what boards take)" if self.on_edge else ""
+        return (
+            f"{self.protocol}: best delay {1e6 * self.delay_s:.0f} us{edge}, one range {100 * self.std_m:.2f} cm in "
+            f"{1e6 * self.duration_s:.0f} us, mean of a second {1e3 * self.score_m2s**0.5:.3f} mm"
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwbsim optimum --json` prints."""
         document = asdict(self)
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in document.items()}
 
 
-def optimum(scenario: Scenario, protocol: RangingProtocol, overhead_s: float = 0.0) -> Optimum:
+def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds", overhead_s: float = 0.0) -> Optimum:
     """Minimise mean squared error times duration over the delay of the scheduled message.
 
     A second of air holds 1/duration exchanges, whose mean has the variance of one times the duration. Antenna delays,
-    power bias and reflections are left out: calibration deals with them, and no delay does. `overhead_s` is what an
-    exchange takes besides (commands, turnaround).
+    power bias and reflections are left out: calibration deals with them, and no delay does. `scenario` is whatever
+    `load` takes, or a `Scenario`, `protocol` a name or a row of `PROTOCOLS`; `overhead_s` is what an exchange takes
+    besides, in seconds (commands, turnaround). Raises `ParameterError`.
+
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> best = uwbsim.optimum(
+    ...     {
+    ...         "run": {"duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     }
+    ... )
+    >>> best.on_edge, 500e-6 < best.delay_s < 1500e-6
+    (False, True)
     """
     from scipy.optimize import minimize_scalar
 
+    scenario, (protocol,) = as_scenario(scenario), chosen([protocol], "protocol")
+    if not (math.isfinite(overhead_s) and overhead_s >= 0):
+        raise ParameterError("overhead_s", f"found {overhead_s}, expected seconds, 0 or more")
     world = calibrated(conditions_of(scenario, 2048))
     # The grid of delayed transmissions would show as teeth of 8 ns on the curve.
     world = replace(world, quantize=False)
@@ -69,15 +97,15 @@ def optimum(scenario: Scenario, protocol: RangingProtocol, overhead_s: float = 0
     refined = float(minimize_scalar(score, bounds=(low, high), method="bounded", options={"xatol": 1e-8}).x)
     delay = min((refined, float(delays[best])), key=score)
     return Optimum(
-        protocol.name,
-        delay,
-        float(np.sqrt(_square_m2(protocol, world, delay))),
-        costs(scenario, protocol, delay)["duration_s"] + overhead_s,
-        score(delay),
-        best in (0, POINTS - 1),
-        delays,
-        squares,
-        scores,
+        protocol=protocol.name,
+        delay_s=delay,
+        std_m=float(np.sqrt(_square_m2(protocol, world, delay))),
+        duration_s=costs(scenario, protocol, delay)["duration_s"] + overhead_s,
+        score_m2s=score(delay),
+        on_edge=best in (0, POINTS - 1),
+        delays_s=delays,
+        variance_m2=squares,
+        scores_m2s=scores,
     )
 
 

@@ -7,51 +7,77 @@ from dataclasses import dataclass, fields
 from typing import Any, Final
 
 from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.twr import RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.comparison import chosen
 from uwbsim.protocols.conditions import Conditions
 from uwbsim.protocols.prediction import predict
+from uwbsim.units import PS, PS_PER_S, US
 
 LARGEST: Final = 1e9
 SHORTEST_US: Final = 1.0
 """A third message that follows at once leaves nothing to tell the clocks' rates from."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """What to predict; the skew is that of the initiator's clock relative to the target's, shared by both equally.
+    """One state of the world to predict ranges in; `protocol` is a name or a row of `PROTOCOLS`.
 
-    An aggregate antenna delay is split 0.44 to 0.56 between transmission and reception, which changes nothing.
+    The skew is that of the initiator's clock relative to the target's, shared by both equally. `reply_delay_us` is the
+    target's reply (dt32), `final_delay_us` the third message's delay (dt53). An aggregate antenna delay is split 0.44
+    to 0.56 between transmission and reception, which changes nothing.
+
+    >>> from uwbsim import State
+    >>> State(protocol="ss", skew_ppm=4.0).reply_delay_us
+    300.0
     """
 
-    protocol: str
-    skew_ppm: float
-    reply_delay_us: float
-    final_delay_us: float
-    distance_m: float
-    speed_mps: float
-    drift_ppm_per_s: float
-    tx_noise_ps: float
-    rx_noise_ps: float
-    carrier_noise_ppm: float
-    carrier_bias_ppm: float
-    delay_initiator_ns: float
-    delay_target_ns: float
-    whole_ticks: bool
+    protocol: str | RangingProtocol = "ds"
+    skew_ppm: float = 0.0
+    reply_delay_us: float = 300.0
+    final_delay_us: float = 1538.7
+    distance_m: float = 5.0
+    speed_mps: float = 0.0
+    drift_ppm_per_s: float = 0.0
+    tx_noise_ps: float = 0.0
+    rx_noise_ps: float = 150.0
+    carrier_noise_ppm: float = 0.2
+    carrier_bias_ppm: float = 0.0
+    delay_initiator_ns: float = 0.0
+    delay_target_ns: float = 0.0
+    whole_ticks: bool = False
+
+
+NOT_NEGATIVE: Final = ("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm")
+
+
+def _check(q: State) -> None:
+    for field in fields(q):
+        value = getattr(q, field.name)
+        if field.name in ("protocol", "whole_ticks"):
+            continue
+        if not isinstance(value, int | float) or not (math.isfinite(value) and abs(value) < LARGEST):
+            raise ParameterError(field.name, f"found {value}, expected a number below {LARGEST:g}")
+        if field.name in NOT_NEGATIVE and value < 0:
+            raise ParameterError(field.name, f"found {value:g}, expected 0 or more")
+    if q.final_delay_us < SHORTEST_US:
+        raise ParameterError("final_delay_us", f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}")
 
 
 def predict_state(q: State) -> dict[str, Any]:
-    """Return bias and standard deviation of a range, in metres and as time of flight, and the parts of the latter.
+    """Return bias and standard deviation of a raw range without simulating any, and the parts of the latter.
 
-    Raises `ParameterError` for a number that cannot be, and for an unknown protocol.
+    Keys are `protocol`, `title`; `bias_m`, `std_m`, `variance_m2` of the range, `bias_ps`, `std_ps` of the time of
+    flight; `parts_m`, the standard deviation in metres that each cause alone leaves. Raises `ParameterError` for a
+    number that cannot be, and for an unknown protocol.
+
+    >>> import uwbsim
+    >>> found = uwbsim.predict_state(uwbsim.State(protocol="ss", skew_ppm=2.0, reply_delay_us=1000.0, rx_noise_ps=0.0))
+    >>> round(found["bias_m"], 3)  # half of skew times reply times the speed of light
+    0.3
     """
     (protocol,) = chosen([q.protocol], "protocol")
-    for field in fields(q):
-        value = getattr(q, field.name)
-        if isinstance(value, float) and not (math.isfinite(value) and abs(value) < LARGEST):
-            raise ParameterError(field.name, f"found {value}, expected a number below {LARGEST:g}")
-    if q.final_delay_us < SHORTEST_US:
-        raise ParameterError("final_delay_us", f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}")
+    _check(q)
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
     target_waits = timings[1] == "scheduled"
@@ -64,14 +90,14 @@ def predict_state(q: State) -> dict[str, Any]:
         rate_target=-q.skew_ppm * 0.5e-6,
         drift_initiator=q.drift_ppm_per_s * 0.5e-6,
         drift_target=-q.drift_ppm_per_s * 0.5e-6,
-        tx_std=q.tx_noise_ps * 1e-12,
-        rx_std=q.rx_noise_ps * 1e-12,
+        tx_std=q.tx_noise_ps * PS,
+        rx_std=q.rx_noise_ps * PS,
         tx_delay_initiator=0.44e-9 * q.delay_initiator_ns,
         rx_delay_initiator=-0.56e-9 * q.delay_initiator_ns,
         tx_delay_target=0.44e-9 * q.delay_target_ns,
         rx_delay_target=-0.56e-9 * q.delay_target_ns,
-        at_once=at_once * 1e-6,
-        scheduled=scheduled * 1e-6,
+        at_once=at_once * US,
+        scheduled=scheduled * US,
         carrier_bias_ppm=q.carrier_bias_ppm,
         carrier_std_ppm=q.carrier_noise_ppm,
         quantize=q.whole_ticks,
@@ -90,7 +116,7 @@ def predict_state(q: State) -> dict[str, Any]:
         "bias_m": bias,
         "std_m": variance**0.5,
         "variance_m2": variance,
-        "bias_ps": bias / SPEED_OF_LIGHT * 1e12,
-        "std_ps": variance**0.5 / SPEED_OF_LIGHT * 1e12,
+        "bias_ps": bias / SPEED_OF_LIGHT * PS_PER_S,
+        "std_ps": variance**0.5 / SPEED_OF_LIGHT * PS_PER_S,
         "parts_m": {name: float(part[0]) ** 0.5 for name, part in parts.items()},
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ class Run:
         return [f"{key}={toml_value(value)}" for key, value in self.values.items()]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SweepDesign:
     """A sweep as its file has it, and where its runs come from: `axes` of a grid, or `rows` one by one."""
 
@@ -71,8 +72,29 @@ class SweepDesign:
         return Run(number, values, self.seeds[seed])
 
 
-def load_plan(path: Path) -> SweepDesign:
-    """Read a sweep; raises `ScenarioError` that says where, what, and the near key where one is misspelt."""
+def load_design(path: str | os.PathLike[str]) -> SweepDesign:
+    """Read what a sweep varies (.toml); nothing is run yet, and runs are made when they are asked for by number.
+
+    Raises `ScenarioError` that says where, what, and the near key where one is misspelt.
+
+    >>> from pathlib import Path
+    >>> import uwbsim
+    >>> _ = Path("two.toml").write_text(
+    ...     "run = { duration_s = 2.0 }\\n"
+    ...     "ranging = { rate_hz = 50.0 }\\n"
+    ...     "tags = [{ id = 1, body = 'a' }, { id = 2, body = 'b' }]\\n"
+    ...     "[[bodies]]\\nname = 'a'\\nmotion = { model = 'static', position_m = [0.0, 0.0, 2.0] }\\n"
+    ...     "[[bodies]]\\nname = 'b'\\nmotion = { model = 'static', position_m = [5.0, 0.0, 2.0] }\\n"
+    ... )
+    >>> _ = Path("sweep.toml").write_text(
+    ...     "sweep = { scenario = 'two.toml', protocols = ['ds'], ranges = 1000, seeds = 2 }\\n"
+    ...     "[vary]\\n'radio.rx_noise_ps' = [50.0, 100.0, 200.0]\\n"
+    ... )
+    >>> design = uwbsim.load_design("sweep.toml")
+    >>> design.total, design.run(5).values, design.run(5).seed
+    (6, {'radio.rx_noise_ps': 200.0}, 2)
+    """
+    path = Path(path)
     table, text = _parse(path)
     unknown = sorted(set(table) - {"sweep", "vary", "list"})
     if unknown:
@@ -91,16 +113,16 @@ def load_plan(path: Path) -> SweepDesign:
     vary, listed = table.get("vary", {}), table.get("list", [])
     axes, rows = _points(path, head, design, vary, listed)
     plan = SweepDesign(
-        path,
-        str(head.get("name", path.stem)),
-        scenario,
-        kind,
-        tuple(protocols),
-        _whole(path, head, "ranges", 100_000, 1, 10_000_000),
-        _seeds(path, head),
-        axes,
-        rows,
-        _fingerprint(text, scenario),
+        path=path,
+        name=str(head.get("name", path.stem)),
+        scenario=scenario,
+        kind=kind,
+        protocols=tuple(protocols),
+        ranges=_whole(path, head, "ranges", 100_000, 1, 10_000_000),
+        seeds=_seeds(path, head),
+        axes=axes,
+        rows=rows,
+        fingerprint=_fingerprint(text, scenario),
     )
     if plan.total > MOST_RUNS:
         raise ScenarioError(f"{path}: {plan.total} runs are too many, at most {MOST_RUNS}")

@@ -6,6 +6,7 @@ chunks are out at a time and every result goes to the store at once, so memory d
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,7 +42,7 @@ class Summary:
 
 def run_sweep(
     plan: SweepDesign,
-    folder: Path,
+    folder: str | os.PathLike[str],
     *,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -59,7 +60,25 @@ def run_sweep(
 
     Raises `ScenarioError` where the folder holds another sweep's results, or the same one's without `resume`, and
     `ParameterError` where the scheduler does not answer; nothing is written then.
+
+    >>> from pathlib import Path
+    >>> import uwbsim
+    >>> _ = Path("two.toml").write_text(
+    ...     "run = { duration_s = 2.0 }\\n"
+    ...     "ranging = { rate_hz = 50.0 }\\n"
+    ...     "tags = [{ id = 1, body = 'a' }, { id = 2, body = 'b' }]\\n"
+    ...     "[[bodies]]\\nname = 'a'\\nmotion = { model = 'static', position_m = [0.0, 0.0, 2.0] }\\n"
+    ...     "[[bodies]]\\nname = 'b'\\nmotion = { model = 'static', position_m = [5.0, 0.0, 2.0] }\\n"
+    ... )
+    >>> _ = Path("sweep.toml").write_text("sweep = { scenario = 'two.toml', kind = 'calibrate', seeds = 2 }\\n")
+    >>> def farthest(flight):
+    ...     return {"farthest_m": flight.truth_m.max().round(6).item()}
+    >>> uwbsim.run_sweep(uwbsim.load_design("sweep.toml"), "results", workers=1, evaluate=farthest)
+    Summary(done=2, failed=0, skipped=0)
+    >>> Path("results/results.csv").read_text().splitlines()[1].endswith("ds,5.0,0")
+    True
     """
+    folder = Path(folder)
     check_folder(folder)
     _check(plan, folder, resume=resume)
     if plan.kind == "calibrate":

@@ -13,7 +13,6 @@ import numpy as np
 
 import uwblink
 from uwblink.errors import UwblinkError
-from uwblink.twr import PROTOCOLS
 from uwbsim.errors import UwbsimError
 from uwbsim.sweep.extensions import Evaluate, Extensions
 
@@ -73,8 +72,7 @@ def _compare(task: Task) -> Rows:
     from uwbsim.scenario.model import Scenario
 
     scenario = Scenario.model_validate_json(task.scenario)
-    outcomes, _ = compare(scenario, [PROTOCOLS[name] for name in task.protocols], task.ranges)
-    return [outcome.to_dict() for outcome in outcomes]
+    return [outcome.to_dict() for outcome in compare(scenario, task.protocols, task.ranges).outcomes]
 
 
 def _evaluate(task: Task, evaluate: Evaluate) -> Rows:

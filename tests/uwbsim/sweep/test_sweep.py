@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
-from uwbsim.sweep.design import load_plan, toml_value
+from uwbsim.sweep.design import load_design, toml_value
 from uwbsim.sweep.executors import Processes
 from uwbsim.sweep.results import Store
 from uwbsim.sweep.runner import run_sweep
@@ -30,7 +30,7 @@ GRID = '[vary]\n"ranging.response_delay_uus" = [300, 1500]\n"radio.rx_noise_ps" 
 def plan(tmp_path, text=HEAD + "ranges = 3000\nseeds = 2\n" + GRID, name="plan.toml"):
     path = tmp_path / name
     path.write_text(text)
-    return load_plan(path)
+    return load_design(path)
 
 
 def rows(folder):
