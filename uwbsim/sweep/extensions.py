@@ -6,11 +6,12 @@ Workers are other processes, perhaps on other machines: functions reach them by 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any, Final
 
+from uwblink.twr import PROTOCOLS, RangingProtocol, register_protocol
 from uwbsim.errors import ParameterError
 from uwbsim.simulation.run import Simulated
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
@@ -24,25 +25,33 @@ GROUP: Final = "uwbcal.evaluators"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Extensions:
-    """What a worker needs besides its tasks: the function that evaluates flights, and effects of the channel."""
+    """What a worker needs besides its tasks: the function that evaluates flights, protocols, effects of the channel."""
 
     evaluate: Evaluate | None = None
+    protocols: tuple[RangingProtocol, ...] = ()
     effects: tuple[tuple[str, ChannelEffect], ...] = ()
 
     @classmethod
-    def of_here(cls, evaluate: Evaluate | None) -> Extensions:
-        """Return what this process has."""
+    def of_here(cls, evaluate: Evaluate | None, protocols: Sequence[str]) -> Extensions:
+        """Return what this process has, with the rows of some protocols."""
         added = {name: effect for name, effect in CHANNEL_EFFECTS.items() if name not in OWN_EFFECTS}
-        return cls(evaluate=evaluate, effects=tuple(added.items()))
+        rows = tuple(PROTOCOLS[name] for name in protocols)
+        return cls(evaluate=evaluate, protocols=rows, effects=tuple(added.items()))
 
     def install(self) -> None:
         """Have a process know what is in here; what it knows already stays."""
+        for row in self.protocols:
+            if row.name not in PROTOCOLS:
+                register_protocol(row)
         for name, effect in self.effects:
             CHANNEL_EFFECTS.setdefault(name, effect)
 
     def check(self) -> None:
         """Raise `ParameterError` where another process would not find a function by its name."""
         named: dict[str, object] = {f"channel effect {name!r}": effect for name, effect in self.effects}
+        for row in self.protocols:
+            formulas = {part: getattr(row, part) for part in ("flight_ticks", "delay_weights")}
+            named |= {f"{part} of protocol {row.name!r}": formula for part, formula in formulas.items()}
         if self.evaluate is not None:
             named["evaluate"] = self.evaluate
         for what, function in named.items():

@@ -87,7 +87,7 @@ def run_sweep(
         raise ParameterError("evaluate", f"goes with a sweep of kind 'calibrate', and this one's is {plan.kind!r}")
     if workers is not None and workers < 1:
         raise ParameterError("workers", f"found {workers}, expected 1 or more")
-    team = workers_for(workers, scheduler, Extensions.of_here(evaluate))
+    team = workers_for(workers, scheduler, Extensions.of_here(evaluate, plan.protocols))
     try:
         folder.mkdir(exist_ok=True)
         path = folder / STORE

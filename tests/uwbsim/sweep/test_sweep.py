@@ -8,12 +8,14 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
 import numpy as np
 import pytest
 
+from uwblink.twr import PROTOCOLS, register_protocol
 from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
 from uwbsim.sweep.design import load_design, toml_value
 from uwbsim.sweep.executors import Processes
@@ -204,6 +206,7 @@ CALIBRATE = HEAD.replace('["ss-cfo", "ds"]', '["ds"]') + 'kind = "calibrate"\n[v
 
 STRANGER = """
 from dataclasses import replace
+import numpy as np
 
 def figures(flight):
     return {"count": len(flight.exchanges), "weakest_dbm": float(flight.exchanges.fpp1_dbm.min())}
@@ -213,6 +216,12 @@ def failing(flight):
 
 def weaker(link, ends):
     return replace(link, power_dbm=link.power_dbm - 3.0)
+
+def flight_ticks(spans):
+    return (spans.dt41 - spans.dt32) / 2
+
+def delay_weights(spans):
+    return np.full_like(spans.dt41, 0.5), np.full_like(spans.dt41, 0.5)
 """
 
 
@@ -252,6 +261,21 @@ def test_effects_of_the_channel_reach_other_processes(tmp_path, stranger):
     before, after = ([float(row["weakest_dbm"]) for row in rows(tmp_path / name)] for name in ("without", "with"))
     # Boards print powers of whole counts: at -97 dBm a step is 0.015 dB.
     np.testing.assert_allclose(np.subtract(before, after), 3.0, atol=0.03)
+
+
+def test_registered_protocols_reach_other_processes(tmp_path, stranger):
+    row = replace(
+        PROTOCOLS["ss"], name="mine", flight_ticks=stranger.flight_ticks, delay_weights=stranger.delay_weights
+    )
+    register_protocol(row)
+    try:
+        text = HEAD.replace('"ss-cfo"', '"ss"').replace('"ds"', '"mine"')
+        run_sweep(plan(tmp_path, text + "ranges = 500\nseeds = 2\n"), tmp_path / "out", workers=2)
+    finally:
+        PROTOCOLS.remove("mine")
+    known, own = ([row["bias_m"] for row in rows(tmp_path / "out") if row["protocol"] == p] for p in ("ss", "mine"))
+    assert len(known) == 2
+    assert known == own
 
 
 def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stranger):
