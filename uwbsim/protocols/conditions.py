@@ -25,7 +25,7 @@ STEP_S: Final = 1e-3
 """Over this time the speed along the line between two tags is measured."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Conditions:
     """The state of the world in exchanges, columns of length n; times of flight and delays in seconds.
 

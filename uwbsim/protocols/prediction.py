@@ -34,7 +34,7 @@ FROM_INITIATOR: Final = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
     """Errors of ranges, (n,) each: their mean in metres, and the parts of their variance in square metres."""
 

@@ -83,7 +83,10 @@ class Air:
     """The medium and the radios on it, while the slots of a plan are played."""
 
     def __init__(self, protocol: RangingProtocol, slots: int, tags: int, powers: Powers, rules: Rules) -> None:
-        """Be silent."""
+        """Begin at time zero with no frame on the air.
+
+        `slots` is the number of planned exchanges, `tags` that of radios; `powers` gives what each hears of a sender.
+        """
         self.env = simpy.Environment()
         self._messages = protocol.messages
         self._powers, self._rules = powers, rules

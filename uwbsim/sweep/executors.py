@@ -45,7 +45,7 @@ class InProcess:
     size = 1
 
     def __init__(self, extensions: Extensions) -> None:
-        """Have nothing to do."""
+        """Begin without chunks; each is worked on with `extensions`."""
         self._extensions = extensions
         self._waiting: list[Chunk] = []
 
@@ -60,7 +60,7 @@ class InProcess:
         return [(chunk, rows, seconds)]
 
     def close(self) -> None:
-        """Do nothing."""
+        """Return: nothing was started."""
 
 
 class Processes:
