@@ -7,7 +7,7 @@ the antennas from; so an effect of `CHANNEL_EFFECTS` shows in all of them, by th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -39,6 +39,8 @@ class Ends:
     `time_s` (n,) is true time; `places` are the tags at the two ends as places in the scenario's list, (n,) each;
     `antennas_m` where their antennas are, (n, 3) each, and `rotations` how they are turned, body to world, (n, 3, 3)
     each. `shadows` are the bodies that may stand in between; `phases` (tags, harmonics) those of the tags' shadowing.
+    `distance_m` and `gain_db`, (n,) each, follow from these: the lengths of the straight lines, and what the two
+    antennas together add along them.
     """
 
     scenario: Scenario
@@ -48,26 +50,25 @@ class Ends:
     antennas_m: tuple[Floats, Floats]
     rotations: tuple[Floats, Floats]
     shadows: Sequence[PlacedShadow]
+    distance_m: Floats = field(init=False)
+    gain_db: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Work out what follows, once for all effects."""
+        apart = self.antennas_m[1] - self.antennas_m[0]
+        distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
+        towards = apart / np.maximum(distance, SHORTEST_M)[:, None]
+        radio, gain = self.scenario.radio, np.zeros(len(distance))
+        for tags, rotation, way in zip(self.places, self.rotations, (towards, -towards), strict=True):
+            phases = self.phases[tags] if radio.shadowing_db else self.phases
+            gain = gain + gain_db(radio, phases, np.einsum("ni,nij->nj", way, rotation))
+        object.__setattr__(self, "distance_m", distance)
+        object.__setattr__(self, "gain_db", gain)
 
     def tags(self) -> tuple[Ints, Ints]:
         """Return the ids of the tags at the two ends, (n,) each."""
         ids = np.array([tag.id for tag in self.scenario.tags], dtype=np.int64)
         return ids[self.places[0]], ids[self.places[1]]
-
-    def distance_m(self) -> Floats:
-        """Return the lengths of the straight lines, (n,)."""
-        apart = self.antennas_m[1] - self.antennas_m[0]
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", apart, apart)))
-
-    def gain_db(self) -> Floats:
-        """Return what the two antennas together add along the straight lines, (n,)."""
-        distance = self.distance_m()
-        towards = (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(distance, SHORTEST_M)[:, None]
-        gain = np.zeros(len(distance))
-        for tags, rotation, sign in zip(self.places, self.rotations, (1.0, -1.0), strict=True):
-            direction = np.einsum("ni,nij->nj", sign * towards, rotation)
-            gain = gain + gain_db(self.scenario.radio, self.phases[tags], direction)
-        return gain
 
 
 ChannelEffect = Callable[[Link, Ends], Link]
@@ -76,9 +77,8 @@ ChannelEffect = Callable[[Link, Ends], Link]
 
 def link_between(ends: Ends) -> Link:
     """Return the links of tags at known places, (n,), with every effect of `CHANNEL_EFFECTS` in its order."""
-    distance = ends.distance_m()
-    power = path_gain_db(ends.scenario.radio, distance) + ends.gain_db()
-    link = Link(distance, np.zeros_like(distance), power, power)
+    power = path_gain_db(ends.scenario.radio, ends.distance_m) + ends.gain_db
+    link = Link(ends.distance_m, np.zeros_like(ends.distance_m), power, power)
     for effect in CHANNEL_EFFECTS.values():
         link = effect(link, ends)
     return link
@@ -96,7 +96,7 @@ def _reflections(link: Link, ends: Ends) -> Link:
     if room is None or room.reflection_loss_db is None:
         return link
     lengths = reflected_lengths_m(room, *ends.antennas_m)
-    echoes = path_gain_db(radio, lengths) + ends.gain_db()[:, None] - room.reflection_loss_db
+    echoes = path_gain_db(radio, lengths) + ends.gain_db[:, None] - room.reflection_loss_db
     return first_path(link, lengths, echoes, radio.dynamic_range_db)
 
 

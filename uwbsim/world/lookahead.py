@@ -43,6 +43,7 @@ class SampledWorld:
     def __init__(self, world: World) -> None:
         """Begin at time zero."""
         self._world = world
+        self._places = np.arange(len(world.scenario.tags))
         self._shadowing = [body for body in world.scenario.bodies if body.shadow is not None]
         self._prepare(0)
 
@@ -57,14 +58,15 @@ class SampledWorld:
             self._prepare(block)
         spots, turns = self._tags.at(index, into)
         count = len(spots)
+        origin = np.full(count, sender)
         return link_between(
             Ends(
                 scenario=self._world.scenario,
                 phases=self._world.phases,
                 time_s=np.full(count, time / SUBTICKS_PER_SECOND),
-                places=(np.full(count, sender), np.arange(count)),
-                antennas_m=(np.broadcast_to(spots[sender], spots.shape), spots),
-                rotations=(np.broadcast_to(turns[sender], turns.shape), turns),
+                places=(origin, self._places),
+                antennas_m=(spots[origin], spots),
+                rotations=(turns[origin], turns),
                 shadows=self._shadows(index, into, count),
             )
         )
