@@ -61,11 +61,19 @@ def _without_map(row: Importer) -> Any:
 
 
 def _argument(row: Importer) -> Any:
-    return Annotated[Path, typer.Argument(help=f"File to import ({' or '.join(row.suffixes)}).")]
+    what = f"File to import ({' or '.join(row.suffixes)})." if row.suffixes else "Folder to import."
+    return Annotated[Path, typer.Argument(help=what)]
 
 
 def _import(row: Importer, source: Path, output: Path, map_file: Path | None, *, force: bool) -> None:
-    from uwblink.importers import import_recording
+    from uwblink.display import printable
+    from uwblink.importers import read_source
+    from uwblink.recording.file import check_output
 
-    count = import_recording(source, output, importer=row.name, map_file=map_file, force=force)
-    typer.echo(f"{output}: {count} exchanges")
+    check_output(output, force=force)
+    contents = read_source(source, importer=row.name, map_file=map_file)
+    contents.save(output, force=force)
+    counts = contents.counts()
+    typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in counts.items())}")
+    for note in contents.meta.get("notes", ()):
+        typer.echo(f"  {printable(note)}")

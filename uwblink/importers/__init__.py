@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.exchanges_csv import read_csv
+from uwblink.importers.miluv import read_miluv
 from uwblink.plugins import NAME, Registry
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import check_output
@@ -24,7 +25,7 @@ class Importer:
 
     `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
     file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
-    small letters; `name` is that of the command `uwblink import NAME`, and `help` its line.
+    small letters, none for a kind of folder; `name` is that of the command `uwblink import NAME`, and `help` its line.
     """
 
     name: str
@@ -59,6 +60,13 @@ _OWN: Final = (
         read_csv,
         "Import ranging exchanges from a table.",
         map_help="Names, units and constants (.toml).",
+    ),
+    Importer(
+        "miluv",
+        (),
+        read_miluv,
+        "Import the folder of a flight of the MILUV dataset.",
+        map_help='Which anchors of anchors.yaml (.toml: constellation = "0").',
     ),
 )
 
@@ -105,14 +113,25 @@ def import_recording(
     1
     """
     check_output(Path(output), force=force)
+    contents = read_source(source, importer=importer, map_file=map_file)
+    contents.save(output, force=force)
+    return len(contents.exchanges)
+
+
+def read_source(
+    source: str | os.PathLike[str], *, importer: str | None = None, map_file: str | os.PathLike[str] | None = None
+) -> Contents:
+    """Return what somebody else's file holds, without writing anything; parameters and errors of `import_recording`.
+
+    An importer may say in `meta["notes"]`, a list of lines, what a user should know of the import.
+    """
     row = _importer(Path(source), importer)
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"map_file: importer {row.name!r} takes none")
     contents = row.read(Path(source), None if map_file is None else Path(map_file))
     if not isinstance(contents, Contents):
         raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
-    contents.save(output, force=force)
-    return len(contents.exchanges)
+    return contents
 
 
 def _importer(source: Path, name: str | None) -> Importer:

@@ -31,7 +31,8 @@ def _no_poses() -> Poses:
 class Contents:
     """What a recording holds; only the exchanges are needed to make one.
 
-    `overheard` has the columns of the table of that name, or none; `meta` is what is known of the whole.
+    `overheard`, `imu` and `height` have the columns of the tables of these names, or none; `meta` is what is known of
+    the whole.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
@@ -44,6 +45,8 @@ class Contents:
     tags: list[Tag] = field(default_factory=list)
     poses: Poses = field(default_factory=_no_poses)
     overheard: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    imu: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    height: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     cirs: list[CirRow] = field(default_factory=list)
     frames: list[FrameRow] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
@@ -60,8 +63,8 @@ class Contents:
         """Return what lies from `start_s` until before `stop_s`, in seconds since the first exchange, of some tags.
 
         `tags` keeps exchanges between these tags; `pairs` those of (initiator, target). Poses stay as far as the span
-        needs them, tags stay all. Bytes and faults are cut in time only. `meta` says what was selected. Raises
-        `ArgumentError`.
+        needs them, tags stay all. Readings, bytes and faults are cut in time only. `meta` says what was selected.
+        Raises `ArgumentError`.
         """
         first_ns, end_ns = self._bounds(start_s, stop_s)
         chosen = _Choice(first_ns, end_ns, _ids("tags", tags), _pairs(pairs))
@@ -72,6 +75,8 @@ class Contents:
             exchanges=x[chosen.rows(x.time_ns, x.initiator, x.target)],
             poses=_around(self.poses, first_ns, end_ns),
             overheard=_overheard(heard, chosen),
+            imu=_between(self.imu, first_ns, end_ns),
+            height=_between(self.height, first_ns, end_ns),
             cirs=[row for row in self.cirs if chosen.has(row.time_ns, row.initiator, row.target)],
             frames=[row for row in self.frames if first_ns <= row.time_ns < end_ns],
             faults=[row for row in self.faults if first_ns <= row.time_ns < end_ns],
@@ -85,7 +90,8 @@ class Contents:
             recording.append_tags(self.tags)
             recording.append_poses(self.poses)
             recording.append_exchanges(self.exchanges)
-            recording.append_columns("overheard", self.overheard)
+            for table in _COLUMNS:
+                recording.append_columns(table, getattr(self, table))
             recording.append_cirs(self.cirs)
             recording.append_frames(self.frames)
             recording.append_faults(self.faults)
@@ -105,9 +111,14 @@ class Contents:
         return f"{len(self.tags)} tags on {bodies}; {also}"
 
     def _numbers(self) -> dict[str, int]:
-        heard = len(self.overheard["time_ns"]) if self.overheard else 0
-        numbers = {"exchanges": len(self.exchanges), "poses": len(self.poses), "overheard": heard}
+        numbers = {"exchanges": len(self.exchanges), "poses": len(self.poses)}
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        numbers |= {name: len(found["time_ns"]) if found else 0 for name, found in columns.items()}
         return numbers | {name: len(getattr(self, name)) for name in ("cirs", "frames", "faults")}
+
+    def counts(self) -> dict[str, int]:
+        """Return how many rows there are by table: the exchanges, and of the others those that have any."""
+        return {name: n for name, n in self._numbers().items() if n or name == "exchanges"}
 
     def _bounds(self, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
         for name, value in (("start_s", start_s), ("stop_s", stop_s)):
@@ -119,6 +130,10 @@ class Contents:
         far = 2**62
         first = -far if start_s is None else origin + round(start_s * 1e9)
         return first, far if stop_s is None else origin + round(stop_s * 1e9)
+
+
+_COLUMNS: Final = ("overheard", "imu", "height")
+"""The tables that are held as columns by name."""
 
 
 def load(path: str | os.PathLike[str]) -> Contents:
@@ -135,8 +150,8 @@ def load(path: str | os.PathLike[str]) -> Contents:
     """
     with Recording.open(Path(path)) as r:
         return Contents(
-            exchanges=r.exchanges(), tags=r.tags(), poses=r.poses(), overheard=r.overheard(), cirs=r.cirs(),
-            frames=r.frames(), faults=r.faults(), meta=r.meta(),
+            exchanges=r.exchanges(), tags=r.tags(), poses=r.poses(), overheard=r.overheard(), imu=r.imu(),
+            height=r.heights(), cirs=r.cirs(), frames=r.frames(), faults=r.faults(), meta=r.meta(),
         )  # fmt: skip
 
 
@@ -167,6 +182,13 @@ def _overheard(heard: Mapping[str, NDArray[Any]], chosen: _Choice) -> Mapping[st
         return heard
     rows = chosen.rows(heard["time_ns"], heard["initiator"], heard["target"])
     return {name: column[rows] for name, column in heard.items()}
+
+
+def _between(columns: Mapping[str, NDArray[Any]], first_ns: int, end_ns: int) -> Mapping[str, NDArray[Any]]:
+    if not columns:
+        return columns
+    rows = (columns["time_ns"] >= first_ns) & (columns["time_ns"] < end_ns)
+    return {name: column[rows] for name, column in columns.items()}
 
 
 def _around(poses: Poses, first_ns: int, end_ns: int) -> Poses:

@@ -173,11 +173,14 @@ class Recording:
             self._store.insert(table, columns)
 
     def append_cirs(self, rows: Iterable[CirRow]) -> None:
-        """Add impulse responses."""
-        for row in rows:
-            values = [getattr(row, name) for name in TABLES["cirs"]]
-            values[-1] = list(row.magnitudes)
-            self._store.execute("INSERT INTO cirs VALUES (?, ?, ?, ?, ?, ?)", values)
+        """Add impulse responses, in one transaction."""
+        listed = list(rows)
+        if listed:
+            *plain, last = TABLES["cirs"]
+            taps = np.empty(len(listed), dtype=object)
+            taps[:] = [list(row.magnitudes) for row in listed]
+            columns = {name: np.array([getattr(row, name) for row in listed]) for name in plain}
+            self._store.insert("cirs", columns | {last: taps})
 
     def transaction(self) -> AbstractContextManager[None]:
         """Have everything appended in the block written at once, or not at all; raises `RecordingError`."""
@@ -255,6 +258,8 @@ class Recording:
     def count(self, table: str) -> int:
         """Return the number of rows of one of `TABLES`."""
         _known_tables([table])
+        if table not in self._store.columns():
+            return 0
         return int(self._store.read(f"SELECT count(*) AS n FROM {table}")["n"][0])  # noqa: S608 - a key of TABLES
 
     def exchanges(self) -> Exchanges:
@@ -275,6 +280,34 @@ class Recording:
         protocol = np.array(names)[np.asarray(code, dtype=np.int64) - 1]
         bits = self.meta().get("timestamp_bits", REPORT_BITS)
         return Exchanges(protocol=protocol, bits=int(bits), **columns)
+
+    def columns(self, table: str) -> dict[str, NDArray[Any]]:
+        """Return one of `TABLES` as columns in the order of its rows, masked where a value is missing.
+
+        Columns that an older file does not have are left out; of a table that it does not have, all are empty. Raises
+        `RecordingError` for a table that recordings do not have.
+        """
+        _known_tables([table])
+        present = self._store.columns().get(table)
+        if present is None:
+            return {name: np.empty(0, dtype=_EMPTY.get(kind, object)) for name, kind in TABLES[table].items()}
+        names = ", ".join(f'"{name}"' for name in TABLES[table] if name in present)
+        return self._store.read(f"SELECT {names} FROM {table} ORDER BY rowid")  # noqa: S608 - keys of TABLES
+
+    def imu(self) -> dict[str, NDArray[Any]]:
+        """Return inertial readings as columns of the table `imu`, in order of time (rad/s, m/s^2, axes of the body)."""
+        return self._readings("imu")
+
+    def heights(self) -> dict[str, NDArray[Any]]:
+        """Return what height sensors read as columns of the table `height`, in order of time."""
+        return self._readings("height")
+
+    def _readings(self, table: str) -> dict[str, NDArray[Any]]:
+        found = self.columns(table)
+        order = np.argsort(_filled(found["time_ns"]), kind="stable")
+        as_words = {"body": np.ma.filled(found.pop("body"), "").astype(np.str_)}
+        numbers = {name: _filled(column) for name, column in found.items()}
+        return {name: (numbers | as_words)[name][order] for name in TABLES[table]}
 
     def overheard(self) -> dict[str, NDArray[Any]]:
         """Return the passively heard exchanges as columns of the table `overheard`, in order of time.
@@ -321,7 +354,11 @@ _APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
     "cirs": Recording.append_cirs,
     "frames": Recording.append_frames,
     "faults": Recording.append_faults,
+    "imu": lambda recording, columns: recording.append_columns("imu", columns),
+    "height": lambda recording, columns: recording.append_columns("height", columns),
 }
+
+_EMPTY: Final = {"BIGINT": np.int64, "DOUBLE": np.float64, "USMALLINT": np.uint16}
 
 
 def _known_tables(names: Iterable[str]) -> None:

@@ -62,10 +62,20 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         **dict.fromkeys(("board", "kind", "detail"), "VARCHAR"),
         **dict.fromkeys(("initiator", "target"), "USMALLINT"),
     },
+    "imu": {
+        "time_ns": "BIGINT",
+        "body": "VARCHAR",
+        **dict.fromkeys(("wx", "wy", "wz", "ax", "ay", "az"), "DOUBLE"),
+    },
+    "height": {"time_ns": "BIGINT", "body": "VARCHAR", "height_m": "DOUBLE"},
 }
 
-ADDED_LATER: Final = {"faults": frozenset({"initiator", "target"})}
-"""Columns that a recording may lack, because it is older than they are."""
+ADDED_LATER: Final = {
+    "faults": frozenset({"initiator", "target"}),
+    "imu": frozenset(TABLES["imu"]),
+    "height": frozenset(TABLES["height"]),
+}
+"""Columns that a recording may lack, because it is older than they are; where all of a table's are, the table."""
 
 
 @dataclass(frozen=True, slots=True)

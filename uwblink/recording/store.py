@@ -44,9 +44,7 @@ class Store:
             store = cls(duckdb.connect(str(place)), path)
         except duckdb.Error as error:
             raise RecordingError(f"{path}: cannot be written ({_first_line(error)})") from error
-        for table, columns in TABLES.items():
-            spec = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
-            store.execute(f"CREATE TABLE {table} ({spec})")
+        store._create_missing()
         return store
 
     @classmethod
@@ -69,6 +67,8 @@ class Store:
             raise _damaged(path, error) from error
         try:
             store.check_columns()
+            if update:
+                store._create_missing()
         except RecordingError:
             store.close()
             raise
@@ -112,7 +112,10 @@ class Store:
 
     def take(self, source: Store, table: str) -> None:
         """Add all rows of another file's table in their order, missing values included, some at a time."""
-        names = ", ".join(f'"{name}"' for name in source.columns()[table] & TABLES[table].keys())
+        present = source.columns().get(table, set())
+        if not present:
+            return
+        names = ", ".join(f'"{name}"' for name in present & TABLES[table].keys())
         (last,) = source.read(f"SELECT max(rowid) AS last FROM {table}")["last"]  # noqa: S608 - a key of TABLES
         for start in range(0, 0 if last is np.ma.masked else int(last) + 1, ROWS_AT_A_TIME):
             piece = f"rowid >= {start} AND rowid < {start + ROWS_AT_A_TIME} ORDER BY rowid"
@@ -144,6 +147,12 @@ class Store:
         for table, column in zip(rows["t"], rows["c"], strict=True):
             found.setdefault(str(table), set()).add(str(column))
         return found
+
+    def _create_missing(self) -> None:
+        """Create the tables that the file does not have: all of a new one, and those that an old one is older than."""
+        for table, columns in TABLES.items():
+            spec = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            self.execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
 
     def check_columns(self) -> None:
         """Raise `RecordingError` where the file lacks a table or a column of those that recordings always had."""

@@ -26,6 +26,12 @@ INSTEAD = {
     "cirs": CIRS[:1],
     "frames": [FrameRow(1, "1", "in", b"R01|1\r\n")],
     "faults": [],
+    "imu": {
+        "time_ns": np.array([3]),
+        "body": np.array(["z"]),
+        **{n: np.ones(1) for n in TABLES["imu"] if n[0] in "wa"},
+    },
+    "height": {"time_ns": np.array([3]), "body": np.array(["z"]), "height_m": np.array([np.nan])},
 }
 
 
@@ -40,6 +46,9 @@ def full(tmp_path):
         r.append_overheard([HEARD, HEARD | {"time_ns": 1, "fpp3_dbm": np.nan, "skew3_ppm": np.nan}])
         r.append_cirs(CIRS)
         r.append_frames([FrameRow(9, "1", "in", bytes(range(256))), FrameRow(8, "2", "out", b"C01\r")])
+        readings = {"time_ns": np.array([7, 6]), "body": np.array(["a", "b"])}
+        r.append_columns("imu", {name: np.array([1.5, 2.5]) for name in TABLES["imu"]} | readings)
+        r.append_columns("height", {"height_m": np.array([0.5, 0.25])} | readings)
         r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "failed exchange", "é", 2, 1)])
     with duckdb.connect(str(path)) as db:
         db.execute("INSERT INTO exchanges (time_ns, initiator, target, protocol) VALUES (1, 2, 3, 'ds')")
@@ -75,7 +84,9 @@ def test_only_what_is_replaced_differs(full, tmp_path, table):
         source.copy(tmp_path / "copy.uwb", replacing={table: INSTEAD[table]})
     expected, found = rows(full), rows(tmp_path / "copy.uwb")
     assert found[table] != expected[table]
-    assert len(found.pop(table)) == len(INSTEAD[table]["time_ns"] if table == "overheard" else INSTEAD[table])
+    assert len(found.pop(table)) == len(
+        INSTEAD[table]["time_ns"] if isinstance(INSTEAD[table], dict) else INSTEAD[table]
+    )
     del expected[table]
     assert found | {"meta": sorted(found["meta"])} == expected | {"meta": sorted(expected["meta"])}
 
