@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup demo test lint format bench bench-large bench-workbench bench-boards accuracy fidelity endurance lock clean
+.PHONY: help setup demo test lint format bench bench-large bench-workbench bench-boards accuracy fidelity endurance rooms coverage lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -29,6 +29,12 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 
 test: setup ## run the whole test suite, on two cores
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
+	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term-missing
+
+rooms: setup ## draw the rooms into docs/architecture.md from the imports
+	$(BIN)/python -m tests.rooms
 
 lint: setup ## check style (ruff) and types (mypy)
 	$(BIN)/ruff check .
