@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import uwblink
+
 BIN = Path(sys.executable).parent
 HEAVY = ("matplotlib", "scipy", "duckdb", "numpy", "simpy", "pandas")
 
@@ -27,4 +29,4 @@ def test_usage_errors_have_status_2(command):
     assert subprocess.run([str(BIN / command), "--nonsense"], capture_output=True).returncode == 2
     assert subprocess.run([str(BIN / command), "nonsense"], capture_output=True).returncode == 2
     done = subprocess.run([str(BIN / command), "--version"], capture_output=True, text=True)
-    assert done.stdout.strip() == "0.1.0"
+    assert done.stdout.strip() == uwblink.__version__

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from uwblink.twr import PROTOCOLS, Exchanges, raw_range, register_protocol
     from uwblink.wire.messages import register_message
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "PROTOCOLS",
