@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib.calibration.model import Calibration, CorrectedRanges
+from calib.evaluation.display import as_html, as_text
 from calib.ranges import Ranges
 from calib.sources import Data, load_ranges
 from calib.spread import robust_spread
@@ -82,13 +83,21 @@ class PlantedComparison:
     correction_rms_m: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Evaluation:
     """The outcome for all ranges and for each pair, named "smaller-larger"."""
 
     overall: ErrorStatistics
     pairs: dict[str, ErrorStatistics]
     planted: PlantedComparison | None
+
+    def __repr__(self) -> str:
+        """Return a table of errors in cm, a row a pair."""
+        return as_text(self)
+
+    def _repr_html_(self) -> str:
+        """Return the same as HTML, for notebooks."""
+        return as_html(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib evaluate --json` prints; `planted` only where a simulation planted something."""

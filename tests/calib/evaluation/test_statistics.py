@@ -1,5 +1,7 @@
 """Statistics by pair and overall, against their definitions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,3 +100,23 @@ def test_the_planted_calibration_is_found_beside():
     wrong = (applied.corrected_m - r.raw_m + clean - r.truth_m)[~applied.clamped]
     assert found.correction_rms_m == pytest.approx(np.sqrt(np.mean(wrong**2)), rel=0.02)
     assert found.correction_rms_m < 0.005
+
+
+def test_an_evaluation_prints_on_a_screen():
+    r = ranges(2000)
+    found = evaluate(r, fit(r).calibration)
+    lines = repr(found).splitlines()
+    assert len(lines) == 2 + 6 + 1
+    assert max(map(len, lines)) < 110
+    everything = found.overall
+    assert lines[-1].split() == [
+        "all", "2000", *(
+            f"{100 * value:{form}}"
+            for stats in (everything.raw, everything.delays, everything.full)
+            for value, form in ((stats.mean_m, "+.1f"), (stats.robust_std_m, ".1f"))
+        ), f"{100 * everything.coverage['95']:.0f}", "%",
+    ]  # fmt: skip
+    assert found._repr_html_().count("<tr>") == 8
+    many = replace(found, pairs={f"{k}-{k + 1}": everything for k in range(100)})
+    assert len(repr(many).splitlines()) < 50
+    assert "60 more" in repr(many)

@@ -1,0 +1,39 @@
+"""An evaluation on one screen: errors by stage, for all ranges and by pair, as text and as HTML."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from calib.evaluation.statistics import ErrorStatistics, Evaluation
+
+HEADER: Final = ("pair", "n", "raw", "std", "delays", "std", "full", "std", "sigma's 95 % holds")
+TITLE: Final = "Range errors in cm: mean and robust standard deviation, raw, with delays and fully corrected"
+MOST_PAIRS: Final = 40
+
+
+def as_text(evaluation: Evaluation) -> str:
+    """Return a table as lines of text, a row a pair and one for all."""
+    lines = ["".join(f"{cell:>8s}" for cell in row[:-1]) + f"  {row[-1]}" for row in _rows(evaluation)]
+    return "\n".join([TITLE, *lines])
+
+
+def as_html(evaluation: Evaluation) -> str:
+    """Return the same table as HTML, for notebooks."""
+    rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in _rows(evaluation))
+    return f"<p>{escape(TITLE)}</p><table>{rows}</table>"
+
+
+def _rows(evaluation: Evaluation) -> list[tuple[str, ...]]:
+    pairs = list(evaluation.pairs.items())
+    more = [("...", *[""] * (len(HEADER) - 2), f"{len(pairs) - MOST_PAIRS} more")] if len(pairs) > MOST_PAIRS else []
+    shown = [(name, *_cells(group)) for name, group in pairs[:MOST_PAIRS]]
+    return [HEADER, *shown, *more, ("all", *_cells(evaluation.overall))]
+
+
+def _cells(group: ErrorStatistics) -> tuple[str, ...]:
+    cells = [str(group.raw.n)]
+    for stats in (group.raw, group.delays, group.full):
+        cells += [f"{100 * stats.mean_m:+.1f}", f"{100 * stats.robust_std_m:.1f}"]
+    return (*cells, f"{100 * group.coverage['95']:.0f} %")
