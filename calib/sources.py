@@ -116,6 +116,8 @@ def opened(data: Data) -> Iterator[tuple[str, Source]]:
             yield Path(data).name, RecordedSource(recording)
     elif isinstance(data, Exchanges):
         yield IN_MEMORY, _Bare(data)
+    elif isinstance(data, Ranges):
+        raise BadInputError("ranges do not say where bodies are; give the recording they come from", parameter="data")
     elif isinstance(data, Source):
         yield str(getattr(data, "name", IN_MEMORY)), data
     else:

@@ -103,6 +103,14 @@ def test_what_is_no_recording_is_refused(data):
         load_ranges(data)
 
 
+def test_ranges_are_not_enough_to_localize_or_examine():
+    flight = load_ranges(sample_flight())
+    known = calib.fit(flight).calibration
+    for call in (lambda: calib.examine(flight), lambda: calib.localize(flight, known)):
+        with pytest.raises(BadInputError, match="give the recording"):
+            call()
+
+
 def test_arrays_become_ranges():
     r = Ranges.from_arrays([3, 4], initiator=1, target=[2, 3], fpp1_dbm=[-85.0, 0.0], truth_m=[2.9, 3.9])
     assert r.tags() == [1, 2, 3]
