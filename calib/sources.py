@@ -27,10 +27,10 @@ def no_poses() -> Poses:
 
 @runtime_checkable
 class Source(Protocol):
-    """What anything may hand over instead of a file: exchanges, poses of bodies, the tags on them, what was planted.
+    """What anything may hand over instead of a file: exchanges, poses of bodies, and the tags on them.
 
-    A simulation's result has these attributes. `faults` and `overheard` (columns of the recording's table) are used
-    where they are there, too.
+    A simulation's result has these attributes. Used where they are there, too: `planted`, what a simulation put in,
+    which is shown and never used (or `meta` with that entry); `faults`; `overheard`, columns of the recording's table.
     """
 
     @property
@@ -44,10 +44,6 @@ class Source(Protocol):
     @property
     def tags(self) -> Sequence[Tag]:
         """The tags with their bodies and lever arms."""
-
-    @property
-    def planted(self) -> Mapping[str, Any] | None:
-        """What a simulation put in, which is shown and never used."""
 
 
 Data = str | os.PathLike[str] | Recording | Source | Exchanges | Ranges
@@ -127,7 +123,7 @@ def opened(data: Data) -> Iterator[tuple[str, Source]]:
 def _no_recording(data: object) -> BadInputError:
     return BadInputError(
         f"found {type(data).__name__}, expected a path, a Recording, Exchanges, Ranges, or an object with exchanges, "
-        "poses, tags and planted",
+        "poses and tags",
         parameter="data",
     )
 
@@ -135,9 +131,9 @@ def _no_recording(data: object) -> BadInputError:
 def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False) -> Ranges:
     """Return the ranges of one or more recordings with their true distances, without those that cannot be used.
 
-    `data` is the path of a recording, an open `Recording`, `Ranges`, any object with `exchanges`, `poses`, `tags` and
-    `planted` (as `uwbsim.simulate` gives it), or several of those. `trim_static` leaves out spans of two seconds in
-    which a pair's distance stays within two centimetres. Raises the errors of `Recording.open`, and
+    `data` is the path of a recording, an open `Recording`, `Exchanges` with their true distances, `Ranges`, any object
+    with `exchanges`, `poses` and `tags` (a simulation in memory), or several of those. `trim_static` leaves out spans
+    of two seconds in which a pair's distance stays within two centimetres. Raises the errors of `Recording.open`, and
     `UnanswerableError` where nothing can be used.
 
     >>> import calib
@@ -174,9 +170,14 @@ def _load(data: Data) -> Ranges:
         exchanges = source.exchanges
         complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
         poses, tags = (None, []) if complete else (source.poses, source.tags)
-        planted = source.planted
+        planted = _planted(source)
     ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, planted=planted, source=name)
     return ranges.usable(_why_no_truth(ranges, poses, tags))
+
+
+def _planted(source: Source) -> Mapping[str, Any] | None:
+    found = getattr(source, "planted", None) or getattr(source, "meta", {}).get("planted")
+    return found if isinstance(found, Mapping) else None
 
 
 def _why_no_truth(ranges: Ranges, poses: Poses | None, tags: Sequence[Tag]) -> str:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -83,6 +83,18 @@ def test_a_strangers_object_will_do():
     assert load_ranges(bare).planted is None
     assert_same(load_ranges(bare), load_ranges(flight))
     assert calib.examine(bare) == []
+    planted = {"delays_ns": {"1": 0.1}}
+    assert load_ranges(Bare(flight.exchanges, flight.poses, flight.tags, planted)).planted == planted
+
+
+def test_what_was_planted_may_stand_in_the_meta_of_an_object():
+    flight = sample_flight()
+
+    class Simulation:
+        exchanges, poses, tags = flight.exchanges, flight.poses, flight.tags
+        meta: ClassVar = {"planted": flight.planted}
+
+    assert load_ranges(Simulation()).planted == flight.planted
 
 
 def test_exchanges_with_their_distances_need_no_poses():
