@@ -69,6 +69,11 @@ def register_loss(name: str, weights: Weights, *, replace: bool = False) -> None
     ...     weight = 1 / (1 + u**2) ** 2
     ...     return weight, weight * (1 - 4 * u**2 / (1 + u**2))
     >>> calib.register_loss("geman-mcclure", geman_mcclure)
+
+    And out again:
+
+    >>> from calib.estimation.losses import LOSSES
+    >>> LOSSES.remove("geman-mcclure")
     """
     try:
         LOSSES.register(RobustLoss(name, weights), replace=replace)

@@ -32,6 +32,11 @@ def register_report_section(name: str, section: Section, *, before: str = PROVEN
     >>> def weather(campaign):
     ...     return [Heading("Weather"), Text(f"Dry, for all {len(campaign.judged)} ranges.")]
     >>> calib.register_report_section("weather", weather, before="outliers")
+
+    And out again:
+
+    >>> from calib.report.layout import SECTIONS
+    >>> del SECTIONS["weather"]
     """
     if name in SECTIONS:
         raise BadInputError(f"a section {name!r} is there already; choose another name", parameter="name")
