@@ -3,11 +3,10 @@
 import numpy as np
 
 import calib
-from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate
+import uwbsim
 
-train = simulate(load("scenarios/icra2023/train.toml", ["run.duration_s=60"]))
-test = simulate(load("scenarios/icra2023/test1.toml", ["run.duration_s=30"]))
+train = uwbsim.simulate(uwbsim.load("scenarios/icra2023/train.toml", {"run.duration_s": 60.0}))
+test = uwbsim.simulate(uwbsim.load("scenarios/icra2023/test1.toml", {"run.duration_s": 30.0}))
 
 result = calib.fit(train)
 print(result)

@@ -4,16 +4,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import calib
-from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate, write
+import uwbsim
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_memory_and_file_give_the_same_calibration(tmp_path):
     settings = ["run.duration_s=20", "tags.0.passive=true"]
-    flight = simulate(load(ROOT / "scenarios/icra2023/train.toml", settings))
-    write(flight, tmp_path / "f.uwb")
+    flight = uwbsim.simulate(uwbsim.load(ROOT / "scenarios/icra2023/train.toml", settings))
+    flight.save(tmp_path / "f.uwb")
     in_memory, from_file = calib.fit(flight).calibration, calib.fit(tmp_path / "f.uwb").calibration
     named = {"recordings": ["f.uwb"]}
     assert replace(in_memory, provenance=in_memory.provenance | named).to_json() == from_file.to_json()
