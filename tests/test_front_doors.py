@@ -15,13 +15,14 @@ def offered(package):
     return sorted(getattr(importlib.import_module(package), "__all__", []))
 
 
-NAMES = [(package, name) for package in PACKAGES for name in offered(package)]
+# Examples of calib register rows; tests/calib/test_front_door.py runs them and takes those out again.
+NAMES = [(package, name) for package in PACKAGES if package != "calib" for name in offered(package)]
 
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_what_dir_shows_is_what_is_offered(package):
     module = importlib.import_module(package)
-    if package in dict(NAMES):
+    if offered(package):
         assert sorted(dir(module)) == offered(package)
         assert len(set(module.__all__)) == len(module.__all__)
         with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'nothing'"):
