@@ -22,7 +22,7 @@ class RecordingError(UwblinkError, ValueError):
 
 
 class RecordingExistsError(UwblinkError, FileExistsError):
-    """The output is already there and `--force` was not given."""
+    """The output is already there and was not to be replaced."""
 
 
 class OutputError(UwblinkError, OSError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import sys
 import warnings
@@ -17,6 +18,11 @@ from uwblink.errors import PluginWarning, UwblinkError
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+
+FLAGS: Final = {"map_file": "--map", "tags_from": "--tags"}
+"""Parameters of uwblink whose flag is called otherwise; all others are spelt alike, with dashes."""
+
+_PARAMETER: Final = re.compile(r"`([a-z_]+)`")
 
 MISTAKE: Final = 2
 """Exit status of a command that cannot do what it was told."""
@@ -40,22 +46,27 @@ def run(
     *errors: type[Exception],
     statuses: Mapping[type[Exception], int] | None = None,
     arguments: Sequence[str] | None = None,
-    wording: Callable[[str], str] = str,
+    wording: Callable[[str], str] | None = None,
 ) -> NoReturn:
     """Run a command and end the process: an error of `errors`, or of uwblink, is one line and status 2.
 
     `statuses` gives kinds of errors another status; `arguments` replaces those of the process; `wording` turns what
-    the packages say, which know parameters only, into what people of the command line know.
+    the packages say, which know parameters only, into what people of the command line know (`with_flags`).
     """
     mistakes: tuple[type[Exception], ...] = (UwblinkError, *errors)
     try:
         with _plain_warnings():
             app(args=list(sys.argv[1:] if arguments is None else arguments))
     except mistakes as error:
-        typer.echo(f"error: {wording(str(error))}", err=True)
+        typer.echo(f"error: {(wording or with_flags)(str(error))}", err=True)
         found = (status for kind, status in (statuses or {}).items() if isinstance(error, kind))
         sys.exit(next(found, MISTAKE))
     sys.exit(0)
+
+
+def with_flags(text: str) -> str:
+    """Return a text with flags in place of the parameters in backticks: `force` becomes --force."""
+    return _PARAMETER.sub(lambda found: FLAGS.get(found[1], f"--{found[1].replace('_', '-')}"), text)
 
 
 def print_json(document: Any) -> None:

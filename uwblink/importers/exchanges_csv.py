@@ -135,7 +135,7 @@ class _Table:
     def _missing(self, name: str) -> ImportTableError:
         return ImportTableError(
             f"{self._path}: column {self._map.header(name)!r} is missing; there are "
-            f"{', '.join(self._header)}; a --map can rename columns or give constants"
+            f"{', '.join(self._header)}; a `map_file` can rename columns or give constants"
         )
 
     def _numbers(self, name: str) -> Floats:

@@ -49,7 +49,7 @@ def add_poses(
             found = ", ".join(sorted({tag.body for tag in seats})) or "none"
             raise ImportTableError(
                 f"{source}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
-                "say with --tags where the tags sit"
+                "say in `tags_from` where the tags sit"
             )
         if shift_ns is None:
             shift_ns = find_offset(exchanges, poses, seats).offset_ns
@@ -59,7 +59,7 @@ def add_poses(
         if not covered:
             raise ImportTableError(
                 f"{source}: no exchange lies within its poses, which end {_apart(exchanges.time_ns, moved.time_ns)}; "
-                "give --offset in seconds, or auto"
+                "give `offset` in seconds, or auto"
             )
         meta = {"poses_from": source.name, "poses_offset_s": shift_ns * 1e-9}
         opened.replace_poses(moved, meta, tags)
@@ -72,7 +72,7 @@ def _seconds(text: str) -> int:
     except ValueError:
         value = math.nan
     if not math.isfinite(value) or abs(value) > 4e9:
-        raise ImportTableError(f"--offset: found {text!r}, expected seconds or auto")
+        raise ImportTableError(f"`offset`: found {text!r}, expected seconds or auto")
     return round(value * 1e9)
 
 

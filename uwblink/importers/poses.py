@@ -61,7 +61,7 @@ def _csv(path: Path, body: str | None) -> Iterable[Row]:
 
 def _tum(path: Path, body: str | None) -> Iterable[Row]:
     if body is None:
-        raise ImportTableError(f"{path}: a TUM file does not say whose poses it holds; name the body with --body")
+        raise ImportTableError(f"{path}: a TUM file does not say whose poses it holds; name it as `body`")
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

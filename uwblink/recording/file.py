@@ -372,7 +372,7 @@ def check_output(path: Path, *, force: bool) -> None:
     if path.is_dir():
         raise RecordingError(f"{path}: is a directory, expected the name of an output file")
     if path.exists() and not force:
-        raise RecordingExistsError(f"{path}: exists already; give another name, or --force to replace it")
+        raise RecordingExistsError(f"{path}: exists already; give another name, or `force` to replace it")
     if not path.parent.is_dir():
         raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
     if not os.access(path.parent, os.W_OK):

@@ -62,7 +62,7 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
     if spread > CLEARLY * typical:
         raise ImportTableError(
             f"the ranges do not tell the offset: their spread is {100 * spread:.0f} cm at the best offset and "
-            f"{100 * typical:.0f} cm at others; record bodies that move, or give --offset in seconds"
+            f"{100 * typical:.0f} cm at others; record bodies that move, or give `offset` in seconds"
         )
     return Alignment(best, spread, typical)
 

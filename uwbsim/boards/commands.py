@@ -3,15 +3,13 @@
 A new command is one message class and one executor:
 
 ```python
-@dataclass(frozen=True, slots=True)
+@message(b"C10")
 class GetTemperature(Message):
-    KEY: ClassVar = b"C10"
+    pass
 
-@dataclass(frozen=True, slots=True)
+@message(b"R10")
 class Temperature(Message):
-    KEY: ClassVar = b"R10"
-    FIELDS: ClassVar = {"celsius": INT}
-    celsius: int
+    celsius: int = wire(INT)
 
 register_message(GetTemperature)
 register_message(Temperature)
@@ -19,7 +17,7 @@ register_command(GetTemperature, lambda board: Temperature(23))
 ```
 
 From then on every virtual board answers it, in process and served, and `Board.request(GetTemperature())` returns the
-answer. Fields are handed to the executor in the order of `FIELDS`.
+answer. Fields are handed to the executor in the order in which they are declared.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def test_csv_and_tum_say_the_same(tmp_path):
         ("a.csv", HEADER.replace("body,", "") + "0,1,2,3,0,0,0,1\n", "column 'body' is missing"),
         ("a.csv", HEADER, "holds no poses"),
         ("a.csv", HEADER + "0,b,1,2,3,0,0,0,0\n", "quaternion has length 0"),
-        ("a.tum", "0 1 2 3\n", "--body"),
+        ("a.tum", "0 1 2 3\n", "name it as `body`"),
         ("a.xyz", "", "expected one of"),
     ],
 )

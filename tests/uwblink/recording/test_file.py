@@ -49,7 +49,7 @@ def test_everything_comes_back_bit_for_bit(recording):
 
 def test_an_existing_file_is_not_replaced_without_force(recording):
     before = recording.read_bytes()
-    with pytest.raises(RecordingExistsError, match="--force"):
+    with pytest.raises(RecordingExistsError, match="or `force` to replace it"):
         Recording.create(recording)
     assert recording.read_bytes() == before
     with Recording.create(recording, force=True):
