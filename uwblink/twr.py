@@ -7,7 +7,7 @@ stamp of the third message are in the initiator's clock, the others in the targe
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Literal
 
@@ -395,14 +395,26 @@ def truncate4(values: Floats) -> Floats:
 
 def _rows_by_protocol(exchanges: Exchanges) -> list[tuple[RangingProtocol, Bools]]:
     """Return each protocol that occurs, and its rows; looks for plug-ins only where the rows so far do not suffice."""
+    names, left = exchanges.protocol, len(exchanges)
     found: list[tuple[RangingProtocol, Bools]] = []
-    for rows in (PROTOCOLS.known, PROTOCOLS.values):
-        masks = ((row, exchanges.protocol == row.name) for row in rows())
-        found = [(row, mask) for row, mask in masks if mask.any()]
-        if sum(int(np.count_nonzero(mask)) for _, mask in found) == len(exchanges):
+    for row in _candidates(names):
+        mask = names == row.name
+        if mask.any():
+            found.append((row, mask))
+            left -= int(np.count_nonzero(mask))
+        if not left:
             return found
-    strange = sorted(set(np.unique(exchanges.protocol).tolist()) - set(PROTOCOLS))
-    raise ArgumentError(f"protocol: found {strange[0]!r}, allowed: {', '.join(PROTOCOLS)}")
+    if left:
+        strange = sorted(set(np.unique(names).tolist()) - set(PROTOCOLS))
+        raise ArgumentError(f"protocol: found {strange[0]!r}, allowed: {', '.join(PROTOCOLS)}")
+    return found
+
+
+def _candidates(names: NDArray[np.str_]) -> Iterator[RangingProtocol]:
+    """Yield the rows of `PROTOCOLS`, that of the first exchange first: mostly it is that of all, and one will do."""
+    known = PROTOCOLS.known()
+    yield from sorted(known, key=lambda row: bool(len(names)) and row.name != names[0])
+    yield from (row for row in PROTOCOLS.values() if row not in known)
 
 
 def _pick(spans: Intervals, rows: Bools) -> Intervals:

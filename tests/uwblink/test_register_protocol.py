@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from tests.uwblink.test_twr import exchange
+from uwblink import twr
 from uwblink.errors import ArgumentError
 from uwblink.formulas import half_delays
+from uwblink.plugins import Registry
 from uwblink.ticks import TICK_S
 from uwblink.twr import (
     PROTOCOLS,
@@ -179,3 +181,16 @@ def test_what_cannot_work_is_refused_in_one_line(change, expected):
 def test_what_is_no_protocol_is_refused():
     with pytest.raises(ArgumentError, match="found 'ds', expected a RangingProtocol"):
         register_protocol("ds")  # type: ignore[arg-type]
+
+
+def test_ranges_of_known_protocols_look_for_no_plug_ins(monkeypatch):
+    registry: Registry[RangingProtocol] = Registry("protocol", "nobody", PROTOCOLS.known(), check_protocol)
+
+    def forbidden(**_group):
+        raise AssertionError("entry points were asked for")
+
+    monkeypatch.setattr("importlib.metadata.entry_points", forbidden)
+    monkeypatch.setattr(twr, "PROTOCOLS", registry)
+    for name in ("ss", "ds-sym"):
+        assert time_of_flight(exchange(name, 1000, 98_304_000, 98_304_000, 0, 0))[0] / TICK_S == pytest.approx(1000)
+    assert len(time_of_flight(exchange("ss", 1000, 98_304_000, 0, 0, 0)[:0])) == 0
