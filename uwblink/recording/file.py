@@ -128,14 +128,17 @@ class Recording:
     def append_meta(self, meta: Mapping[str, Any]) -> None:
         """Add entries to `meta`, replacing those with the same key; values are stored as JSON."""
         for key, value in meta.items():
+            try:
+                text = json.dumps(value, sort_keys=True, allow_nan=False)
+            except (TypeError, ValueError) as error:
+                raise RecordingError(f"{self.path}: meta {key!r}: cannot be stored as JSON ({error})") from error
             self._store.execute("DELETE FROM meta WHERE key = ?", [key])
-            text = json.dumps(value, sort_keys=True, allow_nan=False)
             self._store.execute("INSERT INTO meta VALUES (?, ?)", [key, text])
 
     def append_tags(self, tags: Iterable[Tag]) -> None:
         """Add tags with their bodies and lever arms."""
         for t in tags:
-            self._store.execute("INSERT INTO tags VALUES (?, ?, ?, ?, ?)", [t.tag, t.body, *t.lever_arm_m])
+            self._store.insert_row("tags", [t.tag, t.body, *t.lever_arm_m])
 
     def append_exchanges(self, exchanges: Exchanges) -> None:
         """Add exchanges, in one transaction."""

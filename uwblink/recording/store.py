@@ -83,9 +83,15 @@ class Store:
         self._db.execute(statement, values)
 
     def insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Add rows from columns with the table's names; what is masked in them is missing in the table."""
+        """Add rows from columns with the table's names; what is masked in them is missing in the table.
+
+        Raises `RecordingError` for values that do not fit into the table.
+        """
         names = [name for name in TABLES[table] if name in columns]
-        if not len(columns[names[0]]):
+        lengths = {name: len(columns[name]) for name in names}
+        if len(set(lengths.values())) > 1:
+            raise RecordingError(f"{self.path}: table {table}: columns of different lengths, {lengths}")
+        if not lengths or not lengths[names[0]]:
             return
         batch: dict[str, NDArray[Any]] = {}
         values = []
@@ -98,8 +104,27 @@ class Store:
                 values[-1] = f'CASE WHEN "no_{name}" THEN NULL ELSE "{name}" END'
         listed = ", ".join(f'"{name}"' for name in names)
         self._db.register("batch", batch)
-        self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch")  # noqa: S608 - keys of TABLES
+        with self._fitting(table):
+            self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch")  # noqa: S608 - keys of TABLES
         self._db.unregister("batch")
+
+    def insert_row(self, table: str, values: list[Any]) -> None:
+        """Add one row, a value a column; raises `RecordingError` for values that do not fit into the table."""
+        marks = ", ".join("?" * len(values))
+        with self._fitting(table):
+            self.execute(f"INSERT INTO {table} VALUES ({marks})", values)  # noqa: S608 - a key of TABLES
+
+    @contextmanager
+    def _fitting(self, table: str) -> Iterator[None]:
+        import duckdb
+
+        try:
+            yield
+        except (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException) as error:
+            raise RecordingError(
+                f"{self.path}: table {table}: values that do not fit ({_first_line(error)}); "
+                f"its columns are {', '.join(f'{name} {kind}' for name, kind in TABLES[table].items())}"
+            ) from error
 
     def read(self, query: str) -> dict[str, NDArray[Any]]:
         """Return what a query finds, as columns; masked where it is missing. Raises `RecordingError`."""
@@ -137,6 +162,10 @@ class Store:
                 f"{self.path}: cannot be written any more ({_first_line(error)}); is the disk full? "
                 "What was written before is kept"
             ) from error
+        except RecordingError:
+            with suppress(duckdb.Error):
+                self.execute("ROLLBACK")
+            raise
 
     def columns(self) -> dict[str, set[str]]:
         """Return the names of the columns of each table that the file has."""

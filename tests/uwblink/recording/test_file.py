@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import duckdb
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from uwblink.errors import RecordingError, RecordingExistsError, RecordingMissingError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.schema import CirRow, Fault, Poses, Tag
 from uwblink.twr import COLUMNS, Exchanges
 
 
@@ -161,3 +162,40 @@ def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
         pytest.raises(RecordingError, match="open in this program"),
     ):
         Recording.open(tmp_path / "live.uwb")
+
+
+def short(e):
+    return replace(e, range_m=e.range_m[:3])
+
+
+def stray(e):
+    return replace(e, initiator=e.initiator + 70_000)
+
+
+def text(e):
+    return replace(e, tx1=np.full(50, "early"))
+
+
+@pytest.mark.parametrize(
+    ("write", "expected"),
+    [
+        (lambda r: r.append_exchanges(stray(random_exchanges())), "table exchanges: values that do not fit"),
+        (lambda r: r.append_exchanges(text(random_exchanges())), "table exchanges: values that do not fit"),
+        (lambda r: r.append_exchanges(short(random_exchanges())), "table exchanges: columns of different lengths"),
+        (lambda r: r.append_tags([Tag(-1, "a", (0, 0, 0))]), "table tags: values that do not fit"),
+        (lambda r: r.append_cirs([CirRow(1, 1, 1, 2, 0.0, (70_000,))]), "table cirs: values that do not fit"),
+        (lambda r: r.append_meta({"bad": float("nan")}), "meta 'bad': cannot be stored as JSON"),
+        (lambda r: r.append_meta({"bad": {1, 2}}), "meta 'bad': cannot be stored as JSON"),
+    ],
+)
+def test_what_does_not_fit_is_one_line_and_leaves_the_rest_of_a_transaction_out(tmp_path, write, expected):
+    with Recording.create(tmp_path / "f.uwb", live=True) as r:
+        r.append_exchanges(random_exchanges(7))
+        with pytest.raises(RecordingError, match=expected) as caught, r.transaction():
+            r.append_exchanges(random_exchanges(5))
+            write(r)
+        assert "\n" not in str(caught.value)
+        assert r.count("exchanges") == 7
+        r.append_exchanges(random_exchanges(2))
+    with Recording.open(tmp_path / "f.uwb") as r:
+        assert r.count("exchanges") == 9
