@@ -41,6 +41,15 @@ from uwblink import Contents, Exchanges
 from uwblink.importers import Importer
 from uwblink.twr import ProtocolMessage, RangingProtocol
 
+
+def flight_ticks(t):
+    return (t.dt41 * t.dt53 / t.dt64 - t.dt32) / 2
+
+
+def delay_weights(t):
+    return t.dt53 / t.dt64 / 2, np.full_like(t.dt41, 0.5)
+
+
 PROTOCOL = RangingProtocol(
     "strange-ds",
     "DS-TWR of a stranger",
@@ -49,8 +58,8 @@ PROTOCOL = RangingProtocol(
         ProtocolMessage("target", "rx1", "at once"),
         ProtocolMessage("target", "tx2", "scheduled"),
     ),
-    lambda t: (t.dt41 * t.dt53 / t.dt64 - t.dt32) / 2,
-    lambda t: (t.dt53 / t.dt64 / 2, np.full_like(t.dt41, 0.5)),
+    flight_ticks,
+    delay_weights,
 )
 
 

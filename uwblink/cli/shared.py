@@ -46,19 +46,19 @@ def run(
     *errors: type[Exception],
     statuses: Mapping[type[Exception], int] | None = None,
     arguments: Sequence[str] | None = None,
-    wording: Callable[[str], str] | None = None,
+    wording: Callable[[str], str] = str,
 ) -> NoReturn:
     """Run a command and end the process: an error of `errors`, or of uwblink, is one line and status 2.
 
     `statuses` gives kinds of errors another status; `arguments` replaces those of the process; `wording` turns what
-    the packages say, which know parameters only, into what people of the command line know (`with_flags`).
+    the packages say, which know parameters only, into what people of the command line know, before `with_flags` does.
     """
     mistakes: tuple[type[Exception], ...] = (UwblinkError, *errors)
     try:
         with _plain_warnings():
             app(args=list(sys.argv[1:] if arguments is None else arguments))
     except mistakes as error:
-        typer.echo(f"error: {(wording or with_flags)(str(error))}", err=True)
+        typer.echo(f"error: {with_flags(wording(str(error)))}", err=True)
         found = (status for kind, status in (statuses or {}).items() if isinstance(error, kind))
         sys.exit(next(found, MISTAKE))
     sys.exit(0)
