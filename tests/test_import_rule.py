@@ -1,12 +1,10 @@
 """The import rule of docs/architecture.md, held by walking every import statement."""
 
-import ast
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("uwblink", "uwbsim", "calib")
+from tests.rooms import DRAWN, PACKAGES, PAGE, ROOT, circle, drawing, imports, rooms
 
 FORBIDDEN = {
     "uwblink": {"uwbsim", "calib"},
@@ -28,21 +26,41 @@ CONFINED = {
     "rosbags": lambda path: path == "uwblink/importers/poses.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }
+# The rooms by floor, the ground first: a room imports only rooms of lower floors, so two on one floor never meet.
+FLOORS = {
+    "uwblink": (
+        ("arrays", "errors", "lazy", "ticks"),
+        ("output", "plugins", "toml"),
+        ("twr",),
+        ("wire",),
+        ("recording",),
+        ("boards", "importers"),
+        ("cli",),
+    ),
+    "uwbsim": (
+        ("errors", "random_streams"),
+        ("output", "scenario"),
+        ("world",),
+        ("simulation",),
+        ("boards", "protocols"),
+        ("pages", "sweep"),
+        ("cli",),
+    ),
+    "calib": (
+        ("errors",),
+        ("output", "ranges"),
+        ("calibration",),
+        ("estimation", "evaluation"),
+        ("doctor",),
+        ("report",),
+        ("cli",),
+    ),
+}
 NEVER = {"pickle", "pandas", "pyarrow"}
 
 
-def imported(source: str) -> set[str]:
-    names = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names.add(node.module.split(".")[0])
-    return names
-
-
 def violations(package: str, path: str, source: str) -> list[str]:
-    names = imported(source)
+    names = {name.split(".")[0] for name in imports(source)}
     wrong = names & (FORBIDDEN[package] | NEVER)
     wrong |= {lib for lib, allowed in CONFINED.items() if lib in names and not allowed(path)}
     return [f"{path} imports {name}" for name in sorted(wrong)]
@@ -70,3 +88,41 @@ def test_package_keeps_the_import_rule(package):
 )
 def test_the_walk_sees_a_violation(package, path, source):
     assert violations(package, path, source)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_rooms_import_only_rooms_below_them(package):
+    graph = rooms(package)
+    assert circle(graph) == []
+    floor = {name: k for k, names in enumerate(FLOORS[package]) for name in names}
+    assert sorted(set(graph) - set(floor)) == [], "rooms without a floor"
+    wrong = [f"{name} imports {other}" for name in graph for other in graph[name] if floor[other] >= floor[name]]
+    assert wrong == []
+
+
+def written(folder, **sources):
+    for name, source in sources.items():
+        path = folder / "calib" / name.replace("__", "/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.with_suffix(".py").write_text(source)
+    return folder
+
+
+def test_a_circle_is_seen(tmp_path):
+    root = written(
+        tmp_path,
+        __init__="from calib.fits__x import a",
+        errors="",
+        fits__x="import calib.errors\nfrom calib.report import y",
+        report__y="def f():\n    from calib.fits.x import g",
+    )
+    graph = rooms("calib", root)
+    assert graph == {"errors": set(), "fits": {"errors", "report"}, "report": {"fits"}}
+    assert circle(graph) == ["fits", "report"]
+
+
+def test_the_picture_of_rooms_is_what_the_imports_say():
+    found = DRAWN.search(PAGE.read_text(encoding="utf-8"))
+    assert found, "docs/architecture.md has no place for the picture of rooms"
+    drawn = found[0].removeprefix(found[1]).removesuffix(found[2])
+    assert drawn == drawing(), "draw the rooms anew: make rooms"

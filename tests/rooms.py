@@ -1,0 +1,100 @@
+"""The rooms of the packages as their imports say: who imports whom, and on which floor that puts each.
+
+`python -m tests.rooms` draws them into docs/architecture.md (`make rooms`).
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("uwblink", "uwbsim", "calib")
+PAGE = ROOT / "docs" / "architecture.md"
+DRAWN = re.compile(r"(<!-- rooms:begin[^>]*-->\n```\n).*?(```\n<!-- rooms:end -->)", re.DOTALL)
+
+
+Rooms = dict[str, set[str]]
+
+
+def imports(source: str) -> Iterator[str]:
+    """Yield the dotted names that a module imports, those under `if TYPE_CHECKING` among them."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def room_of(path: Path, package: Path) -> str:
+    """Return the room of a file: its folder in the package, or itself where it stands in none."""
+    return path.relative_to(package).parts[0].removesuffix(".py")
+
+
+def rooms(package: str, root: Path = ROOT) -> Rooms:
+    """Return every room of a package and the other rooms that it imports; the front door is none."""
+    folder = root / package
+    names = {room_of(path, folder) for path in folder.rglob("*.py")} - {"__init__", "__main__"}
+    found: Rooms = {name: set() for name in names}
+    for path in folder.rglob("*.py"):
+        here = room_of(path, folder)
+        if here not in found:
+            continue
+        dotted = (name.split(".") for name in imports(path.read_text(encoding="utf-8")))
+        found[here] |= {parts[1] for parts in dotted if parts[0] == package and len(parts) > 1} & names - {here}
+    return found
+
+
+def circle(graph: Rooms) -> list[str]:
+    """Return rooms that cannot be put on floors because they import each other in a circle; empty if there are none."""
+    left = {name: set(others) for name, others in graph.items()}
+    while low := [name for name, others in left.items() if not others & left.keys()]:
+        for name in low:
+            del left[name]
+    return sorted(left)
+
+
+def floors(graph: Rooms) -> list[list[str]]:
+    """Return the rooms by floor, the ground first: each stands one above the highest that it imports."""
+    if found := circle(graph):
+        raise ValueError(f"rooms import each other in a circle: {', '.join(found)}")
+    height: dict[str, int] = {}
+    while len(height) < len(graph):
+        for name, others in graph.items():
+            if others <= height.keys():
+                height[name] = 1 + max((height[other] for other in others), default=-1)
+    return [sorted(n for n, h in height.items() if h == level) for level in range(max(height.values()) + 1)]
+
+
+def drawing(root: Path = ROOT) -> str:
+    """Return the picture: from the top floor down, each room with the rooms below it that it imports."""
+    lines = []
+    for package in PACKAGES:
+        graph = rooms(package, root)
+        lines.append(package)
+        for level, names in reversed([*enumerate(floors(graph))]):
+            for k, name in enumerate(names):
+                label = f"  {level if not k else ' '}  {name:15}"
+                below = ", ".join(sorted(graph[name]))
+                lines.append(f"{label} imports {below}" if below else label.rstrip())
+        lines.append("")
+    return "\n".join(lines[:-1]) + "\n"
+
+
+def main() -> int:
+    """Put the picture into the page."""
+    text = PAGE.read_text(encoding="utf-8")
+    updated, count = DRAWN.subn(lambda found: found[1] + drawing() + found[2], text)
+    if count != 1:
+        print(f"{PAGE}: found {count} places for the picture, expected one")
+        return 1
+    PAGE.write_text(updated, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
