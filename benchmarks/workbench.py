@@ -70,7 +70,7 @@ def full() -> str:
 
 
 def _rate(conditions: object, count: int = 4_000_000) -> str:
-    from uwblink.twr import PROTOCOLS
+    from uwblink.protocols.table import PROTOCOLS
     from uwbsim.protocols.monte_carlo import error_pieces
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
@@ -80,7 +80,8 @@ def _rate(conditions: object, count: int = 4_000_000) -> str:
 
 def engines() -> tuple[np.ndarray, np.ndarray, float]:
     """A million ranges by integer stamps and by floats, over the same states; the standard error of a difference."""
-    from uwblink.twr import PROTOCOLS, raw_range
+    from uwblink.protocols.table import PROTOCOLS
+    from uwblink.twr import raw_range
     from uwbsim.protocols.conditions import conditions_of
     from uwbsim.protocols.monte_carlo import range_errors_m
     from uwbsim.protocols.prediction import predict

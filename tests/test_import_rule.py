@@ -29,8 +29,9 @@ CONFINED = {
 # The rooms by floor, the ground first: a room imports only rooms of lower floors, so two on one floor never meet.
 FLOORS = {
     "uwblink": (
-        ("arrays", "errors", "lazy", "ticks"),
-        ("output", "plugins", "toml"),
+        ("arrays", "display", "errors", "lazy", "toml"),
+        ("columns", "output", "plugins", "ticks"),
+        ("protocols",),
         ("twr",),
         ("wire",),
         ("recording",),
@@ -47,10 +48,12 @@ FLOORS = {
         ("cli",),
     ),
     "calib": (
-        ("errors",),
-        ("output", "ranges"),
-        ("calibration",),
-        ("estimation", "evaluation"),
+        ("errors", "samples", "spread"),
+        ("ranges",),
+        ("calibration", "sources"),
+        ("evaluation",),
+        ("figures",),
+        ("estimation",),
         ("doctor",),
         ("report",),
         ("cli",),

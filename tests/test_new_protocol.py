@@ -10,9 +10,10 @@ import calib.cli
 import uwblink.cli
 import uwbsim.cli
 from tests.uwblink.test_register_protocol import SYMMETRIC, TARGETS
+from uwblink.protocols.table import PROTOCOLS, register_protocol
 from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwblink.twr import PROTOCOLS, delay_weights, raw_range, register_protocol
+from uwblink.twr import delay_weights, raw_range
 from uwbsim.protocols.conditions import Conditions
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict

@@ -17,11 +17,13 @@ if TYPE_CHECKING:
     from uwblink.boards.recorder import record
     from uwblink.errors import UwblinkError
     from uwblink.importers import import_recording, register_importer
+    from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
+    from uwblink.protocols.table import PROTOCOLS, register_protocol
     from uwblink.recording.contents import Contents, load
     from uwblink.recording.file import Recording
     from uwblink.recording.schema import Poses, Tag
     from uwblink.ticks import SPEED_OF_LIGHT
-    from uwblink.twr import PROTOCOLS, Exchanges, raw_range, register_protocol
+    from uwblink.twr import Exchanges, raw_range
     from uwblink.wire.messages import register_message
 
 __version__ = "0.2.0"
@@ -35,7 +37,9 @@ __all__ = [
     "Heard",
     "Listener",
     "Poses",
+    "ProtocolMessage",
     "RangingPlan",
+    "RangingProtocol",
     "Recording",
     "Tag",
     "UwblinkError",
@@ -49,7 +53,7 @@ __all__ = [
 ]
 
 _HOMES: Final = {
-    "PROTOCOLS": "uwblink.twr",
+    "PROTOCOLS": "uwblink.protocols.table",
     "SPEED_OF_LIGHT": "uwblink.ticks",
     "Board": "uwblink.boards.board",
     "Contents": "uwblink.recording.contents",
@@ -57,7 +61,9 @@ _HOMES: Final = {
     "Heard": "uwblink.boards.listeners",
     "Listener": "uwblink.boards.listeners",
     "Poses": "uwblink.recording.schema",
+    "ProtocolMessage": "uwblink.protocols.rows",
     "RangingPlan": "uwblink.boards.ranging_plan",
+    "RangingProtocol": "uwblink.protocols.rows",
     "Recording": "uwblink.recording.file",
     "Tag": "uwblink.recording.schema",
     "UwblinkError": "uwblink.errors",
@@ -67,7 +73,7 @@ _HOMES: Final = {
     "record": "uwblink.boards.recorder",
     "register_importer": "uwblink.importers",
     "register_message": "uwblink.wire.messages",
-    "register_protocol": "uwblink.twr",
+    "register_protocol": "uwblink.protocols.table",
 }
 
 if not TYPE_CHECKING:

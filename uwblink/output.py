@@ -5,10 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from uwblink.errors import OutputError
-from uwblink.recording.file import check_output
-
-__all__ = ["check_output", "write_bytes", "write_text"]
+from uwblink.errors import OutputError, RecordingError, RecordingExistsError
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
@@ -30,3 +27,15 @@ def write_bytes(path: Path, data: bytes, *, force: bool) -> None:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def check_output(path: Path, *, force: bool) -> None:
+    """Raise the one clear error if `path` cannot be written to; writes nothing."""
+    if path.is_dir():
+        raise RecordingError(f"{path}: is a directory, expected the name of an output file")
+    if path.exists() and not force:
+        raise RecordingExistsError(f"{path}: exists already; give another name, or `force` to replace it")
+    if not path.parent.is_dir():
+        raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise RecordingError(f"{path}: no permission to write in {path.parent}")

@@ -1,4 +1,4 @@
-"""Two-way ranging: exchange columns, and the protocols as rows of one table.
+"""Two-way ranging: exchanges as columns, and the ranges that their stamps say.
 
 Stamps are those of Shalaby et al., ICRA 2023, Fig. 2: t1..t6 = tx1, rx1, tx2, rx2, tx3, rx3, so
 dt41 = rx2 - tx1, dt32 = tx2 - rx1, dt53 = tx3 - tx2, dt64 = rx3 - rx2. tx1, rx2 and the initiator's
@@ -7,23 +7,21 @@ stamp of the third message are in the initiator's clock, the others in the targe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uwblink import columns, formulas
+from uwblink import columns
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, as_text, excerpt, first_few
 from uwblink.errors import ArgumentError
-from uwblink.formulas import Intervals
-from uwblink.plugins import NAME, Registry
-from uwblink.protocol_checks import check_formulas, check_messages
+from uwblink.protocols.formulas import Intervals
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import COUNTER_BITS, METRES_PER_TICK, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
-
-Role = Literal["initiator", "target"]
 
 STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 
@@ -184,141 +182,6 @@ def _messages(names: NDArray[np.str_]) -> Ints:
         if name not in PROTOCOLS:
             raise ArgumentError(f"protocol: found {name[:40]!r}, allowed: {', '.join(PROTOCOLS)}")
     return np.array([len(PROTOCOLS[name].messages) for name in known.tolist()], dtype=np.int64)[place]
-
-
-@dataclass(frozen=True, slots=True)
-class ProtocolMessage:
-    """One message of a protocol: who sends it, after which stamp, and on whose timing.
-
-    `timing` is `"at once"` (as soon as the software gets there) or `"scheduled"` (a delayed
-    transmission on the chip's 512-tick grid, a set number of UWB microseconds after the stamp).
-    """
-
-    sender: Role
-    after: str
-    timing: Literal["at once", "scheduled"]
-
-
-@dataclass(frozen=True, slots=True)
-class RangingProtocol:
-    """A ranging protocol: its messages and its formulas, from which everything else follows.
-
-    `flight_ticks` maps `uwblink.formulas.Intervals` (n,) to the time of flight in ticks of the initiator's clock, (n,);
-    `delay_weights` to the pair (d t_f/d d_i, d t_f/d d_j), (n,) each, by which a tag's aggregate antenna delay
-    d = d_t - d_r enters the calibrated time of flight.
-    """
-
-    name: str
-    title: str
-    messages: tuple[ProtocolMessage, ...]
-    flight_ticks: Callable[[Intervals], Floats]
-    delay_weights: Callable[[Intervals], tuple[Floats, Floats]]
-
-    @property
-    def third_sender(self) -> Role | None:
-        """Who sends the third message; None where there are only two."""
-        return self.messages[2].sender if len(self.messages) > 2 else None
-
-
-_POLL = ProtocolMessage("initiator", "", "at once")
-
-_OWN: Final = (
-    RangingProtocol(
-        "ss",
-        "SS-TWR",
-        (_POLL, ProtocolMessage("target", "rx1", "scheduled")),
-        formulas.single_sided,
-        formulas.half_delays,
-    ),
-    RangingProtocol(
-        "ss-cfo",
-        "SS-TWR, corrected with the carrier integrator",
-        (_POLL, ProtocolMessage("target", "rx1", "scheduled")),
-        formulas.carrier_corrected,
-        formulas.carrier_delays,
-    ),
-    RangingProtocol(
-        "ds",
-        "DS-TWR, third message from the target",
-        (_POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("target", "tx2", "scheduled")),
-        formulas.double_sided,
-        formulas.double_sided_delays,
-    ),
-    RangingProtocol(
-        "ds-alt",
-        "DS-TWR, third message from the initiator",
-        (_POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("initiator", "rx2", "scheduled")),
-        formulas.alternative,
-        formulas.alternative_delays,
-    ),
-    RangingProtocol(
-        "ds-sym",
-        "DS-TWR, third message from the initiator, equal replies",
-        (_POLL, ProtocolMessage("target", "rx1", "scheduled"), ProtocolMessage("initiator", "rx2", "scheduled")),
-        formulas.alternative,
-        formulas.alternative_delays,
-    ),
-)
-
-ON_BOARDS: Final = ("ss", "ds")
-"""The protocols that the boards' firmware executes."""
-
-
-def check_protocol(row: RangingProtocol) -> None:
-    """Raise `ArgumentError` for a protocol that cannot be simulated, recorded and calibrated; says what is wrong.
-
-    Its messages are two or three, of the order that the stamps of a recording have; and its formulas, tried on two
-    exchanges without noise or skew, find the time of flight exactly, and take an antenna delay on either side out.
-    """
-    if not isinstance(row, RangingProtocol):
-        raise ArgumentError(f"protocol: found {row!r:.60}, expected a RangingProtocol")
-    if not isinstance(row.name, str) or not NAME.fullmatch(row.name):
-        raise ArgumentError(f"protocol: name: found {row.name!r:.60}, expected a word such as 'ds-alt'")
-    if not isinstance(row.title, str) or not row.title:
-        raise ArgumentError(f"protocol {row.name!r}: title: found {row.title!r:.60}, expected what pages call it")
-    if not isinstance(row.messages, tuple) or not all(isinstance(m, ProtocolMessage) for m in row.messages):
-        raise ArgumentError(
-            f"protocol {row.name!r}: messages: found {row.messages!r:.60}, expected a tuple of ProtocolMessage"
-        )
-    check_messages(row)
-    check_formulas(row)
-
-
-PROTOCOLS: Final[Registry[RangingProtocol]] = Registry("protocol", "uwbcal.protocols", _OWN, check_protocol)
-"""Protocols by name: the project's, those of `register_protocol`, and those of installed distributions."""
-
-
-def register_protocol(row: RangingProtocol, *, replace: bool = False) -> None:
-    """Add a protocol to `PROTOCOLS`: simulation, recording, calibration and comparison then know it by its name.
-
-    `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken, for messages
-    that a recording has no place for, and for formulas that are not exact without noise.
-
-    >>> import numpy as np, uwblink
-    >>> from uwblink.twr import ProtocolMessage, RangingProtocol
-    >>> poll = ProtocolMessage("initiator", "", "at once")
-    >>> reply = ProtocolMessage("target", "rx1", "scheduled")
-    >>> mine = RangingProtocol(
-    ...     "my-ss", "SS-TWR of mine", (poll, reply),
-    ...     flight_ticks=lambda t: (t.dt41 - t.dt32) / 2,
-    ...     delay_weights=lambda t: (np.full_like(t.dt41, 0.5), np.full_like(t.dt41, 0.5)),
-    ... )
-    >>> uwblink.register_protocol(mine)
-    >>> "my-ss" in uwblink.PROTOCOLS
-    True
-    >>> uwblink.PROTOCOLS.remove("my-ss")
-    """
-    PROTOCOLS.register(row, replace=replace)
-
-
-def single_sided() -> tuple[str, ...]:
-    """Return the names of the protocols of two messages."""
-    return tuple(row.name for row in PROTOCOLS.values() if row.third_sender is None)
-
-
-def third_from_target() -> tuple[str, ...]:
-    """Return the names of the protocols whose third message the target sends."""
-    return tuple(row.name for row in PROTOCOLS.values() if row.third_sender == "target")
 
 
 def intervals(exchanges: Exchanges) -> Intervals:

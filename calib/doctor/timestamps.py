@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from calib.doctor.base import PLAUSIBLE_M, Finding, RecordingView, pair_ids, plausible_share
+from uwblink.protocols.table import single_sided
 from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
-from uwblink.twr import board_range, intervals, raw_range, single_sided
+from uwblink.twr import board_range, intervals, raw_range
 
 VACUUM_OVER_AIR: Final = 299_792_458.0 / SPEED_OF_LIGHT
 

@@ -23,9 +23,9 @@ from calib.calibration.power_curves import lift
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.sources import Data, opened
 from uwblink.arrays import Floats
+from uwblink.protocols.table import third_from_target
 from uwblink.recording.distances import distances_m
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
-from uwblink.twr import third_from_target
 
 FEWEST: Final = 50
 PLAUSIBLE_NS: Final = 100.0

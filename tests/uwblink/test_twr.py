@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import METRES_PER_TICK, TICK_S, elapsed
-from uwblink.twr import PROTOCOLS, Exchanges, delay_weights, time_of_flight, truncate4
+from uwblink.twr import Exchanges, delay_weights, time_of_flight, truncate4
 
 
 def initiator_stamps(protocol):

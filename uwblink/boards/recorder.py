@@ -21,7 +21,8 @@ from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.station import Station
 from uwblink.boards.writer import RecordingWriter
 from uwblink.errors import BoardError, PlanError, PortError, PortLostError
-from uwblink.recording.file import Recording, check_output
+from uwblink.output import check_output
+from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Tag
 from uwblink.wire.codec import Event
 from uwblink.wire.messages import IdReport, Message, RangeCommand, RangeReport, Skipped, TextLine

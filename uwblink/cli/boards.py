@@ -191,7 +191,7 @@ def cir(
     """Range with another board and print the channel impulse response."""
     from uwblink.boards.board import Board
     from uwblink.errors import RecordingError
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output
 
     if plot:
         check_output(plot, force=force)

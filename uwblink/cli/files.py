@@ -73,7 +73,8 @@ def replay(
 ) -> None:
     """Decode the stored bytes again, or play them back as boards would have sent them."""
     from uwblink.boards.replay import decode_again, play, rewrite, summarize
-    from uwblink.recording.file import Recording, check_output
+    from uwblink.output import check_output
+    from uwblink.recording.file import Recording
 
     if output:
         check_output(output, force=force)

@@ -68,7 +68,7 @@ def _argument(row: Importer) -> Any:
 def _import(row: Importer, source: Path, output: Path, map_file: Path | None, *, force: bool) -> None:
     from uwblink.display import printable
     from uwblink.importers import read_source
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output
 
     check_output(output, force=force)
     contents = read_source(source, importer=row.name, map_file=map_file)

@@ -40,7 +40,7 @@ def record(
     from uwblink.boards.ranging_plan import RangingPlan, load_plan
     from uwblink.boards.recorder import record as run
     from uwblink.errors import PlanError
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output
 
     check_output(output, force=force)
     if (plan is None) == (pairs is None):

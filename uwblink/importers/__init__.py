@@ -14,9 +14,9 @@ from typing import Any, Final
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.exchanges_csv import read_csv
 from uwblink.importers.miluv import read_miluv
+from uwblink.output import check_output
 from uwblink.plugins import NAME, Registry
 from uwblink.recording.contents import Contents
-from uwblink.recording.file import check_output
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Final
 
 from uwblink.errors import ImportTableError
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.toml import TomlReader, is_number
-from uwblink.twr import PROTOCOLS, STAMPS
+from uwblink.twr import STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
 LEVELS: Final = ("fpp1", "fpp2", "skew1", "skew2", "gt_range_m")

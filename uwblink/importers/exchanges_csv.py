@@ -20,9 +20,10 @@ import numpy as np
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import LEVELS, POSITIONS, STAMP_UNITS, TIME_UNITS, ColumnMap, load_map
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.contents import Contents
 from uwblink.recording.schema import Tag
-from uwblink.twr import LARGEST_ID, LATEST_NS, PROTOCOLS, STAMPS, Exchanges, raw_range
+from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS, Exchanges, raw_range
 
 REQUIRED: Final = ("time_s", "from_id", "to_id", *STAMPS[:4])
 

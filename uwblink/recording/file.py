@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.errors import RecordingError, RecordingExistsError, RecordingMissingError
+from uwblink.errors import RecordingError, RecordingMissingError
+from uwblink.output import check_output
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.schema import (
     FORMAT_VERSION,
     SUFFIX,
@@ -31,7 +33,7 @@ from uwblink.recording.schema import (
 )
 from uwblink.recording.store import Store
 from uwblink.ticks import REPORT_BITS
-from uwblink.twr import COLUMNS, PROTOCOLS, Exchanges
+from uwblink.twr import COLUMNS, Exchanges
 
 if TYPE_CHECKING:
     from uwblink.recording.summary import Summary
@@ -368,18 +370,6 @@ def _known_tables(names: Iterable[str]) -> None:
     for name in names:
         if name not in TABLES:
             raise RecordingError(f"no table {name!r} in a recording; there are {', '.join(TABLES)}")
-
-
-def check_output(path: Path, *, force: bool) -> None:
-    """Raise the one clear error if `path` cannot be written to; writes nothing."""
-    if path.is_dir():
-        raise RecordingError(f"{path}: is a directory, expected the name of an output file")
-    if path.exists() and not force:
-        raise RecordingExistsError(f"{path}: exists already; give another name, or `force` to replace it")
-    if not path.parent.is_dir():
-        raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
-    if not os.access(path.parent, os.W_OK):
-        raise RecordingError(f"{path}: no permission to write in {path.parent}")
 
 
 def _filled(column: NDArray[Any]) -> NDArray[Any]:

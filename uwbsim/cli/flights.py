@@ -36,7 +36,7 @@ def run(
     force: Force = False,
 ) -> None:
     """Simulate a scenario and write what its boards and motion capture record."""
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output
     from uwbsim.scenario.loading import load
     from uwbsim.simulation.run import simulate, write
     from uwbsim.simulation.through_wire import through_wire
@@ -66,7 +66,7 @@ def serve(
     force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output
     from uwbsim.boards.server import Server, extended, write_poses
     from uwbsim.scenario import faults as fault_files
     from uwbsim.scenario.loading import load
@@ -94,7 +94,7 @@ def show(
     force: Force = False,
 ) -> None:
     """Draw the room, the flights, and one exchange of each protocol."""
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output
     from uwbsim.pages.scenario_page import show as draw
     from uwbsim.scenario.loading import load
 

@@ -65,7 +65,7 @@ def compare(
 
 
 def _names(protocols: str) -> list[str]:
-    from uwblink.twr import PROTOCOLS
+    from uwblink.protocols.table import PROTOCOLS
 
     return list(PROTOCOLS) if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()]
 

@@ -7,7 +7,7 @@ from html import escape
 from typing import Any, Final
 
 from uwblink.arrays import Floats
-from uwblink.twr import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS
 from uwbsim.pages import protocol_figures as figures
 from uwbsim.pages.scenario_figures import png
 from uwbsim.pages.scenario_page import STYLE, figure_html

@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import TICK_S
-from uwblink.twr import PROTOCOLS, RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
 from uwbsim.scenario.model import Scenario

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from uwblink.output import check_output, write_text
-from uwblink.twr import PROTOCOLS, RangingProtocol
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
 from uwbsim.pages.scenario_figures import png, room, timing
 from uwbsim.pages.scenario_summary import preview, sentences

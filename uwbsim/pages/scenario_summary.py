@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwblink.twr import PROTOCOLS
 from uwbsim.scenario.model import UUS_S, Scenario
 from uwbsim.simulation.schedule import schedule
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND

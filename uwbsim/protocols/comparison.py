@@ -9,8 +9,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from uwblink.arrays import Floats
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
-from uwblink.twr import PROTOCOLS, RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.twr import RangingProtocol
+from uwblink.protocols.rows import RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.comparison import calibrated, chosen, costs
 from uwbsim.protocols.conditions import Conditions, conditions_of

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
+from uwblink.protocols.rows import RangingProtocol
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwblink.twr import RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.comparison import chosen
 from uwbsim.protocols.conditions import Conditions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from uwblink.twr import RangingProtocol
+from uwblink.protocols.rows import RangingProtocol
 
 PREAMBLE_SYMBOL_S: Final = 508 / 499.2e6
 HEADER_SYMBOL_S: Final = 512 / 499.2e6

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwblink.twr import PROTOCOLS
 from uwbsim.scenario.airtime import exchange_air_s
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints

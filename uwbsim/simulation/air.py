@@ -16,7 +16,7 @@ from typing import Any, Final
 import simpy
 
 from uwblink.arrays import Floats
-from uwblink.twr import RangingProtocol
+from uwblink.protocols.rows import RangingProtocol
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 

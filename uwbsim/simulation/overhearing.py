@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Ints
+from uwblink.protocols.rows import RangingProtocol
 from uwblink.recording.schema import CirRow
 from uwblink.ticks import REPORT_BITS
-from uwblink.twr import Exchanges, RangingProtocol
+from uwblink.twr import Exchanges
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.timestamps import Stamped

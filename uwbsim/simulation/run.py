@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
 from uwblink.ticks import REPORT_BITS, UUS_TICKS
-from uwblink.twr import PROTOCOLS, STAMPS, Exchanges, RangingProtocol, board_range, raw_range
+from uwblink.twr import STAMPS, Exchanges, board_range, raw_range
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import before_marker_s

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from uwblink.protocols.table import ON_BOARDS
 from uwblink.recording.schema import FrameRow
 from uwblink.ticks import TICK_S, elapsed
-from uwblink.twr import COLUMNS, ON_BOARDS
+from uwblink.twr import COLUMNS
 from uwblink.wire.bulk import ColumnDecoder
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import RangeReport

@@ -12,13 +12,13 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
+from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
 from uwblink.ticks import (
     ANTENNA_DELAY_TICKS,
     DELAYED_TX_GRID,
     TICK_S,
     UUS_TICKS,
 )
-from uwblink.twr import ProtocolMessage, RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import US

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from uwblink.twr import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import load

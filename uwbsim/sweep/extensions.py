@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any, Final
 
-from uwblink.twr import PROTOCOLS, RangingProtocol, register_protocol
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS, register_protocol
 from uwbsim.errors import ParameterError
 from uwbsim.simulation.run import Simulated
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect

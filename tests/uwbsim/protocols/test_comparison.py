@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwblink.twr import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS
 from uwbsim.protocols.comparison import calibrated, compare, costs, over_reply, over_skew, paper_bias_m, winners
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.reply_delay import optimum

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwblink.twr import COLUMNS, PROTOCOLS, raw_range
+from uwblink.twr import COLUMNS, raw_range
 from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.monte_carlo import error_pieces, range_errors_m
 from uwbsim.protocols.prediction import predict

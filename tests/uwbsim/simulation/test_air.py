@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblink.twr import PROTOCOLS
+from uwblink.protocols.table import PROTOCOLS
 from uwbsim.scenario.airtime import before_marker_s, exchange_air_s, frame_s
 from uwbsim.simulation import air
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND

@@ -15,7 +15,7 @@ import duckdb
 import numpy as np
 import pytest
 
-from uwblink.twr import PROTOCOLS, register_protocol
+from uwblink.protocols.table import PROTOCOLS, register_protocol
 from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
 from uwbsim.sweep.design import load_design, toml_value
 from uwbsim.sweep.executors import Processes

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, Protocol
+from typing import Final
 
 import numpy as np
 
 from uwblink.errors import ArgumentError
-from uwblink.formulas import Intervals
+from uwblink.protocols.formulas import Intervals
+from uwblink.protocols.rows import RangingProtocol
 
 _TRIED_FLIGHT: Final = np.array([1000.0, 4000.0])
 _TRIED_DELAY: Final = 64.0
@@ -21,36 +22,7 @@ _COURSE: Final = (
 """Who may send each message of an exchange, and after which stamp: that is what dt41 to dt64 are made of."""
 
 
-class Row(Protocol):
-    """What of a protocol is checked here; `uwblink.twr.RangingProtocol` is one."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def messages(self) -> tuple[Any, ...]:
-        """Its messages, with sender, after and timing."""
-        ...
-
-    @property
-    def third_sender(self) -> str | None:
-        """Who sends the third message."""
-        ...
-
-    @property
-    def flight_ticks(self) -> Any:
-        """Its formula."""
-        ...
-
-    @property
-    def delay_weights(self) -> Any:
-        """Its weights of the antenna delays."""
-        ...
-
-
-def check_messages(row: Row) -> None:
+def check_messages(row: RangingProtocol) -> None:
     """Raise `ArgumentError` for messages that are not two or three, in the order that a recording has stamps for."""
     where, messages = f"protocol {row.name!r}: messages", row.messages
     if not 2 <= len(messages) <= LONGEST_EXCHANGE:
@@ -68,7 +40,7 @@ def check_messages(row: Row) -> None:
             raise ArgumentError(f"{where}: {number}: timing: found {message.timing!r}, allowed: {', '.join(TIMINGS)}")
 
 
-def check_formulas(row: Row) -> None:
+def check_formulas(row: RangingProtocol) -> None:
     """Raise `ArgumentError` for formulas that are not exact for exchanges without noise, or leave antenna delays in."""
     where = f"protocol {row.name!r}"
     for name in ("flight_ticks", "delay_weights"):

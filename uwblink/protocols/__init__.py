@@ -1,0 +1,1 @@
+"""Ranging protocols: their rows, formulas, the table of them, and what a row must be."""
