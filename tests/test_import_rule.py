@@ -39,7 +39,7 @@ FLOORS = {
         ("cli",),
     ),
     "uwbsim": (
-        ("errors", "random_streams"),
+        ("errors", "random_streams", "units"),
         ("output", "scenario"),
         ("world",),
         ("simulation",),

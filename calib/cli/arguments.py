@@ -32,7 +32,7 @@ Fix = Annotated[
 ]
 GroupFile = Annotated[
     Path | None,
-    typer.Option(help="Groups of tags that share curves (.toml with a table [groups]); by default all tags do."),
+    typer.Option(help="Groups of tags that share curves (.toml with a table \\[groups]); by default all tags do."),
 ]
 Sequential = Annotated[
     bool,

@@ -49,7 +49,7 @@ def poses(
     recording: Annotated[Path, typer.Argument(help="Recording to add poses to (.uwb).")],
     source: Annotated[Path, typer.Option("--from", help="Poses: .csv, .tum or a ROS bag.")],
     offset: Annotated[str, typer.Option(help="Seconds to add to the poses' times, or auto.")] = "0",
-    tags: Annotated[Path | None, typer.Option(help="Plan or scenario (.toml) whose [[tags]] to use.")] = None,
+    tags: Annotated[Path | None, typer.Option(help="Plan or scenario (.toml) whose \\[\\[tags]] to use.")] = None,
     body: Annotated[str | None, typer.Option(help="The body of a TUM file.")] = None,
 ) -> None:
     """Add motion-capture truth to a recording of boards."""
