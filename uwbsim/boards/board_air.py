@@ -13,7 +13,7 @@ import simpy
 
 from uwbsim.boards.frames import Frame, Payload, Radios, Received
 from uwbsim.scenario.airtime import PREAMBLE_SYMBOL_S, after_marker_s, before_marker_s
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 US: Final = 1_000
 MS: Final = 1_000_000

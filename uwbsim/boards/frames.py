@@ -17,9 +17,10 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import FINAL_BYTES, POLL_BYTES, RESPONSE_BYTES
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.timestamps import draw_reply_s
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import Clocks
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.reception import Frames, Medium
+from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 MASK: Final = (1 << REPORT_BITS) - 1

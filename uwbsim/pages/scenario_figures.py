@@ -17,8 +17,9 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw_reply_s, stamp
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import Clocks
 from uwbsim.world.reception import Medium
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.

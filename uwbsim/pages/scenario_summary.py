@@ -11,7 +11,7 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.model import UUS_S, Scenario
 from uwbsim.simulation.schedule import schedule
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 SAMPLES: Final = 200

@@ -14,8 +14,9 @@ from uwbsim.scenario.airtime import before_marker_s
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.schedule import schedule
 from uwbsim.simulation.timestamps import draw_reply_s
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import Clocks
 from uwbsim.world.reception import arrive
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 STATES: Final = 16_384
@@ -29,11 +30,12 @@ STEP_S: Final = 1e-3
 class Conditions:
     """The state of the world in exchanges, columns of length n; times of flight and delays in seconds.
 
-    Clocks run at 1 + rate; `drift` is the change of the rate in 1/s. `late` is what power adds to each reception and
-    `rx_std` its noise; `tx_std` the noise of a transmission. `at_once` and `scheduled` are the two kinds of reply,
-    `carrier_bias_ppm` and `carrier_std_ppm` those of the carrier integrator; `multipath` is the probability of a
-    detour of `detour_s` on average, which all messages of an exchange take. `quantize` says whether stamps are whole
-    ticks and delayed transmissions on the chip's grid.
+    Clocks run at 1 + rate; `drift` is the change of the rate in 1/s, `white` its white noise, a fraction times the root
+    of a second (of flicker and random walk there is only the rate that they have reached). `late` is what power adds to
+    each reception and `rx_std` its noise; `tx_std` the noise of a transmission. `at_once` and `scheduled` are the two
+    kinds of reply, `carrier_bias_ppm` and `carrier_std_ppm` those of the carrier integrator; `multipath` is the
+    probability of a detour of `detour_s` on average, which all messages of an exchange take. `quantize` says whether
+    stamps are whole ticks and delayed transmissions on the chip's grid.
     """
 
     flight: Floats
@@ -42,6 +44,8 @@ class Conditions:
     rate_target: Floats
     drift_initiator: Floats
     drift_target: Floats
+    white_initiator: Floats
+    white_target: Floats
     late: Floats
     rx_std: Floats
     tx_std: Floats
@@ -100,14 +104,17 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     later = world.link(i, j, start + round(STEP_S * SUBTICKS_PER_SECOND))
     arrival = arrive(radio, link)
     delays = np.array([tag.antenna_delays_s for tag in scenario.tags])
+    white = np.array([tag.white_sqrt_s for tag in scenario.tags])
     nothing = np.zeros(len(rows))
     return Conditions(
         flight=arrival.flight_s,
         flight_rate=(later.distance_m - link.distance_m) / STEP_S / SPEED_OF_LIGHT,
-        rate_initiator=clocks.rate(i, start),
-        rate_target=clocks.rate(j, start),
+        rate_initiator=clocks.exchange_rate(i, start),
+        rate_target=clocks.exchange_rate(j, start),
         drift_initiator=nothing,
         drift_target=nothing,
+        white_initiator=white[i],
+        white_target=white[j],
         late=arrival.bias_s,
         rx_std=arrival.std_s,
         tx_std=np.full(len(rows), radio.tx_noise_s),

@@ -19,6 +19,8 @@ from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
 from uwbsim.protocols.conditions import STATES, Conditions
 from uwbsim.random_streams import stream
+from uwbsim.units import PPM_PER_ONE
+from uwbsim.world.clocks import RATE_SPAN_S
 
 METRES: Final = TICK_S * SPEED_OF_LIGHT
 SIDES: Final = ("initiator", "target")
@@ -77,6 +79,8 @@ class _Ticks:
         self.reply = {"at once": c.at_once * scale, "scheduled": c.scheduled * scale}
         self.carrier_ppm = (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
         self.carrier_std_ppm, self.detour = c.carrier_std_ppm, c.detour_s * scale
+        # What a clock's phase gathers in a tick, in ticks.
+        self.white = {"initiator": c.white_initiator * scale**0.5, "target": c.white_target * scale**0.5}
         self.moving = bool(np.any(c.flight_rate))
 
 
@@ -89,6 +93,25 @@ class _Draws:
     carrier: Floats | None
     phase: dict[str, Floats] | None
     detour: Floats | None
+    clocks: dict[str, list[Floats]] | None
+
+
+class _Wander:
+    """The phase of a clock whose rate has white noise, in ticks, at one instant after another."""
+
+    def __init__(self, white: Floats, steps: list[Floats]) -> None:
+        """Begin at zero when first asked; `steps` are standard normal, one an instant."""
+        self._white, self._steps = white, iter(steps)
+        self._time: Floats | None = None
+        self._phase = np.zeros_like(white)
+
+    def at(self, time: Floats) -> Floats:
+        """Return the phase at times (n,) in ticks, none earlier than the last."""
+        if self._time is not None:
+            gap = np.maximum(time - self._time, 0)
+            self._phase = self._phase + self._white * np.sqrt(gap) * next(self._steps)
+        self._time = time
+        return self._phase
 
 
 class _Noise:
@@ -101,6 +124,9 @@ class _Noise:
         self._carrier = stream(seed, "skew reading", 2) if c.carrier_std_ppm else None
         self._phase = {side: stream(seed, "counter phase", side) for side in SIDES} if c.quantize else None
         self._hit = stream(seed, "multipath") if c.multipath else None
+        white = np.any(c.white_initiator) or np.any(c.white_target)
+        self._clocks = {side: stream(seed, "clock noise", side) for side in SIDES} if white else None
+        self._instants = len(numbers) + 2
         self._share = c.multipath
 
     def draw(self, count: int) -> _Draws:
@@ -116,6 +142,9 @@ class _Noise:
             self._carrier.standard_normal(count) if self._carrier else None,
             {side: g.random(count) * DELAYED_TX_GRID for side, g in self._phase.items()} if self._phase else None,
             detour,
+            {side: [g.standard_normal(count) for _ in range(self._instants)] for side, g in self._clocks.items()}
+            if self._clocks
+            else None,
         )
 
 
@@ -123,6 +152,8 @@ def _execute(protocol: RangingProtocol, c: _Ticks, draws: _Draws) -> Floats:
     """Return range errors in metres of one piece."""
     stamps: dict[str, Floats] = {}
     flights: list[Floats] = []
+    wander = {side: _Wander(c.white[side], steps) for side, steps in draws.clocks.items()} if draws.clocks else None
+    carrier_noise: Floats | float = 0.0
     path = c.flight if draws.detour is None else c.flight + draws.detour * c.detour
     for k, message in enumerate(protocol.messages):
         sender = message.sender
@@ -135,12 +166,18 @@ def _execute(protocol: RangingProtocol, c: _Ticks, draws: _Draws) -> Floats:
         half = c.half_drift[sender]
         if half is not None:
             departure -= half * departure**2
+        if wander is not None:
+            if k == 1:
+                carrier_noise = _carrier_ppm(wander, departure)
+            departure = departure - wander[sender].at(departure)
         flight = c.flight + c.flight_rate * departure if c.moving else c.flight
         arrival = departure + (path if not c.moving else path + c.flight_rate * departure)
         seen = arrival * c.faster[receiver]
         half = c.half_drift[receiver]
         if half is not None:
             seen += half * arrival**2
+        if wander is not None:
+            seen += wander[receiver].at(arrival)
         seen += c.rx_late[receiver]
         if draws.receive is not None:
             seen += draws.receive[k] * c.rx_std
@@ -151,7 +188,7 @@ def _execute(protocol: RangingProtocol, c: _Ticks, draws: _Draws) -> Floats:
             seen -= phase
         stamps[f"tx{k + 1}"], stamps[f"rx{k + 1}"] = printed, seen
         flights.append(flight)
-    spans = _intervals(protocol, stamps, c, draws)
+    spans = _intervals(protocol, stamps, c, draws, carrier_noise)
     truth = (flights[0] + flights[1]) / 2
     return np.asarray((protocol.flight_ticks(spans) - truth) * METRES)
 
@@ -170,8 +207,18 @@ def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks
     return np.asarray(np.ceil(latency / DELAYED_TX_GRID) * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS - phase)
 
 
-def _intervals(protocol: RangingProtocol, stamps: dict[str, Floats], c: _Ticks, draws: _Draws) -> Intervals:
-    carrier = c.carrier_ppm
+def _carrier_ppm(wander: dict[str, _Wander], departure: Floats) -> Floats:
+    """Return what the clocks' noise adds to the carrier integrator's reading of a frame, over its preamble."""
+    span = RATE_SPAN_S / TICK_S
+    begun = {side: path.at(departure - span) for side, path in wander.items()}
+    gained = {side: path.at(departure) - begun[side] for side, path in wander.items()}
+    return np.asarray((gained["initiator"] - gained["target"]) / span * PPM_PER_ONE)
+
+
+def _intervals(
+    protocol: RangingProtocol, stamps: dict[str, Floats], c: _Ticks, draws: _Draws, carrier_noise: Floats | float
+) -> Intervals:
+    carrier = c.carrier_ppm + carrier_noise
     if draws.carrier is not None:
         carrier = carrier + draws.carrier * c.carrier_std_ppm
     none = c.flight

@@ -18,6 +18,8 @@ from uwblink.protocols.formulas import Intervals
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
 from uwbsim.protocols.conditions import Conditions
+from uwbsim.units import PPM_PER_ONE
+from uwbsim.world.clocks import RATE_SPAN_S
 
 METRES: Final = TICK_S * SPEED_OF_LIGHT
 STEP: Final = 16.0
@@ -43,12 +45,14 @@ class Prediction:
     receive_m2: Floats
     quantization_m2: Floats
     carrier_m2: Floats
+    clock_m2: Floats
     multipath_m2: Floats
 
     @property
     def variance_m2(self) -> Floats:
         """Return the whole variance."""
-        return self.transmit_m2 + self.receive_m2 + self.quantization_m2 + self.carrier_m2 + self.multipath_m2
+        radio = self.transmit_m2 + self.receive_m2 + self.quantization_m2 + self.carrier_m2
+        return radio + self.clock_m2 + self.multipath_m2
 
     def pooled(self) -> tuple[float, float]:
         """Return mean and variance over all states together: the variance has the spread of the means in it."""
@@ -57,7 +61,8 @@ class Prediction:
 
 def predict(protocol: RangingProtocol, c: Conditions) -> Prediction:
     """Predict the error of a protocol under conditions (n,)."""
-    spans, truth = _noiseless(protocol, c)
+    spans, (leave, arrive) = _noiseless(protocol, c)
+    truth = (arrive[0] - leave[0] + arrive[1] - leave[1]) / 2 / TICK_S
     slopes = dict(_slopes(protocol, spans))
     stamps = _by_stamp(protocol, slopes)
     squares = {kind: _sum_of_squares(stamps, kind) for kind in ("tx", "rx")}
@@ -71,12 +76,13 @@ def predict(protocol: RangingProtocol, c: Conditions) -> Prediction:
         receive_m2=np.asarray(squares["rx"] * (c.rx_std * SPEED_OF_LIGHT) ** 2),
         quantization_m2=np.asarray(squares["rx"] * METRES**2 / 12 * c.quantize),
         carrier_m2=np.asarray((slopes["carrier_ppm"] * c.carrier_std_ppm * METRES) ** 2),
+        clock_m2=_white_clocks(protocol, slopes, stamps, leave, arrive, c) * SPEED_OF_LIGHT**2,
         multipath_m2=np.full(len(c), p * (2 - p) * detour**2),
     )
 
 
-def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, Floats]:
-    """Return the intervals of exchanges without noise in ticks, and the mean flight of the first two messages.
+def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, tuple[list[Floats], list[Floats]]]:
+    """Return the intervals of exchanges without noise in ticks, and true seconds at which messages leave and arrive.
 
     From true durations: what a clock reads of one is its length times 1 + rate, plus half of drift times the difference
     of squares of its ends; what antennas and power add to stamps comes on top.
@@ -114,8 +120,7 @@ def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, Flo
             dt53 = read(i, leave[2], arrive[1]) + tx[i] - rx[i]
             dt64 = read(j, arrive[2], leave[1]) + rx[j] - tx[j]
     carrier = (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-    truth = (arrive[0] - leave[0] + arrive[1] - leave[1]) / 2
-    return Intervals(dt41 * ticks, dt32 * ticks, dt53 * ticks, dt64 * ticks, carrier), truth * ticks
+    return Intervals(dt41 * ticks, dt32 * ticks, dt53 * ticks, dt64 * ticks, carrier), (leave, arrive)
 
 
 def _reply_s(protocol: RangingProtocol, k: int, c: Conditions) -> Floats:
@@ -148,6 +153,35 @@ def _by_stamp(protocol: RangingProtocol, slopes: dict[str, Floats]) -> dict[str,
             for stamp, sign in parts.items():
                 found[stamp] = found.get(stamp, 0.0) + sign * slopes[interval]
     return found
+
+
+def _white_clocks(
+    protocol: RangingProtocol,
+    slopes: dict[str, Floats],
+    stamps: dict[str, Floats],
+    leave: list[Floats],
+    arrive: list[Floats],
+    c: Conditions,
+) -> Floats:
+    """Return the variance of the flight in square seconds that white noise of the clocks' rates leaves.
+
+    The phase at an instant is what the clock has gathered until then, so a span of time weighs with the sum of the
+    slopes of all that is read after it: h^2 times the integral of its square. The carrier integrator reads the mean
+    rate over the preamble of the second message.
+    """
+    # How the flight changes with what the phase gains during the preamble.
+    gain = slopes["carrier_ppm"] * PPM_PER_ONE * TICK_S / RATE_SPAN_S
+    total = np.zeros(len(c))
+    for side, white, sign in (("initiator", c.white_initiator, 1), ("target", c.white_target, -1)):
+        read = [(leave[1] - RATE_SPAN_S, -sign * gain), (leave[1], sign * gain)]
+        for k, message in enumerate(protocol.messages):
+            name, time = ("tx", leave[k]) if message.sender == side else ("rx", arrive[k])
+            read.append((time, stamps.get(f"{name}{k + 1}", np.zeros(len(c)))))
+        read.sort(key=lambda pair: float(pair[0][0]))
+        after = np.cumsum([slope for _, slope in reversed(read)], axis=0)[::-1]
+        gaps = np.diff([time for time, _ in read], axis=0)
+        total += white**2 * np.sum(after[1:] ** 2 * np.maximum(gaps, 0), axis=0)
+    return total
 
 
 def _sum_of_squares(stamps: dict[str, Floats], kind: str) -> Floats:

@@ -148,8 +148,9 @@ class Tag(Section):
 
     Give the aggregate `delay_ns` = transmit - receive, split 0.44 / 0.56, or both parts.
     The clock: `drift_ppm_per_sqrt_s` is the random walk of its rate (Allan deviation q sqrt(tau/3)),
-    `white_ppm_sqrt_s` white noise of its rate (Allan deviation h/sqrt(tau)), `ramp_ppm_per_s` what a change of
-    temperature adds. A `passive` tag records the exchanges that it overhears.
+    `white_ppm_sqrt_s` white noise of its rate (Allan deviation h/sqrt(tau)), `flicker_ppm` flicker noise of its rate
+    (the same Allan deviation at every tau), `ramp_ppm_per_s` what a change of temperature adds. A `passive` tag records
+    the exchanges that it overhears.
     """
 
     id: TagId
@@ -161,6 +162,7 @@ class Tag(Section):
     skew_ppm: Annotated[float, Field(ge=-100, le=100)] = 0.0
     drift_ppm_per_sqrt_s: NotNegative = 0.0
     white_ppm_sqrt_s: NotNegative = 0.0
+    flicker_ppm: NotNegative = 0.0
     ramp_ppm_per_s: float = 0.0
     passive: bool = False
     clock_offset_s: NotNegative | None = None
@@ -192,6 +194,11 @@ class Tag(Section):
     def white_sqrt_s(self) -> float:
         """Return the white noise of the clock's rate, as a fraction times the root of a second."""
         return self.white_ppm_sqrt_s * PPM
+
+    @property
+    def flicker(self) -> float:
+        """Return the Allan deviation of flicker noise of the clock's rate, as a fraction."""
+        return self.flicker_ppm * PPM
 
     @property
     def ramp_per_s(self) -> float:

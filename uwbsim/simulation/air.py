@@ -18,7 +18,7 @@ import simpy
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 PREAMBLE_TIMEOUT_S: Final = 6.521e-3
 """How long a board waits for a preamble (firmware wire format, 3.1)."""

@@ -29,9 +29,10 @@ from uwbsim.simulation.schedule import Schedule, schedule
 from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw, stamp
 from uwbsim.units import NS_PER_S
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
-from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import LONGEST_RUN_S, Clocks
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.reception import Medium
+from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 

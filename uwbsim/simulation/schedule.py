@@ -15,7 +15,7 @@ import numpy as np
 from uwblink.arrays import Floats, Ints
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,14 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import COUNTER_BITS, TICKS_PER_SECOND
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
+from uwbsim.world.clock_noise import ClockNoise
+from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 
-SUBTICKS: Final = 1024
-SUBTICKS_PER_SECOND: Final = SUBTICKS * TICKS_PER_SECOND
 LONGEST_RUN_S: Final = 36 * 3600.0
 WALK_STEP_S: Final = 0.1
+
+RATE_SPAN_S: Final = 130e-6
+"""How long the boards' preambles are: 128 symbols of 1.02 us."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,20 +31,22 @@ class Clocks:
     """The clocks of all tags, indexed by the tag's place in the scenario.
 
     A clock reads t + offset + deviation(t); the deviation is skew times t plus the integral of the rate's random
-    walk, white noise and temperature ramp, constant over steps of `WALK_STEP_S`.
+    walk and temperature ramp, constant over steps of `WALK_STEP_S`, plus the phase of its white and flicker noise. (A
+    rate that jumps at regular instants has the Allan variance q^2 tau/3 of a random walk for a shorter tau, too.)
     """
 
     offset: Ints
     skew: Floats
     walk_rate: Floats
     walk_subticks: Floats
+    noise: ClockNoise | None = None
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         """Build the clocks of a scenario; offsets not given and random walks come from its seed."""
         seed, duration = scenario.run.seed, scenario.run.duration_s
         steps = int(duration / WALK_STEP_S) + 20
-        offsets, rates, phases = [], [], []
+        offsets, rates = [], []
         for tag in scenario.tags:
             rng = stream(seed, "clock", tag.id)
             drawn = rng.integers(0, 1 << COUNTER_BITS)
@@ -52,16 +57,13 @@ class Clocks:
             walk = np.concatenate([[0.0], np.cumsum(rng.normal(0, 1, steps) * sigma)])
             ramp = tag.ramp_per_s * WALK_STEP_S * np.arange(steps + 1)
             rates.append(walk + ramp)
-            # White noise of the rate is a random walk of the phase.
-            white = tag.white_sqrt_s / np.sqrt(WALK_STEP_S)
-            phases.append(stream(seed, "clock white", tag.id).normal(0, 1, steps) * white)
         rate = np.array(rates)
-        rate[:, :-1] += np.array(phases)
         step = WALK_STEP_S * SUBTICKS_PER_SECOND
         phase = np.cumsum(rate[:, :-1] * step, axis=1)
         walk = np.concatenate([np.zeros((len(rate), 1)), phase], axis=1)
         skew = np.array([tag.skew for tag in scenario.tags])
-        return cls(np.array(offsets, dtype=np.int64), skew, rate, walk)
+        noise = ClockNoise.of(seed, scenario.tags, duration)
+        return cls(np.array(offsets, dtype=np.int64), skew, rate, walk, noise)
 
     def read(self, tag: Ints, time: Ints) -> Ints:
         """Return what the clocks of tags (n,) read at true times (n,), in sub-ticks, not wrapped."""
@@ -77,8 +79,25 @@ class Clocks:
         return time
 
     def rate(self, tag: Ints, time: Ints) -> Floats:
-        """Return how much faster than true time the clocks run, as a fraction, shape (n,)."""
+        """Return how much faster than true time the clocks run, as a fraction, shape (n,).
+
+        Noise has no rate at an instant; its share is the mean over the `RATE_SPAN_S` before, as of a preamble that the
+        carrier integrator follows.
+        """
+        return np.asarray(self._smooth_rate(tag, time) + self._noise_rate(tag, time, RATE_SPAN_S))
+
+    def exchange_rate(self, tag: Ints, time: Ints) -> Floats:
+        """Return the rate without the noise that averages out within a tenth of a second, shape (n,)."""
+        return np.asarray(self._smooth_rate(tag, time) + self._noise_rate(tag, time, WALK_STEP_S))
+
+    def _smooth_rate(self, tag: Ints, time: Ints) -> Floats:
         return np.asarray(self.skew[tag] + self.walk_rate[tag, self._step(time)[0]])
+
+    def _noise_rate(self, tag: Ints, time: Ints, span_s: float) -> Floats | float:
+        if self.noise is None:
+            return 0.0
+        span = round(span_s * SUBTICKS_PER_SECOND)
+        return (self.noise.phase(tag, time) - self.noise.phase(tag, time - span)) / span
 
     def _step(self, time: Ints) -> tuple[Ints, Floats]:
         step = int(WALK_STEP_S * SUBTICKS_PER_SECOND)
@@ -88,4 +107,6 @@ class Clocks:
     def _deviation(self, tag: Ints, time: Ints) -> Ints:
         index, into = self._step(time)
         walked = self.walk_subticks[tag, index] + self.walk_rate[tag, index] * into
+        if self.noise is not None:
+            walked = walked + self.noise.phase(tag, time)
         return np.rint(self.skew[tag] * time + walked).astype(np.int64)

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.propagation import Link
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 STEP_S: Final = 0.005

@@ -16,9 +16,10 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
 from uwbsim.units import PPM_PER_ONE
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import Clocks
 from uwbsim.world.propagation import Link
 from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
+from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 
 
 class Links(Protocol):

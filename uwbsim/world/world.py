@@ -17,10 +17,10 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import NS, NS_PER_S
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.propagation import Link, reflected_lengths_m
 from uwbsim.world.radio import path_gain_db, shadowing_phases
 from uwbsim.world.trajectories import Trajectory, sample
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 SEPARATION_STEP_S: Final = 0.05
 TRIES: Final = 60

@@ -6,7 +6,7 @@ import pytest
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.scenario.airtime import before_marker_s, exchange_air_s, frame_s
 from uwbsim.simulation import air
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 US = SUBTICKS_PER_SECOND // 1_000_000
 DS = PROTOCOLS["ds"]

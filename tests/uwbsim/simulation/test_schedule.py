@@ -6,7 +6,7 @@ import pytest
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import simulate
 from uwbsim.simulation.schedule import schedule
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 
 def ring(count=6, **ranging):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.uwbsim.simulation.test_protocols import bench
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import Clocks
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 
 def clocks(skews=(12.0, -7.0), drift=0.01, duration=100.0):
@@ -41,3 +42,47 @@ def test_drift_is_a_continuous_random_walk():
     assert np.std(steps) == pytest.approx(0.1 * np.sqrt(0.1), rel=0.03)
     fine = time[500] + np.arange(-50, 50)
     assert np.abs(np.diff(c.read(np.zeros(100, dtype=np.int64), fine)) - 1).max() <= 1
+
+
+NOISY = {"white_ppm_sqrt_s": 0.01, "flicker_ppm": 0.01, "drift_ppm_per_sqrt_s": 0.01}
+
+
+def noisy_clocks(duration=10.0, **more):
+    scenario = bench(skews=(12.0, -7.0))
+    tags = tuple(t.model_copy(update=NOISY | more) for t in scenario.tags)
+    settings = scenario.run.model_copy(update={"duration_s": duration})
+    return Clocks.of(scenario.model_copy(update={"tags": tags, "run": settings}))
+
+
+def test_noisy_clocks_are_inverted_to_the_subtick():
+    c = noisy_clocks()
+    time = np.random.default_rng(1).integers(0, 10 * SUBTICKS_PER_SECOND, 5000)
+    for tag in (0, 1):
+        which = np.full(len(time), tag)
+        assert np.abs(c.when(which, c.read(which, time)) - time).max() <= 1
+
+
+def test_noise_depends_neither_on_what_else_is_asked_nor_on_how_long_the_run_is():
+    time = np.random.default_rng(1).integers(0, 10 * SUBTICKS_PER_SECOND, 100)
+    tag = np.arange(100) % 2
+    short, long = noisy_clocks(), noisy_clocks(duration=100.0)
+    whole = short.read(tag, time)
+    one_by_one = [short.read(tag[k : k + 1], time[k : k + 1])[0] for k in range(99, -1, -1)][::-1]
+    np.testing.assert_array_equal(whole, one_by_one)
+    np.testing.assert_array_equal(whole, long.read(tag, time))
+
+
+def test_noisy_clocks_begin_at_their_offset_and_never_stand_still():
+    c = noisy_clocks(clock_offset_s=1.0)
+    which = np.array([0, 1])
+    np.testing.assert_array_equal(c.read(which, np.zeros(2, dtype=np.int64)), c.offset)
+    fine = 3 * SUBTICKS_PER_SECOND + np.arange(0, 100_000_000, 1_000_000)
+    assert np.diff(c.read(np.zeros(len(fine), dtype=np.int64), fine)).min() > 0.999 * 1_000_000
+
+
+def test_the_noises_of_two_clocks_have_nothing_to_do_with_each_other():
+    c = noisy_clocks(duration=100.0, drift_ppm_per_sqrt_s=0.0)
+    time = (np.arange(0, 100, 0.001) * SUBTICKS_PER_SECOND).astype(np.int64)
+    steps = [np.diff(c.noise.phase(np.full(len(time), k), time)) for k in (0, 1)]
+    # 100 000 independent pairs know a correlation to 0.003.
+    assert abs(np.corrcoef(*steps)[0, 1]) < 0.015
