@@ -59,7 +59,7 @@ def test_what_a_board_cannot_do(ports, tmp_path):
     for delay in ("279", "6501", "100000"):
         refused(run("uwblink", "set-delay", port, delay), delay, "280 to 6500")
     refused(run("uwblink", "passive", port, "maybe"), "maybe", "on or off")
-    refused(run("uwblink", "send", port, "x" * 93), "93 bytes", "at most 92")
+    refused(run("uwblink", "send", port, "x" * 58), "58 bytes", "at most 57", "one USB packet")
     refused(run("uwblink", "cir", port, 2, "--plot", tmp_path / "c.xyz"), ".xyz", ".png")
     assert list(tmp_path.iterdir()) == []
 

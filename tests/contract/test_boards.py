@@ -4,11 +4,13 @@ Real boards are tested when the environment variable UWB_PORTS names two ports, 
 """
 
 import os
+from contextlib import ExitStack
 
 import pytest
 
 from tests.boards import bench_scenario, served
 from uwblink.boards.board import Board
+from uwblink.boards.ports import SerialPort
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.ticks import elapsed
 from uwblink.twr import truncate4
@@ -19,20 +21,30 @@ ABSENT = 9
 
 
 @pytest.fixture(params=["virtual", "terminal", "real"])
-def pair(request):
-    """Two boards, the initiator first."""
+def transports(request):
+    """The ports of two boards, the initiator first."""
     if request.param == "virtual":
         ports = VirtualPorts(bench_scenario())
-        yield Board(ports.port(1)), Board(ports.port(2))
-    elif request.param == "terminal":
-        with served() as server, Board.open(server.names[1]) as one, Board.open(server.names[2]) as two:
-            yield one, two
-    else:
-        names = [n for n in os.environ.get("UWB_PORTS", "").split(",") if n]
-        if len(names) != 2:
-            pytest.skip("no real boards: UWB_PORTS does not name two ports")
-        with Board.open(names[0]) as one, Board.open(names[1]) as two:
-            yield one, two
+        yield ports.port(1), ports.port(2)
+        return
+    with ExitStack() as stack:
+        if request.param == "terminal":
+            server = stack.enter_context(served())
+            names = [server.names[1], server.names[2]]
+        else:
+            names = [n for n in os.environ.get("UWB_PORTS", "").split(",") if n]
+            if len(names) != 2:
+                pytest.skip("no real boards: UWB_PORTS does not name two ports")
+        found = [SerialPort(name) for name in names]
+        for port in found:
+            stack.callback(port.close)
+        yield tuple(found)
+
+
+@pytest.fixture
+def pair(transports):
+    """The two boards."""
+    return Board(transports[0]), Board(transports[1])
 
 
 def test_every_plain_command_is_answered(pair):
@@ -115,7 +127,7 @@ def test_the_own_id_is_refused_by_the_driver_and_by_the_board(pair):
 def test_a_broadcast_reaches_the_other_board(pair):
     one, two = pair
     list(two.reports(0.05))
-    payload = b"\x00R00\r\n|RS" + bytes(range(60))
+    payload = b"\x00R00\r\n|RS" + bytes(range(48))
     one.send(payload)
     assert [e for e in two.reports(0.1) if isinstance(e, m.BroadcastReceived)] == [m.BroadcastReceived(payload)]
 
@@ -136,13 +148,60 @@ def test_what_would_harm_a_board_is_never_sent(pair):
     for delay in (279, 6501, 40_000, -5):
         with pytest.raises(RefusedError, match="280 to 6500"):
             one.set_response_delay(delay)
-    with pytest.raises(RefusedError, match="at most 92"):
-        one.send(bytes(93))
+    for length in (58, 80, 92, 93):
+        with pytest.raises(RefusedError, match=rf"broadcast of {length} bytes: at most 57 fit.*one USB packet"):
+            one.send(bytes(length))
+    for number in (float("nan"), float("inf"), 1e10, -10_000.0):
+        with pytest.raises(RefusedError, match="overwrites the board's memory"):
+            one.request(m.DoTests(1, "x", True, number, b""))
+    with pytest.raises(RefusedError, match=r"DoTests of 65 bytes: a command must fit one USB packet of 64"):
+        one.request(m.DoTests(1, "x" * 43, True, 1.0, b"12345"))
     with pytest.raises(RefusedError, match="protocol"):
         one.range(2, protocol="tdoa")
     with pytest.raises(RefusedError):
         one.request(m.IdleSet())
     assert one.request(m.GetId()) == m.IdReport(one.id)
+
+
+def test_the_longest_broadcast_fits_one_packet(pair):
+    one, two = pair
+    for _ in range(20):
+        one.send(bytes(range(57)))
+    assert [e.data for e in two.reports(0.1) if isinstance(e, m.BroadcastReceived)] == [bytes(range(57))] * 20
+    assert one.request(m.GetId()) == m.IdReport(one.id)
+
+
+@pytest.mark.parametrize("delay", [280, 6400, 6500])
+def test_every_delay_that_the_driver_sets_works(pair, delay):
+    one, two = pair
+    two.set_response_delay(delay)
+    try:
+        assert int(elapsed((report := one.range(two.id)).tx3, report.tx2)) == 65536 * delay + 16384
+    finally:
+        two.set_response_delay(1500)
+
+
+def test_a_target_that_prints_its_impulse_response_is_left_alone(pair):
+    one, two = pair
+    for _ in range(20):
+        list(two.reports(0.01))
+        one.range(two.id, target_reports=True, get_cir=True)
+        assert two.request(m.GetId()) == m.IdReport(two.id)
+        kinds = [type(e) for e in two.reports(0.05) if isinstance(e, m.Cir | m.TargetRangeReport)]
+        assert kinds == [m.Cir, m.TargetRangeReport]
+
+
+def test_a_board_whose_response_is_coming_in_is_not_asked(pair):
+    """Somebody else, another process say, had it print one: the driver sees it come and waits."""
+    one, two = pair
+    list(two.reports(0.01))
+    one.request(m.RangeCommand(two.id, target_reports=True, get_cir=True))
+    for _ in range(100):
+        two._pass(0.001)
+        if two._connection.decoder.begun == b"S10":
+            break
+    assert two.request(m.GetId()) == m.IdReport(two.id)
+    assert [type(e) for e in two.reports(0.05) if isinstance(e, m.Cir)] == [m.Cir]
 
 
 def test_many_exchanges_in_a_row_are_all_good(pair):

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Final, Self, TypeVar
 
-from uwblink.boards.connection import ANSWER_S, FENCE, Connection
+from uwblink.boards.connection import ANSWER_S, FENCE, QUIET_TARGET_S, Connection
 from uwblink.boards.ports import SerialPort, Transport
 from uwblink.errors import BoardError, NoAnswerError, RefusedError
 from uwblink.wire.codec import Event
@@ -97,7 +97,7 @@ class Board:
         (nothing was sent), `NoAnswerError`, `RangingFailedError` with the board's own line, or `PortLostError`. Other
         reports that come meanwhile are kept for `reports`.
         """
-        self._wait(self._connection.ready_s(self._transport.now_s()))
+        self._settle()
         if self._connection.doubtful:
             self._exchange(FENCE)
         try:
@@ -111,12 +111,19 @@ class Board:
     def range(
         self, target: int, *, protocol: str = "ds", target_reports: bool = False, get_cir: bool = False
     ) -> RangeReport:
-        """Range with another board; `protocol` is "ss" or "ds". Raises what `request` raises."""
+        """Range with another board; `protocol` is "ss" or "ds". Raises what `request` raises.
+
+        With both `target_reports` and `get_cir` it returns when the target has printed its impulse response, too, so
+        that neither board is asked something meanwhile, which would damage what it prints.
+        """
         if protocol not in PROTOCOL_FLAGS:
             raise RefusedError(f"protocol {protocol!r}: the boards know {' and '.join(PROTOCOL_FLAGS)}")
         if self._id is not None and target == self._id:
             raise RefusedError(f"{self.name}: target {target} is the board's own id; name another one")
-        return self._ask(RangeCommand(target, target_reports, PROTOCOL_FLAGS[protocol], get_cir), RangeReport)
+        report = self._ask(RangeCommand(target, target_reports, PROTOCOL_FLAGS[protocol], get_cir), RangeReport)
+        if target_reports and get_cir:
+            self._pass(QUIET_TARGET_S)
+        return report
 
     def cir(self, target: int, *, protocol: str = "ds") -> tuple[RangeReport, Cir]:
         """Range with another board and return its report and the channel impulse response of the last frame."""
@@ -135,7 +142,7 @@ class Board:
         self.request(SetResponseDelay(delay_uus))
 
     def send(self, data: bytes) -> None:
-        """Broadcast up to 92 bytes to every board in range; delivery is not confirmed."""
+        """Broadcast up to 57 bytes to every board in range; delivery is not confirmed."""
         self.request(Broadcast(data))
 
     def test(self) -> TestsDone:
@@ -198,8 +205,18 @@ class Board:
                 return True
         return False
 
-    def _wait(self, seconds: float) -> None:
+    def _settle(self) -> None:
+        """Wait until the board may be asked; an impulse response that comes in postpones that."""
+        self._pass(0.0)
+        while (wait_s := self._connection.ready_s(self._transport.now_s())) > 0:
+            self._pass(wait_s)
+
+    def _pass(self, seconds: float) -> None:
+        """Let time pass, and keep what the board says meanwhile; even no time takes in what has come."""
         until_s = self._transport.now_s() + seconds
-        while (left_s := until_s - self._transport.now_s()) > 0:
-            events, _ = self._connection.receive(self._transport.read(left_s), self._transport.now_s())
+        while True:
+            data = self._transport.read(max(until_s - self._transport.now_s(), 0.0))
+            events, _ = self._connection.receive(data, self._transport.now_s())
             self._keep(events, None)
+            if self._transport.now_s() >= until_s:
+                return

@@ -17,6 +17,7 @@ from uwblink.wire.messages import (
     REPORTS,
     Broadcast,
     Cir,
+    DoTests,
     IdleSet,
     Message,
     RangeCommand,
@@ -34,9 +35,26 @@ PATIENT_S: Final = 1.0
 """How long a board that has not answered is given to answer a fence, before it is called dead."""
 
 QUIET_AFTER_CIR_S: Final = 0.030
+"""For how long an initiator is left alone after the report of an exchange whose impulse response was asked for."""
+
+QUIET_TARGET_S: Final = 0.040
+"""The same for the target, which prints its own before its report, if it was asked to report."""
+
+PACKET_BYTES: Final = 64
+"""What one USB packet carries. A board that looks at its buffer between two packets of a command is dead."""
+
+LARGEST_ECHOED: Final = 9999.0
+"""A number printed with more than nine characters overflows the firmware's buffer (firmware wire format, 1.6)."""
+
 SHORTEST_SETTABLE_DELAY_UUS: Final = 280
 LONGEST_SETTABLE_DELAY_UUS: Final = 6500
 FAILURES: Final = ("COMMANDED TASK FAILED", "TWR FAIL", "ERROR: Requested to send message")
+GAP_IN_CIR_S: Final = 0.005
+"""The pieces of an impulse response come a millisecond apart; one that stays away longer never comes."""
+
+REPORT_AFTER_CIR_S: Final = 0.003
+"""A target prints its report after its impulse response."""
+
 HEARD_BYTES: Final = 60
 DEAD: Final = "is this a ranging board, and has it power? A board that hangs must be unplugged"
 
@@ -69,7 +87,7 @@ class Connection:
         self._answer_s = answer_s
         self._pending: _Pending | None = None
         self._doubtful = False
-        self._quiet_until_s = 0.0
+        self._quiet_until_s = self._heard_s = 0.0
         self.late = 0
         """Replies that came after their time."""
 
@@ -85,7 +103,13 @@ class Connection:
 
     def ready_s(self, now_s: float) -> float:
         """Return how long to wait until the board may be asked again."""
+        if self.decoder.begun == Cir.KEY:  # somebody else asked for the impulse response that is coming in
+            return max(self._quiet_until_s, self._heard_s + GAP_IN_CIR_S) - now_s
         return max(self._quiet_until_s - now_s, 0.0)
+
+    def leave_alone(self, until_s: float) -> None:
+        """Have the board not asked anything before a time, because it is printing an impulse response."""
+        self._quiet_until_s = max(self._quiet_until_s, until_s)
 
     def deadline_s(self) -> float | None:
         """Return when the outstanding command runs out of time."""
@@ -103,12 +127,13 @@ class Connection:
     def receive(self, data: bytes, now_s: float) -> tuple[list[Event], CommandOutcome | None]:
         """Take in bytes; returns everything they hold, and the outcome of the command if it ended."""
         events = self.decoder.feed(data)
+        self._heard_s = now_s if data else self._heard_s
         pending, outcome = self._pending, None
         if pending:
             pending.heard = (pending.heard + data)[-HEARD_BYTES:]
         for event in events:
             if isinstance(event, Cir):
-                self._quiet_until_s = now_s
+                self._quiet_until_s = now_s + REPORT_AFTER_CIR_S
             if outcome is None and self._pending is not None:
                 outcome = self._ended_by(self._pending, event, now_s)
             elif isinstance(event, RangeReport) and event.KEY == b"R05":
@@ -186,7 +211,27 @@ def checked(command: Message) -> bytes:
             f"{LONGEST_SETTABLE_DELAY_UUS} (UWB microseconds); outside, every double-sided exchange with this "
             "target fails"
         )
+    if isinstance(command, DoTests) and not abs(command.number) <= LARGEST_ECHOED:
+        raise RefusedError(
+            f"number {command.number!r}: allowed are -{LARGEST_ECHOED:g} to {LARGEST_ECHOED:g}; printing a longer one "
+            "overwrites the board's memory"
+        )
+    if isinstance(command, Broadcast) and len(command.data) > LONGEST_BROADCAST:
+        raise RefusedError(f"a broadcast of {len(command.data)} bytes: at most {LONGEST_BROADCAST} fit; {ONE_PACKET}")
     try:
-        return encode(command)
+        data = encode(command)
     except ValueError as error:
         raise RefusedError(str(error)) from error
+    if len(data) > PACKET_BYTES:
+        raise RefusedError(f"{type(command).__name__} of {len(data)} bytes: {ONE_PACKET}")
+    return data
+
+
+ONE_PACKET: Final = (
+    f"a command must fit one USB packet of {PACKET_BYTES} bytes, because a board that finds part of one in its buffer "
+    "crashes and must be unplugged"
+)
+
+
+LONGEST_BROADCAST: Final = PACKET_BYTES - len(encode(Broadcast(b"")))
+"""57 bytes. The boards' frames would carry 92, but no command brings them there safely."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.boards.board import PROTOCOL_FLAGS, Board
-from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, CommandOutcome
+from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, CommandOutcome
 from uwblink.boards.listeners import Heard, Listener, Pair, Turn, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.progress import PairState, Progress
@@ -196,10 +196,10 @@ class Recorder:
 
     def _begin(self) -> None:
         """Ask whoever has something to be asked: set-up first, then the next turn of the plan."""
-        for station in self._stations.values():
-            if command := station.next_command():
-                self._say(station, command)
         now_s = self._ports.now_s()
+        for station in self._stations.values():
+            if command := station.next_command(now_s):
+                self._say(station, command)
         if self._active or not self._turns or now_s < self._next_s:
             return
         found = self._next_turn(now_s)
@@ -280,9 +280,19 @@ class Recorder:
             self._fault(station, "wrong board", f"board {outcome.reply.board} where {station.board} was")
             self._drop(station)
         if self._active and self._active[0] is station and isinstance(outcome.command, RangeCommand):
+            self._leave_alone(self._active[1], now_s)
             self._end_turn(outcome.reply if isinstance(outcome.reply, RangeReport) else None)
-            if self._plan.get_cir:
-                self._next_s = max(self._next_s, now_s + QUIET_AFTER_CIR_S)
+
+    def _leave_alone(self, pair: Pair, now_s: float) -> None:
+        """Keep quiet while the two boards of an exchange, and passive ones, print their impulse responses."""
+        if not self._plan.get_cir:
+            return
+        both = self._plan.target_reports or self._passive
+        until_s = now_s + (QUIET_TARGET_S if both else QUIET_AFTER_CIR_S)
+        self._next_s = max(self._next_s, until_s)
+        for board, station in self._stations.items():
+            if board in pair or self._passive:
+                station.connection.leave_alone(until_s)
 
     def _end_turn(self, report: RangeReport | None) -> None:
         if self._active is None:

@@ -37,9 +37,9 @@ class Station:
         waits = self._todo or self.connection.busy or self.connection.ready_s(now_s)
         return self.port is not None and not waits and now_s >= self._pause_until_s
 
-    def next_command(self) -> Message | None:
+    def next_command(self, now_s: float) -> Message | None:
         """Return what the board is to be told besides the plan's turns, None if nothing is due."""
-        if self.port is None or self.connection.busy or not self._todo:
+        if self.port is None or self.connection.busy or not self._todo or self.connection.ready_s(now_s) > 0:
             return None
         return self._todo.popleft()
 

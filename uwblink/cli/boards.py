@@ -170,7 +170,7 @@ def passive(port: Port, state: Annotated[str, typer.Argument(metavar="on|off")])
     typer.echo(f"{port}: passive listening {state}" + (", until power is lost" if state == "on" else ""))
 
 
-def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 92 bytes in UTF-8.")]) -> None:
+def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 57 bytes in UTF-8.")]) -> None:
     """Broadcast a text to every board in range."""
     from uwblink.boards.board import Board
 

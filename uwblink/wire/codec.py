@@ -89,6 +89,11 @@ class Decoder:
         """Whether everything so far was understood or skipped, and the next byte begins a message."""
         return self._clean and not self._buffer
 
+    @property
+    def begun(self) -> bytes:
+        """The key of a message that has begun and is not complete, empty without one."""
+        return self._buffer[:3] if self._clean else b""
+
     def finish(self) -> list[Event]:
         """Return what is left when no more bytes will come."""
         return self._drain(final=True)

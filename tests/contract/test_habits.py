@@ -1,0 +1,83 @@
+"""The existing client library's habits: boards that stand in for real ones must be kind to them.
+
+It keeps no bytes between two reads, scans ids 0 to 10, and takes one line with a time-out at each call.
+"""
+
+import random
+import re
+
+import pytest
+
+from tests.contract.test_boards import transports  # noqa: F401 - the fixture
+from uwblink.boards.board import Board
+from uwblink.wire import messages as m
+from uwblink.wire.codec import Decoder
+from uwblink.wire.messages import REPORTS
+
+TIMEOUT_S = 0.1
+LATENCY_S = (0.0002, 0.0015)
+"""From the end of a line to the client's next look at its port: an operating system and an interpreter."""
+
+
+class Client:
+    """A client that forgets: each call takes a line and whatever else has come by then, and no more is kept."""
+
+    def __init__(self, transport, seed):
+        self.transport, self.came, self.random = transport, b"", random.Random(seed)
+
+    def write(self, data):
+        self.transport.write(data)
+
+    def pass_time(self, seconds):
+        until = self.transport.now_s() + seconds
+        while (left := until - self.transport.now_s()) > 0:
+            self.came += self.transport.read(left)
+
+    def messages(self, timeout_s=TIMEOUT_S):
+        """What one call finds: a line, or what came before the time was over, and what else waits then."""
+        until = self.transport.now_s() + timeout_s
+        while b"\r\n" not in self.came and (left := until - self.transport.now_s()) > 0:
+            self.came += self.transport.read(left)
+        self.pass_time(self.random.uniform(*LATENCY_S))
+        data, self.came = self.came, b""
+        found = []
+        for part in re.split(rb"(?=[RS]\d\d\|)", data):
+            decoder = Decoder(REPORTS)
+            found += [e for e in decoder.feed(part) if isinstance(e, m.Message)]
+        return found
+
+
+@pytest.fixture
+def clients(transports):  # noqa: F811 - the fixture
+    return [Client(t, seed) for seed, t in enumerate(transports)]
+
+
+def test_ninety_of_a_hundred_impulse_responses_reach_both_ends(clients, transports):  # noqa: F811
+    one, two = clients
+    target = Board(transports[1]).id
+    got = {0: 0, 1: 0}
+    for _ in range(100):
+        one.write(b"C05|%d|1|1|1\r" % target)
+        for number, client in enumerate(clients):
+            found = []
+            for _ in range(3):
+                found += client.messages()
+                if any(isinstance(e, m.Cir) for e in found):
+                    break
+            got[number] += any(isinstance(e, m.Cir) for e in found)
+        for client in (one, two):
+            client.messages(0.02)
+    # The firmware's own boards: 91 of 100.
+    assert min(got.values()) >= 90, got
+
+
+def test_a_scan_of_ids_finds_who_is_there(clients, transports):  # noqa: F811
+    one, _ = clients
+    mine, other = (Board(t).id for t in transports)
+    found = []
+    for number in range(11):
+        one.write(b"C05|%d|0|1|0\r" % number)
+        reports = [e for e in one.messages() if isinstance(e, m.RangeReport)]
+        found += [number for report in reports if report.neighbour == number]
+    assert other in found
+    assert mine not in found
