@@ -17,6 +17,7 @@ from calib.errors import BadInputError
 from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.target_reports import single_reports
 from uwblink.twr import Exchanges
 
 
@@ -167,7 +168,7 @@ def _load(data: Data) -> Ranges:
     if isinstance(data, Ranges):
         return data.usable()
     with opened(data) as (name, source):
-        exchanges = source.exchanges
+        exchanges = single_reports(source.exchanges).exchanges
         complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
         poses, tags = (None, []) if complete else (source.poses, source.tags)
         planted = _planted(source)

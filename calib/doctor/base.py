@@ -27,7 +27,11 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class RecordingView:
-    """A recording as the examinations see it; `truth_m` (n,) is NaN where nothing says it."""
+    """A recording as the examinations see it; `truth_m` (n,) is NaN where nothing says it.
+
+    Each exchange is there once; `reported_twice` were reported by both ends, and `contradictions` say how two reports
+    of one differ.
+    """
 
     name: str
     exchanges: Exchanges
@@ -36,6 +40,8 @@ class RecordingView:
     faults: list[Fault]
     raw_m: Floats
     truth_m: Floats
+    reported_twice: int = 0
+    contradictions: tuple[str, ...] = ()
 
     @property
     def error_m(self) -> Floats:

@@ -17,6 +17,7 @@ from calib.doctor.base import Finding, RecordingView
 from calib.sources import Data, opened
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.target_reports import differences, single_reports
 from uwblink.twr import Exchanges, raw_range
 
 
@@ -55,13 +56,16 @@ def examine(data: Data) -> list[Finding]:
     return sorted((f for f in findings if f.fault not in implied), key=lambda f: -f.confidence)
 
 
-def _admitted(name: str, e: Exchanges, poses: Poses, tags: list[Tag], faults: list[Fault]) -> RecordingView:
+def _admitted(name: str, both: Exchanges, poses: Poses, tags: list[Tag], faults: list[Fault]) -> RecordingView:
+    reports = single_reports(both)
+    e = reports.exchanges
     with np.errstate(all="ignore"):
         raw = raw_range(e)
     truth = e.truth_m
     if not np.isfinite(truth).any() and len(poses):
         truth = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
-    return RecordingView(name, e, poses, tags, faults, raw, truth)
+    told = tuple(", ".join(differences(both, a, b)) for a, b in reports.differing.tolist())
+    return RecordingView(name, e, poses, tags, faults, raw, truth, reports.repeated, told)
 
 
 Examination = Callable[[RecordingView], Iterator[Finding]]
@@ -72,6 +76,7 @@ STRUCTURE: Final[tuple[Examination, ...]] = (
     timestamps.swapped_roles,
     timestamps.speed_of_light,
     timestamps.corrupted,
+    timestamps.contradicting,
     pairs.pairs,
     pairs.silent,
     pairs.still,

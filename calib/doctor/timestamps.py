@@ -128,3 +128,15 @@ def swapped_roles(view: RecordingView) -> Iterator[Finding]:
             "initiator and target (ids, powers and skews) are exchanged: swap the columns on import",
             0.9,
         )
+
+
+def contradicting(view: RecordingView) -> Iterator[Finding]:
+    """Initiator and target that report one exchange differently: they print the same numbers, so a line was damaged."""
+    if view.contradictions:
+        yield Finding(
+            "contradicting reports",
+            f"both ends reported {view.reported_twice} exchanges, {len(view.contradictions)} of them differently; "
+            f"the first: {view.contradictions[0]}",
+            "look at the cables and ports of the two boards; what a damaged line says is not known",
+            0.9,
+        )

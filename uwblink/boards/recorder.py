@@ -18,6 +18,7 @@ from uwblink.boards.listeners import Heard, Listener, Pair, Turn, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.progress import PairState, Progress
 from uwblink.boards.ranging_plan import RangingPlan
+from uwblink.boards.report_check import ReportCheck
 from uwblink.boards.station import Station
 from uwblink.boards.writer import RecordingWriter
 from uwblink.errors import BoardError, PlanError, PortError, PortLostError
@@ -124,6 +125,7 @@ class Recorder:
         self._start_s = self._ports.now_s()
         self._turn, self._next_s = 0, self._start_s
         self._active: tuple[Station, Pair] | None = None
+        self._check = ReportCheck()
         self.progress = Progress(self._ports.host_ns(), pairs={pair: PairState() for pair in self._turns})
         self._listeners = [self.progress, *listeners]
         self._stations: dict[int, Station] = {}
@@ -265,6 +267,8 @@ class Recorder:
             return
         if isinstance(event, TextLine) and not event.text.startswith(EXPECTED_TEXTS):
             self._fault(station, "text", event.text.strip())
+        if isinstance(event, RangeReport) and (told := self._check.add(station.board, event)):
+            self._fault(station, "reports differ", told)
         heard = Heard(time_ns, station.board, event)
         for listener in self._listeners:
             listener.on_message(heard)

@@ -30,6 +30,8 @@ def print_summary(summary: Summary, console: Console) -> None:
         pairs.add_row(str(pair.initiator), str(pair.target), str(pair.exchanges), rate, success)
     for table in (tags, pairs):
         console.print(table)
+    if summary.reported_twice:
+        console.print(f"{summary.reported_twice} reported by both ends, {summary.contradictory} of them differently")
     console.print(f"poses: {escape(counted(summary.poses))}")
     console.print(f"faults: {escape(counted(summary.faults))}")
     for key, value in summary.provenance.items():

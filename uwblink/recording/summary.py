@@ -11,6 +11,7 @@ import numpy as np
 
 from uwblink.display import as_html, cut, first_few, printable
 from uwblink.recording.schema import TABLES, Fault, Tag
+from uwblink.recording.target_reports import single_reports
 
 if TYPE_CHECKING:
     from uwblink.recording.file import Recording
@@ -31,8 +32,9 @@ class PairSummary:
 class Summary:
     """What a recording holds: rows by table, tags, pairs, exchanges by protocol, faults by kind, poses by body.
 
-    `span_s` is the time from the first to the last exchange; `provenance` is what `meta` says of where it comes from,
-    without the scenario and what was planted.
+    An exchange counts once: `reported_twice` are those that both ends reported, `contradictory` those of them whose two
+    reports differ. `span_s` is the time from the first to the last exchange; `provenance` is what `meta` says of where
+    it comes from, without the scenario and what was planted.
     """
 
     file: str
@@ -44,6 +46,8 @@ class Summary:
     faults: dict[str, int]
     poses: dict[str, int]
     provenance: dict[str, Any]
+    reported_twice: int = 0
+    contradictory: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwblink show --json` prints."""
@@ -76,7 +80,9 @@ class Summary:
         rows = {
             name: n for name, n in self.counts.items() if n and name not in ("exchanges", "tags", "poses", "faults")
         }
+        twice = f"  {self.reported_twice} reported by both ends, {self.contradictory} of them differently"
         return [
+            *([twice] if self.reported_twice else []),
             f"  tags: {first_few(f'{tag.tag} on {printable(tag.body)}' for tag in self.tags)}",
             f"  poses: {counted(self.poses)}",
             f"  faults: {counted(self.faults)}",
@@ -86,14 +92,15 @@ class Summary:
 
 def summarize(recording: Recording) -> Summary:
     """Return what a recording holds; raises what its readers raise."""
-    exchanges, poses, faults = recording.exchanges(), recording.poses(), recording.faults()
+    reports, poses, faults = single_reports(recording.exchanges()), recording.poses(), recording.faults()
+    exchanges = reports.exchanges
     span_s = float(np.ptp(exchanges.time_ns)) * 1e-9 if len(exchanges) else 0.0
     done = Counter(zip(exchanges.initiator.tolist(), exchanges.target.tolist(), strict=True))
     failed = failures_by_pair(faults)
     return Summary(
         file=recording.path.name,
         span_s=span_s,
-        counts={table: recording.count(table) for table in TABLES if table != "meta"},
+        counts={t: recording.count(t) for t in TABLES if t != "meta"} | {"exchanges": len(exchanges)},
         tags=tuple(recording.tags()),
         pairs=tuple(
             PairSummary(*pair, done[pair], failed.get(pair, 0), done[pair] / span_s if span_s else None)
@@ -103,6 +110,8 @@ def summarize(recording: Recording) -> Summary:
         faults=_by_name(fault.kind for fault in faults),
         poses=_by_name(poses.body.tolist()),
         provenance={k: v for k, v in recording.meta().items() if k not in {"scenario", "planted"}},
+        reported_twice=reports.repeated,
+        contradictory=len(reports.differing),
     )
 
 

@@ -79,8 +79,14 @@ class Server:
     >>> server.close()
     """
 
-    def __init__(self, scenario: Scenario, link_dir: Path | None = None, faults: Faults | None = None) -> None:
-        """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made."""
+    def __init__(
+        self, scenario: Scenario, link_dir: Path | None = None, faults: Faults | None = None, *, speed: float = 1.0
+    ) -> None:
+        """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made.
+
+        With a `speed` below 1 the boards' time passes that much slower than the wall clock's.
+        """
+        self._speed = speed
         self._faults = faults or Faults()
         self.bench = Bench(scenario, self._printed, self._faults.lost_share())
         self._chance = stream(scenario.run.seed, "serial faults")
@@ -116,7 +122,7 @@ class Server:
     def step(self) -> None:
         """Wait for bytes or for what is due next, and do it."""
         due = min(self.bench.next_ns(), self._timed[0][0] if self._timed else float("inf"))
-        wait_s = min(max((due - self._now_ns()) / NS_PER_S, 0.0), LONGEST_WAIT_S)
+        wait_s = min(max((due - self._now_ns()) / NS_PER_S / self._speed, 0.0), LONGEST_WAIT_S)
         for key, _ in self._selector.select(wait_s):
             tag: int = key.data
             data = self._terminals[tag].read()
@@ -158,7 +164,7 @@ class Server:
             self._selector.register(number, selectors.EVENT_READ, tag)
 
     def _now_ns(self) -> int:
-        return time.monotonic_ns() - self._start_ns
+        return round((time.monotonic_ns() - self._start_ns) * self._speed)
 
     def _at(self, time_ns: int, what: Callable[[], None]) -> None:
         self._count += 1

@@ -1,0 +1,86 @@
+"""Two reports of one exchange: where targets report too, each exchange stands in a recording twice.
+
+Both boards print the same stamps, so the pair and a stamp of either clock tell which two belong together. One of them
+is the exchange; what the other says otherwise is a fault, because the boards cannot disagree about the same frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from uwblink.arrays import Bools, Ints
+from uwblink.twr import STAMPS, Exchanges
+
+APART_NS: Final = 60_000_000
+"""Reports of one exchange are nearer than this, and equal stamps of another one further: they wrap after 67 ms."""
+
+COMPARED: Final = (*STAMPS, "range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
+KEYS: Final = ("tx1", "tx2")
+"""A stamp of each board's clock: where one is damaged, the other still tells."""
+
+
+@dataclass(frozen=True, slots=True)
+class SingleReports:
+    """Exchanges with one row each, in their order: `repeated` second reports are left out, `differing` say otherwise.
+
+    `differing` (k, 2) has the rows of the given exchanges at which the two reports stand, the initiator's first.
+    """
+
+    exchanges: Exchanges
+    repeated: int
+    differing: Ints
+
+
+def single_reports(exchanges: Exchanges) -> SingleReports:
+    """Return each exchange once: the initiator's report where there is one, otherwise the target's."""
+    by_target = np.flatnonzero(exchanges.reporter == exchanges.target)
+    if not len(by_target):
+        return SingleReports(exchanges, 0, np.empty((0, 2), dtype=np.int64))
+    by_initiator = np.flatnonzero(exchanges.reporter == exchanges.initiator)
+    partner = np.full(len(by_target), -1, dtype=np.int64)
+    for name in KEYS:
+        alone = partner < 0
+        partner[alone] = _partners(exchanges, name, by_target[alone], by_initiator)
+    known = partner >= 0
+    first, second = partner[known], by_target[known]
+    differs = np.zeros(len(first), dtype=bool)
+    for name in COMPARED:
+        differs |= _unequal(getattr(exchanges, name), first, second)
+    keep = np.ones(len(exchanges), dtype=bool)
+    keep[second] = False
+    return SingleReports(exchanges[keep], int(known.sum()), np.column_stack([first, second])[differs])
+
+
+def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:
+    """Return what two reports say otherwise, a phrase a column: "range_m 3.0122 and 3.0177"."""
+    pairs = [(name, getattr(exchanges, name)) for name in COMPARED]
+    rows = np.array([first]), np.array([second])
+    return [f"{name} {column[first]} and {column[second]}" for name, column in pairs if _unequal(column, *rows)[0]]
+
+
+def _unequal(column: Ints, first: Ints, second: Ints) -> Bools:
+    a, b = column[first], column[second]
+    return np.asarray((a != b) & ~((a != a) & (b != b)))
+
+
+def _partners(e: Exchanges, name: str, wanted: Ints, among: Ints) -> Ints:
+    """Return for each of the rows `wanted` the row of `among` with its pair and stamp, the nearest in time, else -1."""
+    stamps = getattr(e, name)
+    # Ids and stamp in one number; a stamp of 40 bits loses its highest, which the time makes up for.
+    key = ((e.initiator.astype(np.uint64) << 16 | e.target.astype(np.uint64)) << 32) | (stamps & 0xFFFFFFFF).astype(
+        np.uint64
+    )
+    order = among[np.argsort(key[among], kind="stable")]
+    low, high = (np.searchsorted(key[order], key[wanted], side=side) for side in ("left", "right"))
+    best = np.full(len(wanted), -1, dtype=np.int64)
+    nearest = np.full(len(wanted), APART_NS, dtype=np.int64)
+    for step in range(int((high - low).max(initial=0))):
+        rows = np.flatnonzero(low + step < high)
+        candidate = order[low[rows] + step]
+        apart = np.abs(e.time_ns[candidate] - e.time_ns[wanted[rows]])
+        nearer = apart < nearest[rows]
+        best[rows[nearer]], nearest[rows[nearer]] = candidate[nearer], apart[nearer]
+    return best
