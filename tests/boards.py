@@ -24,11 +24,10 @@ def bench_scenario(seed=1, **radio):
 
 
 @contextmanager
-def served(scenario=None, faults=None, link_dir=None, speed=1.0):
+def served(scenario=None, faults=None, link_dir=None, **more):
     """Serve a scenario in a thread; gives the server."""
-    server = Server(
-        scenario or bench_scenario(), link_dir, Faults.model_validate({"faults": faults or []}), speed=speed
-    )
+    wrong = Faults.model_validate({"faults": faults or []})
+    server = Server(scenario or bench_scenario(), link_dir, wrong, **more)
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop.is_set,), daemon=True)
     thread.start()

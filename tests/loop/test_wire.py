@@ -12,7 +12,7 @@ from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import record
 from uwblink.importers.motion_capture import add_poses
 from uwblink.recording.tags import load_tags
-from uwbsim.boards.server import extended, write_poses
+from uwbsim.boards.server import extended
 from uwbsim.scenario.loading import load
 
 ROOT = Path(__file__).parents[2]
@@ -43,7 +43,7 @@ def test_served_boards_calibrate_like_simulated_ones(tmp_path):
     scenario = load(TRAIN, ["run.duration_s=25"])
     tags = load_tags(TRAIN)
     with served(extended(scenario, 60.0)) as server:
-        write_poses(scenario, server.epoch_ns, tmp_path / "poses.csv")
+        server.write_poses(tmp_path / "poses.csv")
         record(
             list(server.names.values()), tmp_path / "boards.uwb", RangingPlan(tags=tags, rate_hz=160.0), duration_s=22
         )

@@ -6,11 +6,11 @@ boards print goes out when it is due.
 
 from __future__ import annotations
 
-import csv
 import heapq
 import selectors
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -19,14 +19,15 @@ import numpy as np
 
 from uwblink.boards.pseudo_terminals import Terminal
 from uwbsim.boards.board_air import MS, NS_PER_S
-from uwbsim.boards.virtual_board import Bench
+from uwbsim.boards.live_poses import LivePoses
+from uwbsim.boards.virtual_board import Bench, VirtualBoard
 from uwbsim.random_streams import stream
 from uwbsim.scenario.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.clocks import LONGEST_RUN_S
-from uwbsim.world.world import World
 
 LONGEST_WAIT_S: Final = 0.1
+POSES_EVERY: Final = 100 * MS
 
 
 PREPARED_S: Final = 7200.0
@@ -39,17 +40,6 @@ def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
     return scenario.model_copy(
         update={"run": scenario.run.model_copy(update={"duration_s": min(longer, LONGEST_RUN_S)})}
     )
-
-
-def write_poses(scenario: Scenario, epoch_ns: int, path: Path) -> None:
-    """Write what motion capture sees over the scenario's duration, in host time, as `uwblink poses` reads it."""
-    poses = World.of(scenario).motion_capture()
-    columns = zip(poses.time_ns + epoch_ns, poses.body, poses.position_m, poses.quaternion, strict=True)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["time_ns", "body", "x", "y", "z", "qx", "qy", "qz", "qw"])
-        for time_ns, body, position, quaternion in columns:
-            writer.writerow([time_ns, body, *(f"{v:.6f}" for v in (*position, *quaternion))])
 
 
 class Server:
@@ -80,15 +70,24 @@ class Server:
     """
 
     def __init__(
-        self, scenario: Scenario, link_dir: Path | None = None, faults: Faults | None = None, *, speed: float = 1.0
+        self,
+        scenario: Scenario,
+        link_dir: Path | None = None,
+        faults: Faults | None = None,
+        *,
+        speed: float = 1.0,
+        tell: Callable[[str], object] = lambda text: None,
     ) -> None:
         """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made.
 
-        With a `speed` below 1 the boards' time passes that much slower than the wall clock's.
+        With a `speed` below 1 the boards' time passes that much slower than the wall clock's. `tell` is told in a line
+        what went wrong that does not end the serving: a board's own program failed, poses cannot be written any more.
         """
-        self._speed = speed
+        self._speed, self._tell = speed, tell
         self._faults = faults or Faults()
         self.bench = Bench(scenario, self._printed, self._faults.lost_share())
+        self.bench.crashed = self._crashed
+        self._poses: LivePoses | None = None
         self._chance = stream(scenario.run.seed, "serial faults")
         self._terminals: dict[int, Terminal] = {}
         self._selector = selectors.SelectSelector()
@@ -134,8 +133,30 @@ class Server:
         while self._timed and self._timed[0][0] <= now:
             heapq.heappop(self._timed)[2]()
 
+    def write_poses(self, path: Path) -> None:
+        """Write motion capture to a file from now on, in host time, as `uwblink poses` reads it."""
+        self._poses = LivePoses(self.bench.radios.world, path, self.epoch_ns)
+        self._append_poses()
+
+    def _append_poses(self) -> None:
+        if self._poses is None:
+            return
+        now = self._now_ns()
+        try:
+            self._poses.write_until(now)
+        except OSError as error:
+            self._tell(f"the poses end here: {error.strerror or error}")
+            return
+        self._at(now + POSES_EVERY, self._append_poses)
+
+    def _crashed(self, board: VirtualBoard, error: Exception) -> None:
+        self._tell(f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}")
+
     def close(self) -> None:
         """Unplug everything."""
+        if self._poses is not None:
+            with suppress(OSError):
+                self._poses.close()
         for terminal in self._terminals.values():
             terminal.unplug()
         self._selector.close()

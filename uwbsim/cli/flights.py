@@ -60,14 +60,14 @@ def serve(
     scenario: ScenarioFile,
     link_dir: Annotated[Path | None, typer.Option(help="Folder for stable links, tag10 and so on.")] = None,
     faults: Annotated[Path | None, typer.Option(help="What goes wrong (.toml).")] = None,
-    poses: Annotated[Path | None, typer.Option(help="Motion capture to write (.csv), in host time.")] = None,
+    poses: Annotated[Path | None, typer.Option(help="Motion capture to write as it goes (.csv), in host time.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
     overrides: Overrides = None,
     force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
     from uwblink.output import check_output
-    from uwbsim.boards.server import Server, extended, write_poses
+    from uwbsim.boards.server import Server, extended
     from uwbsim.scenario import faults as fault_files
     from uwbsim.scenario.loading import load
 
@@ -80,7 +80,7 @@ def serve(
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")
         if poses:
-            write_poses(loaded, server.epoch_ns, poses)
+            server.write_poses(poses)
         with interrupts() as stop:
             server.run(stop, duration or float("inf"))
     finally:

@@ -11,7 +11,7 @@ from uwblink.errors import ImportTableError
 from uwblink.importers.motion_capture import add_poses
 from uwblink.importers.poses import read_poses
 from uwblink.recording.file import Recording
-from uwbsim.boards.server import write_poses
+from uwbsim.boards.live_poses import LivePoses
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate, write
 
@@ -89,7 +89,11 @@ def flight(tmp_path_factory):
     )
     moved = replace(simulated, poses=nothing, exchanges=replace(e, time_ns=e.time_ns + SHIFT_NS))
     write(moved, folder / "f.uwb")
-    write_poses(scenario, SHIFT_NS + 3_210_000_000, folder / "p.csv")
+    from uwbsim.world.world import World
+
+    poses = LivePoses(World.of(scenario), folder / "p.csv", SHIFT_NS + 3_210_000_000)
+    poses.write_until(int(scenario.run.duration_s * 1e9))
+    poses.close()
     return folder
 
 
