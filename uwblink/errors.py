@@ -21,6 +21,10 @@ class RecordingError(UwblinkError, ValueError):
     """A file that is not a usable recording."""
 
 
+class RecordingInUseError(RecordingError):
+    """Another process is writing the recording, or has it open for updating."""
+
+
 class RecordingExistsError(UwblinkError, FileExistsError):
     """The output is already there and was not to be replaced."""
 

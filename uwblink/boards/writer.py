@@ -18,6 +18,7 @@ from uwblink.boards.listeners import Heard, Listener
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow
+from uwblink.recording.snapshots import SnapshotMaker
 from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import Cir, Overheard, RangeReport
 
@@ -74,6 +75,7 @@ class RecordingWriter(Listener):
         self._ended = threading.Event()
         self._written_s = time.monotonic()
         self._error: RecordingError | None = None
+        self._snapshots = SnapshotMaker(recording.path, recording.snapshot)
         self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
         self._thread.start()
 
@@ -144,6 +146,8 @@ class RecordingWriter(Listener):
             except RecordingError as error:
                 self._error = error
             self._written_s = time.monotonic()
+            self._snapshots.look()
+        self._snapshots.close()
 
 
 def overheard_row(time_ns: int, listener: int, heard: Overheard) -> dict[str, float]:

@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.errors import RecordingError, RecordingMissingError
+from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError
 from uwblink.output import check_output
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.schema import (
@@ -31,6 +32,7 @@ from uwblink.recording.schema import (
     Tag,
     standard_meta,
 )
+from uwblink.recording.snapshots import open_snapshot
 from uwblink.recording.store import Store
 from uwblink.ticks import REPORT_BITS
 from uwblink.twr import COLUMNS, Exchanges
@@ -93,15 +95,23 @@ class Recording:
     def open(cls, path: str | os.PathLike[str], *, update: bool = False) -> Self:
         """Open a recording for reading, or to `update` it in place.
 
-        Raises `RecordingMissingError` or `RecordingError` (a directory, not a recording, truncated,
-        tables or columns missing, a newer format, still being written).
+        Of one that is being recorded a snapshot is opened, which its recorder makes: everything until now. Raises
+        `RecordingMissingError` or `RecordingError` (a directory, not a recording, truncated, tables or columns missing,
+        a newer format, in use by something that makes no snapshots).
         """
         source = Path(path)
         if not source.exists():
             raise RecordingMissingError(f"{source}: no such recording")
         if source.is_dir():
             raise RecordingError(f"{source}: is a directory, expected a {SUFFIX} recording")
-        recording = cls(Store.open(source, update=update))
+        try:
+            store = Store.open(source, update=update)
+        except RecordingInUseError:
+            if update:
+                raise
+            store = open_snapshot(source, partial(Store.open, update=False))
+            store.path = source
+        recording = cls(store)
         try:
             recording._check_version()
         except RecordingError:
@@ -126,6 +136,10 @@ class Recording:
         if kind is None:
             self._partial.replace(self.path)
         _remove(self._partial)
+
+    def snapshot(self, place: str | os.PathLike[str]) -> None:
+        """Write everything committed so far to a new file, while others go on appending; raises `RecordingError`."""
+        self._store.copy_to(Path(place))
 
     def append_meta(self, meta: Mapping[str, Any]) -> None:
         """Add entries to `meta`, replacing those with the same key; values are stored as JSON."""

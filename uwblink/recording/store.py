@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.errors import RecordingError
+from uwblink.errors import RecordingError, RecordingInUseError
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class Store:
 
     def __init__(self, connection: duckdb.DuckDBPyConnection, path: Path) -> None:
         """Wrap an open connection."""
-        self._db = connection
+        self._db, self._second = connection, connection.cursor()
         self.path = path
 
     @classmethod
@@ -61,7 +61,7 @@ class Store:
         except duckdb.IOException as error:
             if _is_locked(path, update=update):
                 use = "has it open" if update else "is writing it"
-                raise RecordingError(f"{path}: another process {use}; wait until that ends") from error
+                raise RecordingInUseError(f"{path}: another process {use}; wait until that ends") from error
             raise _damaged(path, error) from error
         except duckdb.Error as error:
             raise _damaged(path, error) from error
@@ -76,7 +76,25 @@ class Store:
 
     def close(self) -> None:
         """Close the file."""
+        self._second.close()
         self._db.close()
+
+    def copy_to(self, place: Path) -> None:
+        """Write what is committed to a new file, on a connection of its own; raises `RecordingError`."""
+        import duckdb
+
+        target = str(place).replace("'", "''")
+        try:
+            (source,) = self._second.execute("SELECT current_database()").fetchone() or ("",)
+            named = source.replace('"', '""')
+            self._second.execute(f"ATTACH '{target}' AS uwblink_snapshot")
+            try:
+                self._second.execute(f'COPY FROM DATABASE "{named}" TO uwblink_snapshot')
+            finally:
+                self._second.execute("DETACH uwblink_snapshot")
+        except duckdb.Error as error:
+            place.unlink(missing_ok=True)
+            raise RecordingError(f"{place}: cannot be written ({_first_line(error)})") from error
 
     def execute(self, statement: str, values: list[Any] | None = None) -> None:
         """Execute a statement of SQL."""
