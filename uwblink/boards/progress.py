@@ -31,7 +31,10 @@ class PairState:
 
 @dataclass(slots=True)
 class Progress(Listener):
-    """Counts for whoever watches. Times in seconds since `start_ns` (host time)."""
+    """Counts for whoever watches. Times in seconds since `start_ns` (host time).
+
+    `waiting` pieces of bytes are not in the file yet, whose last commit ended `behind_s` seconds ago.
+    """
 
     start_ns: int = 0
     time_s: float = 0.0
@@ -40,6 +43,8 @@ class Progress(Listener):
     last_fault: str = ""
     overheard: int = 0
     cirs: int = 0
+    waiting: int = 0
+    behind_s: float = 0.0
 
     @property
     def exchanges(self) -> int:

@@ -68,8 +68,14 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
         with RecordingWriter(recording) as writer:
             recorder = Recorder(found, plan, turns, [writer, *others], passive=passive, ports=using)
+
+            def tell(progress: Progress) -> None:
+                progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
+                if watch:
+                    watch(progress)
+
             try:
-                recorder.run(duration_s, stop, watch)
+                recorder.run(duration_s, stop, tell)
             finally:
                 recorder.close()
     return recorder.progress

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from uwblink.cli.shared import AsJson, print_json
+from uwblink.cli.shared import INTERRUPTED, AsJson, interrupts, print_json
 
 if TYPE_CHECKING:
     from uwblink.wire.messages import RangeReport
@@ -94,36 +95,52 @@ def twr(
     count: Annotated[int, typer.Option("-n", min=1, help="How many exchanges.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Range with another board."""
+    """Range with another board; a line each as it comes, and a summary at the end, also of what Ctrl-C cut short."""
     from uwblink.boards.board import Board
     from uwblink.errors import RangingFailedError
 
-    reports: list[RangeReport] = []
+    ranges: list[float] = []
     failures: list[RangingFailedError] = []
-    with Board.open(port) as board:
+    with interrupts() as stop, Board.open(port) as board:
         initiator = board.id
-        for _ in range(count):
+        while len(ranges) + len(failures) < count and not stop():
             try:
                 report = board.range(target, protocol=protocol)
             except RangingFailedError as error:
                 failures.append(error)
-                if not reports and len(failures) >= 3:
+                if not ranges and len(failures) >= 3:
                     raise
                 continue
-            reports.append(report)
-            if not as_json:
-                typer.echo(_line(initiator, report))
-    if not reports:
+            ranges.append(report.range_m)
+            row = {"initiator": initiator, "target": target, **_fields(report)}
+            _print_now(json.dumps(row) if as_json else _line(initiator, report))
+        interrupted = stop()
+    if failures and not ranges and not interrupted:
         raise failures[-1]
-    if as_json:
-        rows = [{"initiator": initiator, "target": target, **_fields(r)} for r in reports]
-        print_json(rows)
-    elif count > 1:
-        import statistics
+    if as_json or count > 1:
+        _print_now(_summary_of(ranges, len(failures), count, as_json=as_json))
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
 
-        ranges = [r.range_m for r in reports]
-        spread = f" ± {statistics.stdev(ranges):.4f}" if len(ranges) > 1 else ""
-        typer.echo(f"{len(reports)} of {count} exchanges, mean {statistics.fmean(ranges):.4f}{spread} m")
+
+def _print_now(line: str) -> None:
+    """Print a line so that whoever reads it through a pipe has it at once."""
+    typer.echo(line)
+    sys.stdout.flush()
+
+
+def _summary_of(ranges: list[float], failed: int, count: int, *, as_json: bool) -> str:
+    import statistics
+
+    mean = statistics.fmean(ranges) if ranges else None
+    spread = statistics.stdev(ranges) if len(ranges) > 1 else None
+    if as_json:
+        figures = {"exchanges": len(ranges), "failed": failed, "asked": count, "mean_m": mean, "std_m": spread}
+        return json.dumps({"summary": figures})
+    text = f"{len(ranges)} of {count} exchanges"
+    if mean is not None:
+        text += f", mean {mean:.4f}" + (f" ± {spread:.4f}" if spread is not None else "") + " m"
+    return text
 
 
 def _line(initiator: int, report: RangeReport) -> str:

@@ -13,6 +13,7 @@ import typer
 from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
+    from uwblink.boards.live_page import LivePage
     from uwblink.boards.progress import Progress
 
 LINE_EVERY_S = 2.0
@@ -32,6 +33,9 @@ def record(
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
     cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Serve a page about it to this computer's browser.")] = False,
+    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 0,
+    calibration: Annotated[Path | None, typer.Option(help="Show ranges corrected, too (.json); with --live.")] = None,
     force: Force = False,
 ) -> None:
     """Play a ranging plan on boards and record everything they say."""
@@ -52,7 +56,15 @@ def record(
         chosen = replace(chosen, rate_hz=rate)
     if cir:
         chosen = replace(chosen, get_cir=True)
-    with interrupts() as stop, _watcher() as watch:
+    if calibration and not live:
+        raise PlanError("--calibration: corrected ranges are shown on the page of --live; give that, too")
+    with interrupts() as stop, _watcher() as watch, _page(output, calibration, live_port, live) as page:
+
+        def watch_all(progress: Progress) -> None:
+            watch(progress)
+            if page:
+                page.watch(progress)
+
         progress = run(
             ports,
             output,
@@ -61,9 +73,25 @@ def record(
             passive=passive,
             force=force,
             stop=stop,
-            watch=watch,
+            watch=watch_all,
+            listeners=[page] if page else [],
         )
     typer.echo(f"{output}: {_summary(progress)}")
+
+
+@contextmanager
+def _page(output: Path, calibration: Path | None, port: int, live: bool) -> Iterator[LivePage | None]:
+    """Serve the live page, if it was asked for."""
+    if not live:
+        yield None
+        return
+    from uwblink.boards.corrections import load_correction
+    from uwblink.boards.live_page import LivePage
+
+    correct = load_correction(calibration) if calibration else None
+    with LivePage(output, correct=correct, port=port) as page:
+        typer.echo(f"live page: {page.url}", err=True)
+        yield page
 
 
 @contextmanager

@@ -27,6 +27,9 @@ _PARAMETER: Final = re.compile(r"`([a-z_]+)`")
 MISTAKE: Final = 2
 """Exit status of a command that cannot do what it was told."""
 
+INTERRUPTED: Final = 130
+"""Exit status of a command that Ctrl-C ended before it was done, as shells have it."""
+
 
 def new_app(text: str) -> typer.Typer:
     """Return a command without sub-commands yet, whose help begins with `text`, and which knows `--version`."""

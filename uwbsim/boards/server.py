@@ -165,6 +165,10 @@ class Server:
         """Pull a board's cable, from any thread: `step` does it, so that nothing closes what it waits on."""
         self._at(self._now_ns(), partial(self._unplug, tag))
 
+    def plug(self, tag: int) -> None:
+        """Plug a board in again, from any thread; it boots."""
+        self._at(self._now_ns(), partial(self._plug, tag))
+
     def _unplug(self, tag: int) -> None:
         terminal = self._terminals[tag]
         if terminal.fileno is not None:

@@ -75,7 +75,7 @@ def serve(
         check_output(poses, force=force)
     loaded = load(scenario, overrides or ())
     wrong = fault_files.load(faults, [tag.id for tag in loaded.tags]) if faults else None
-    server = Server(extended(loaded, duration), link_dir, wrong)
+    server = Server(extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True))
     try:
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")

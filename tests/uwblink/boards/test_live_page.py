@@ -1,0 +1,153 @@
+"""The live page: what it shows, to whom, and in a browser where there is one."""
+
+import math
+import re
+import shutil
+import subprocess
+import urllib.error
+import urllib.request
+
+import pytest
+
+import uwblink
+from tests.boards import bench_scenario
+from uwblink.boards.corrections import load_correction
+from uwblink.boards.live_page import LivePage
+from uwblink.errors import PlanError, PortError
+from uwblink.recording.schema import Fault
+from uwblink.wire.messages import RangeReport
+from uwbsim.boards.virtual_port import VirtualPorts
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--virtual-time-budget=3000",
+    "--dump-dom",
+)
+
+
+def fetch(page, path="", **headers):
+    request = urllib.request.Request(page.url + path, headers=headers)  # noqa: S310 - the page's own address
+    with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310
+        return answer.headers, answer.read().decode()
+
+
+class Looking(uwblink.Listener):
+    """Looks at the page when so many exchanges have been told of."""
+
+    def __init__(self, at, look):
+        self.left, self.look, self.seen = at, look, []
+
+    def on_turn(self, turn):
+        self.left -= 1
+        if not self.left:
+            self.seen.append(self.look())
+
+
+def recorded(tmp_path, page, look, lost_share=0.1):
+    ports = VirtualPorts(bench_scenario(), lost_share)
+    looking = Looking(400, look)
+    plan = uwblink.RangingPlan(rate_hz=100.0)
+    done = uwblink.record(
+        ports.names.values(),
+        tmp_path / "f.uwb",
+        plan,
+        duration_s=5.0,
+        listeners=[page, looking],
+        using=ports,
+        watch=page.watch,
+    )
+    return done, looking.seen[0]
+
+
+def test_the_page_shows_rates_success_ranges_power_faults_disk_and_queue(tmp_path):
+    with LivePage(tmp_path / "f.uwb", correct=lambda initiator, report: report.range_m - 0.125) as page:
+        done, (headers, text) = recorded(tmp_path, page, lambda: fetch(page))
+    assert headers["Content-Type"] == "text/html; charset=utf-8"
+    rows = re.findall(r"<tr><td>(\d) &rarr; (\d)</td>(.*?)</tr>", text)
+    assert {(int(a), int(b)) for a, b, _ in rows} == set(done.pairs)
+    for *_, cells in rows:
+        rate, success, distance, corrected, power, picture = re.findall(r"<td>(.*?)</td>", cells)
+        assert 20 < float(rate) < 40
+        assert 80 < float(success.removesuffix(" %")) <= 100
+        assert float(corrected) == pytest.approx(float(distance) - 0.125, abs=0.0011)
+        assert -100 < float(power) < -70
+        assert picture.count("<polyline") == 2
+        assert len(re.findall(r"[\d.]+,[\d.]+", picture)) > 100
+    assert re.search(r"file [\d.]+ MB, disk [\d.]+ GB free; queue: \d+ pieces, last commit [\d.]+ s ago", text)
+    assert "faults: none" in text or "failed exchange" in text
+
+
+def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
+    with LivePage(tmp_path / "<f>.uwb") as page:
+        page.on_fault(Fault(0, "1", "text", "<script>alert(1)</script>"))
+        _, text = fetch(page)
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    assert "recording &lt;f&gt;.uwb" in text
+
+
+def test_the_page_is_for_this_computer_alone(tmp_path):
+    with LivePage(tmp_path / "f.uwb") as page:
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", page.url)
+        headers, text = fetch(page)
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
+        assert not re.findall(r"(?:src|href)=", text)
+        for path, host, status in (
+            ("", "evil.example", 403),
+            ("../etc/passwd", "localhost", 404),
+            ("x", "localhost", 404),
+        ):
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                fetch(page, path, Host=host)
+            assert refused.value.code == status
+            refused.value.close()
+        with pytest.raises(PortError, match="cannot be served there"):
+            LivePage(tmp_path / "f.uwb", port=int(page.url.rsplit(":", 1)[1].rstrip("/")))
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: nothing to open the page with")
+def test_a_browser_shows_it_and_keeps_it_fresh(tmp_path):
+    """Headless Chromium runs the script under the page's own policy, and fetches the body again."""
+
+    def look():
+        words = [str(CHROMIUM), *FLAGS, f"--user-data-dir={tmp_path / 'profile'}", page.url]
+        return subprocess.run(words, capture_output=True, text=True, timeout=120)
+
+    with LivePage(tmp_path / "f.uwb") as page:
+        bodies = []
+        whole = page.body
+
+        def counted():
+            bodies.append(1)
+            return whole()
+
+        page.body = counted  # type: ignore[method-assign]
+        _, done = recorded(tmp_path, page, look)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("<polyline") >= 3
+    assert "recording f.uwb" in done.stdout
+    assert len(bodies) >= 2, "the script fetches the body again"
+
+
+def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
+    import calib
+
+    flight = calib.sample_flight()
+    calibration = calib.fit(flight).calibration
+    (tmp_path / "c.json").write_text("{}")
+    with pytest.raises(PlanError, match=r"c\.json"):
+        load_correction(tmp_path / "c.json")
+    calibration.save(tmp_path / "d.json")
+    correct = load_correction(tmp_path / "d.json")
+    report = RangeReport(2, 3.0, 1, 2, 3, 4, 5, 6, -85.0, -86.0, 0.0, 0.0)
+    assert correct(1, report) == calibration.correct(3.0, -85.0, -86.0, 1, 2).range_m
+    stranger = RangeReport(77, 3.0, 1, 2, 3, 4, 5, 6, -85.0, -86.0, 0.0, 0.0)
+    assert math.isnan(correct(1, stranger))
