@@ -15,7 +15,7 @@ BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 
 def run(*arguments):
     words = [str(a) for a in arguments]
-    return subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True, timeout=30)
+    return subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True, timeout=180)
 
 
 def refused(done, *fragments):

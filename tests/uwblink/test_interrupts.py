@@ -1,15 +1,20 @@
 """Ctrl-C: a summary, the right exit status, a closed file, no traceback."""
 
 import json
+import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from tests.boards import served
 
+ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 
 
@@ -49,3 +54,53 @@ def test_twr_that_is_not_interrupted_has_status_0_and_a_summary():
     assert done.returncode == 0
     assert [set(row) == {"summary"} for row in rows] == [False] * 5 + [True]
     assert rows[-1]["summary"]["exchanges"] == 5
+
+
+def files(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+
+def test_a_sweep_says_that_what_was_done_is_kept_and_goes_on_with_it(tmp_path):
+    plan = ROOT / "docs" / "examples" / "sweep.toml"
+    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
+    (tmp_path / "docs" / "examples").mkdir(parents=True)
+    text = plan.read_text()
+    (tmp_path / "docs" / "examples" / "sweep.toml").write_text(re.sub(r"(?m)^seeds = .*$", "seeds = 400", text))
+    plan, results = tmp_path / "docs" / "examples" / "sweep.toml", tmp_path / "results"
+    process = started("uwbsim", "sweep", str(plan), "-o", str(results), "--workers", "1")
+    wait_for(lambda: (results / "results.duckdb.wal").exists() or len(files(results)) > 0, process)
+    out, _ = ended(process)
+    assert process.returncode == 130
+    assert "interrupted; what was done is kept, and --resume goes on with it" in out
+    assert not (results / "results.duckdb.wal").exists(), "the store is closed"
+    assert not (results / "results.csv").exists(), "which is written when all is done"
+
+
+@pytest.mark.parametrize("delay_s", [0.3, 1.0, 2.0])
+def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(tmp_path, delay_s):
+    flight, page = tmp_path / "f.uwb", tmp_path / "page.html"
+    scenario = ROOT / "scenarios" / "icra2023" / "test1.toml"
+    subprocess.run([str(BIN / "uwbsim"), "run", str(scenario), "-o", str(flight)], check=True, capture_output=True)
+    process = started("calib", "report", str(flight), "-o", str(page))
+    wait_for(lambda: is_working(process), process)
+    time.sleep(delay_s)
+    _, err = ended(process)
+    # On a quick machine it may have been done before.
+    assert process.returncode in (130, 0)
+    assert ("interrupted" in err) == (process.returncode == 130)
+    assert files(tmp_path) == (["f.uwb"] if process.returncode else ["f.uwb", "page.html"])
+
+
+def wait_for(ready, process):
+    for _ in range(1200):
+        if ready():
+            return
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    raise AssertionError("nothing happened for a minute")
+
+
+def is_working(process):
+    """Whether a process has used a second's half of processor time, so that its start is behind it."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return int(fields[11]) + int(fields[12]) > os.sysconf("SC_CLK_TCK") / 2

@@ -51,20 +51,44 @@ def run(
     arguments: Sequence[str] | None = None,
     wording: Callable[[str], str] = str,
 ) -> NoReturn:
-    """Run a command and end the process: an error of `errors`, or of uwblink, is one line and status 2.
+    """Run a command and end the process: an error of `errors`, or of uwblink, is one line and status 2, Ctrl-C 130.
 
     `statuses` gives kinds of errors another status; `arguments` replaces those of the process; `wording` turns what
     the packages say, which know parameters only, into what people of the command line know, before `with_flags` does.
     """
     mistakes: tuple[type[Exception], ...] = (UwblinkError, *errors)
-    try:
-        with _plain_warnings():
+    status = 0
+    with _noted_interrupts() as interrupted, _plain_warnings():
+        try:
             app(args=list(sys.argv[1:] if arguments is None else arguments))
-    except mistakes as error:
-        typer.echo(f"error: {with_flags(wording(str(error)))}", err=True)
-        found = (status for kind, status in (statuses or {}).items() if isinstance(error, kind))
-        sys.exit(next(found, MISTAKE))
-    sys.exit(0)
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
+            if not interrupted():
+                if not isinstance(error, mistakes):
+                    raise
+                typer.echo(f"error: {with_flags(wording(str(error)))}", err=True)
+                found = (number for kind, number in (statuses or {}).items() if isinstance(error, kind))
+                status = next(found, MISTAKE)
+    if interrupted():
+        # Whatever a library made of it: an error of its own, or nothing at all.
+        typer.echo("interrupted", err=True)
+        status = INTERRUPTED
+    sys.exit(status)
+
+
+@contextmanager
+def _noted_interrupts() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C interrupt as ever, and remember that it did."""
+    asked: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        asked.append(number)
+        signal.default_int_handler(number, frame)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def with_flags(text: str) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from uwblink.cli.shared import INTERRUPTED, interrupts
 from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
@@ -191,8 +192,19 @@ def sweep(
     from uwbsim.sweep.runner import run_sweep
 
     loaded = load_design(plan)
-    with progress(loaded.name, eta=True) as report:
-        summary = run_sweep(loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=report)
+    with interrupts() as stop, progress(loaded.name, eta=True) as report:
+
+        def go_on(share: float) -> None:
+            if report:
+                report(share)
+            if stop():  # between two chunks, when nothing is being written
+                raise KeyboardInterrupt
+
+        try:
+            summary = run_sweep(loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=go_on)
+        except KeyboardInterrupt:
+            typer.echo(f"{output}: interrupted; what was done is kept, and --resume goes on with it")
+            raise typer.Exit(INTERRUPTED) from None
     typer.echo(
         f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} were there "
         "already; results.csv, results.parquet"
