@@ -17,7 +17,7 @@ lever_arm_m = [0.17, -0.17, -0.05]
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -33,14 +33,29 @@ KEYS: Final = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "tag
 
 @dataclass(frozen=True, slots=True)
 class RangingPlan:
-    """A ranging plan: `pairs` of (initiator, target) in the order in which they take turns."""
+    """A ranging plan: `pairs` of (initiator, target) in the order in which they take turns, "all", or () to listen.
+
+    `rate_hz` exchanges a second in total, as fast as boards answer without it. `tags` say where boards sit. Raises
+    `PlanError` for what cannot be played.
+    """
 
     pairs: tuple[tuple[int, int], ...] | Literal["all"] = "all"
+    _: KW_ONLY
     rate_hz: float | None = None
     protocol: str = "ds"
     target_reports: bool = False
     get_cir: bool = False
     tags: tuple[Tag, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check what was given."""
+        if self.rate_hz is not None and not (is_number(self.rate_hz) and self.rate_hz > 0):
+            raise PlanError(f"rate_hz: found {self.rate_hz!r}, expected a positive number")
+        if self.protocol not in PROTOCOLS:
+            raise PlanError(f"protocol: found {self.protocol!r}, allowed: {', '.join(PROTOCOLS)}")
+        for pair in () if self.pairs == "all" else self.pairs:
+            if not (isinstance(pair, tuple) and len(pair) == 2 and all(map(is_board_id, pair)) and pair[0] != pair[1]):
+                raise PlanError(f'pairs: found {pair!r:.60}, expected "all" or pairs of two different ids')
 
     def turns(self, present: Sequence[int]) -> tuple[tuple[int, int], ...]:
         """Return the pairs among boards that are present, none to only listen; raises `PlanError` naming absent ones.
@@ -74,7 +89,8 @@ def load_plan(path: Path) -> RangingPlan:
     protocol = file.choice("protocol", table.get("protocol", "ds"), PROTOCOLS)
     for name, value in flags.items():
         file.check(name, value, isinstance(value, bool), "true or false")
-    return RangingPlan(_pairs(path, table.get("pairs", "all")), rate, protocol, tags=read_tags(file), **flags)
+    pairs = _pairs(path, table.get("pairs", "all"))
+    return RangingPlan(pairs, rate_hz=rate, protocol=protocol, tags=read_tags(file), **flags)
 
 
 def _pairs(path: Path, value: Any) -> tuple[tuple[int, int], ...] | Literal["all"]:

@@ -5,7 +5,7 @@ A new command is one message class and one executor:
 ```python
 @message(b"C10")
 class GetTemperature(Message):
-    pass
+    factor: int = wire(INT)
 
 @message(b"R10")
 class Temperature(Message):
@@ -13,10 +13,10 @@ class Temperature(Message):
 
 register_message(GetTemperature)
 register_message(Temperature)
-register_command(GetTemperature, lambda board: Temperature(23))
+register_command(GetTemperature, lambda board, factor: Temperature(23 * factor))
 ```
 
-From then on every virtual board answers it, in process and served, and `Board.request(GetTemperature())` returns the
+From then on every virtual board answers it, in process and served, and `Board.request(GetTemperature(1))` returns the
 answer. Fields are handed to the executor in the order in which they are declared.
 """
 

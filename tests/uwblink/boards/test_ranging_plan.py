@@ -22,7 +22,9 @@ def test_a_whole_plan(tmp_path):
             "[[tags]]\nid = 1\nbody = 'a'\nlever_arm_m = [0.1, 0, -1]\n",
         )
     )
-    assert plan == RangingPlan(((1, 2), (3, 1)), 50, "ss", True, True, (Tag(1, "a", (0.1, 0.0, -1.0)),))
+    tags = (Tag(1, "a", (0.1, 0.0, -1.0)),)
+    expected = RangingPlan(((1, 2), (3, 1)), rate_hz=50, protocol="ss", target_reports=True, get_cir=True, tags=tags)
+    assert plan == expected
     assert plan.turns([1, 2, 3]) == ((1, 2), (3, 1))
 
 
@@ -68,3 +70,19 @@ def test_tags_come_from_a_scenario_too(tmp_path):
     assert load_tags(written(tmp_path, "[run]\nseed = 1\n[[tags]]\nid = 4\nbody = 'x'\nskew_ppm = 3\n")) == (
         Tag(4, "x", (0.0, 0.0, 0.0)),
     )
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"rate_hz": 0}, "rate_hz: found 0, expected a positive number"),
+        ({"rate_hz": float("nan")}, "rate_hz: found nan"),
+        ({"protocol": "tdoa"}, "protocol: found 'tdoa', allowed: ds, ss"),
+        ({"pairs": ((1, 1),)}, r"pairs: found \(1, 1\), expected"),
+        ({"pairs": ((1, 300),)}, "pairs: found"),
+        ({"pairs": "some"}, "pairs: found 's'"),
+    ],
+)
+def test_plans_that_cannot_be_are_refused_where_they_are_made(given, text):
+    with pytest.raises(PlanError, match=text):
+        RangingPlan(**given)

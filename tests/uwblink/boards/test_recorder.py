@@ -50,7 +50,7 @@ def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
 
 def test_overheard_exchanges_impulse_responses_and_target_reports(tmp_path):
     path, ports = tmp_path / "f.uwb", VirtualPorts(bench_scenario())
-    plan = RangingPlan(((1, 2),), 10.0, "ds", target_reports=True, get_cir=True)
+    plan = RangingPlan(((1, 2),), rate_hz=10.0, target_reports=True, get_cir=True)
     done = record(ports.names.values(), path, plan, duration_s=2.0, passive=True, using=ports)
     assert not any(board.passive for board in ports.bench.boards.values()), "listening is switched off again"
     with Recording.open(path) as recording:

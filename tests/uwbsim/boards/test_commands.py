@@ -1,8 +1,6 @@
 """What boards read and do: C's numbers, floats that are none, and commands that a stranger adds."""
 
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar
 
 import pytest
 
@@ -18,33 +16,31 @@ from uwbsim.boards.virtual_port import VirtualPorts
 from uwbsim.errors import UwbsimError
 
 
-@dataclass(frozen=True, slots=True)
+@m.message(b"C10")
 class GetVoltage(m.Message):
     """C10: ask for a supply voltage, times a factor."""
 
-    KEY: ClassVar = b"C10"
-    FIELDS: ClassVar = {"factor": INT, "name": TEXT}
-    factor: int
-    name: str
+    factor: int = m.wire(INT)
+    name: str = m.wire(TEXT)
 
 
-@dataclass(frozen=True, slots=True)
+@m.message(b"R10")
 class Voltage(m.Message):
     """R10: the answer."""
 
-    KEY: ClassVar = b"R10"
-    FIELDS: ClassVar = {"board": INT, "volts": PRINTED, "name": TEXT}
-    board: int
-    volts: float
-    name: str
+    board: int = m.wire(INT)
+    volts: float = m.wire(PRINTED)
+    name: str = m.wire(TEXT)
 
 
 @pytest.fixture
-def voltage(monkeypatch):
-    """The new command in all three tables, taken out again afterwards."""
-    monkeypatch.setitem(m.COMMANDS, b"C10", GetVoltage)
-    monkeypatch.setitem(m.REPORTS, b"R10", Voltage)
-    monkeypatch.setitem(EXECUTORS, b"C10", EXECUTORS[b"C00"])
+def voltage():
+    """The new messages as a stranger registers them, taken out again afterwards."""
+    m.register_message(GetVoltage)
+    m.register_message(Voltage)
+    yield
+    del m.COMMANDS[b"C10"], m.REPORTS[b"R10"]
+    EXECUTORS.pop(b"C10", None)
 
 
 def test_a_new_command_is_one_message_class_and_one_executor(voltage):
