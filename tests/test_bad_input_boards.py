@@ -86,6 +86,9 @@ def test_recordings_that_cannot_begin(ports, tmp_path):
     refused(run("uwblink", "record", *both, "-o", out, "--pairs", "some"), "some")
     refused(run("uwblink", "record", *both, "-o", out, "--plan", tmp_path / "no.toml"), "no.toml")
     refused(run("uwblink", "record", ports[1], "-o", out, "--pairs", "all"), "no two boards")
+    nothing = tmp_path / "no.json"
+    refused(run("uwblink", "record", *both, "-o", out, "--pairs", "all", "--calibration", nothing), "--live")
+    refused(run("uwblink", "record", *both, "-o", out, "--pairs", "all", "--live", "--calibration", nothing), "no.json")
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 

@@ -70,10 +70,13 @@ class DataPayload:
 Payload = PollPayload | ResponsePayload | FinalPayload | DataPayload
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Receptions:
-    """A frame at all boards, shape (tags,): power at the antenna, whether it is strong enough and not lost, its stamp
-    (ticks, not wrapped), and what is printed of it. `echoes` are added where an impulse response is asked for."""
+    """A frame at all boards, shape (tags,), whoever listens.
+
+    Power at the antenna, whether it is strong enough and not lost, its stamp (ticks, not wrapped), and what is printed
+    of it.
+    """
 
     power_dbm: Floats
     heard: Bools
@@ -82,7 +85,7 @@ class Receptions:
     skew_ppm: Floats
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Frame:
     """A frame on the air, or about to be.
 
@@ -155,7 +158,15 @@ class Radios:
         excess = np.zeros(len(self._all))
         if receiver in self.place:
             excess[self.place[receiver]] = excess_m
-        return Frame(sender, receiver, payload, stamp, departure, self._receptions(place, departure, excess), excess_m)
+        return Frame(
+            sender=sender,
+            receiver=receiver,
+            payload=payload,
+            stamp=stamp,
+            departure=departure,
+            receptions=self._receptions(place, departure, excess),
+            excess_m=excess_m,
+        )
 
     def received(self, frame: Frame, board: int) -> Received:
         """Return what one board has of a frame."""
@@ -175,7 +186,9 @@ class Radios:
         power_dbm = received.link.power_dbm
         printed_dbm, skew_ppm = self.medium.readings(frames, power_dbm, noise[2], noise[3])
         heard = self.medium.heard(power_dbm, noise[0]) & arrives
-        return Receptions(power_dbm, heard, received.stamp, printed_dbm, skew_ppm)
+        return Receptions(
+            power_dbm=power_dbm, heard=heard, stamp=received.stamp, printed_dbm=printed_dbm, skew_ppm=skew_ppm
+        )
 
     def _one(self, board: int) -> Ints:
         return np.array([self.place[board]])

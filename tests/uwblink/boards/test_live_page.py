@@ -3,14 +3,18 @@
 import math
 import re
 import shutil
+import signal
 import subprocess
+import sys
+import time
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import pytest
 
 import uwblink
-from tests.boards import bench_scenario
+from tests.boards import bench_scenario, served
 from uwblink.boards.corrections import load_correction
 from uwblink.boards.live_page import LivePage
 from uwblink.errors import PlanError, PortError
@@ -18,6 +22,7 @@ from uwblink.recording.schema import Fault
 from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_port import VirtualPorts
 
+BIN = Path(sys.executable).parent
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
     "--headless",
@@ -151,3 +156,24 @@ def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
     assert correct(1, report) == calibration.correct(3.0, -85.0, -86.0, 1, 2).range_m
     stranger = RangeReport(77, 3.0, 1, 2, 3, 4, 5, 6, -85.0, -86.0, 0.0, 0.0)
     assert math.isnan(correct(1, stranger))
+
+
+def test_the_command_says_where_the_page_is_and_serves_it_while_it_records(tmp_path):
+    with served() as server:
+        ports = [str(name) for name in server.names.values()]
+        words = [str(BIN / "uwblink"), "record", *ports, "-o", str(tmp_path / "f.uwb"), "--pairs", "all", "--live"]
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        url = re.search(r"live page: (http://127\.0\.0\.1:\d+/)", process.stderr.readline())[1]
+        for _ in range(600):
+            with urllib.request.urlopen(url + "body", timeout=30) as answer:  # noqa: S310 - the page's own address
+                text = answer.read().decode()
+            if text.count("<polyline") == 3:
+                break
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert text.count("<polyline") == 3, "three pairs, without a calibration"
+    assert process.returncode == 0, err
+    assert " exchanges in " in out
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(url, timeout=5)  # noqa: S310
