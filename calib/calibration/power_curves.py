@@ -75,12 +75,13 @@ def populated(ordered: Floats) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def knots_for(ordered: Floats, segments: int) -> Floats:
+def knots_for(ordered: Floats, segments: int, span: tuple[float, float] | None = None) -> Floats:
     """Return clamped knots with `segments` intervals, halfway between equal counts and equal lengths, of sorted powers.
 
-    Equal counts alone leave the sparse high powers to one long segment, equal lengths the sparse ones without data.
+    They lie on `span`, by default the populated range. Equal counts alone leave the sparse high powers to one long
+    segment, equal lengths the sparse ones without data.
     """
-    low, high = populated(ordered)
+    low, high = span or populated(ordered)
     quantiles = np.clip(_quantiles(ordered, np.linspace(0, 1, segments + 1)), low, high)
     inner = (quantiles + np.linspace(low, high, segments + 1)) / 2
     inner[[0, -1]] = low, high

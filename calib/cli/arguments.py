@@ -13,9 +13,16 @@ NewCalibration = Annotated[Path, typer.Option("-o", "--output", help="Calibratio
 AsJson = Annotated[bool, typer.Option("--json", help="Print all figures as JSON, in SI units and ns.")]
 Force = Annotated[bool, typer.Option(help="Replace files that are there already.")]
 Loss = Annotated[
-    str,
+    str | None,
     typer.Option(
-        help="cauchy, huber, soft_l1, l2 (least squares), mixture (a likelihood with reflections) or a registered one."
+        help="mixture (the default: a likelihood with reflections by pair), cauchy (that of --sequential), huber, "
+        "soft_l1, l2 (least squares) or a registered one."
+    ),
+]
+ReferencePower = Annotated[
+    float | None,
+    typer.Option(
+        help="Power in dBm at which the curve is zero, and the delays are stated (default: -82, the published alpha)."
     ),
 ]
 Scale = Annotated[

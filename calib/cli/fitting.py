@@ -21,6 +21,7 @@ from calib.cli.arguments import (
     MinimumNorm,
     NewCalibration,
     Recordings,
+    ReferencePower,
     Scale,
     Sequential,
     TrimStatic,
@@ -40,7 +41,7 @@ def add_to(app: typer.Typer) -> None:
 def fit(
     recordings: Recordings,
     output: NewCalibration,
-    loss: Loss = "cauchy",
+    loss: Loss = None,
     scale: Scale = "auto",
     lift: Lift = "mean-of-lifted",
     fix: Fix = None,
@@ -48,6 +49,7 @@ def fit(
     sequential: Sequential = False,
     trim_static: TrimStatic = False,
     minimum_norm: MinimumNorm = False,
+    reference_power: ReferencePower = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -56,7 +58,16 @@ def fit(
     from calib.cli.options import fit_options
     from uwblink.output import check_output
 
-    options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
+    options = fit_options(
+        loss,
+        scale,
+        lift,
+        fix,
+        group,
+        sequential=sequential,
+        minimum_norm=minimum_norm,
+        reference_power_dbm=reference_power,
+    )
     check_output(output, force=force)
     ranges = calib.load_ranges(recordings, trim_static=trim_static)
     try:

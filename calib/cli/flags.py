@@ -9,6 +9,7 @@ FLAGS: Final = {
     "fixed_ns": "--fix",
     "groups": "--group",
     "scale_ns": "--scale",
+    "reference_power_dbm": "--reference-power",
 }
 """Parameters whose flag is called otherwise; all others are spelt alike, with dashes."""
 

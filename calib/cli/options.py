@@ -12,7 +12,7 @@ from calib.estimation.arguments import FitSettings
 
 
 def fit_options(
-    loss: str,
+    loss: str | None,
     scale: str,
     lift: str,
     fix: Iterable[str] | None,
@@ -20,6 +20,7 @@ def fit_options(
     *,
     sequential: bool,
     minimum_norm: bool,
+    reference_power_dbm: float | None = None,
 ) -> FitSettings:
     """Return what the options of a fit mean; raises `BadInputError` for what cannot be read."""
     return {
@@ -30,6 +31,7 @@ def fit_options(
         "groups": groups_of_tags(group) if group else {},
         "sequential": sequential,
         "minimum_norm": minimum_norm,
+        "reference_power_dbm": reference_power_dbm,
     }
 
 

@@ -19,6 +19,7 @@ from calib.cli.arguments import (
     Loss,
     MinimumNorm,
     Recordings,
+    ReferencePower,
     Scale,
     Sequential,
     TrimStatic,
@@ -56,7 +57,7 @@ def report(
     ] = None,
     pdf: Annotated[Path | None, typer.Option(help="The same report to write as PDF.")] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for the figures as PDF and SVG, at paper size.")] = None,
-    loss: Loss = "cauchy",
+    loss: Loss = None,
     scale: Scale = "auto",
     lift: Lift = "mean-of-lifted",
     fix: Fix = None,
@@ -64,6 +65,7 @@ def report(
     sequential: Sequential = False,
     trim_static: TrimStatic = False,
     minimum_norm: MinimumNorm = False,
+    reference_power: ReferencePower = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -74,7 +76,16 @@ def report(
     from calib.cli.options import fit_options
     from calib.report.writing import check_places
 
-    options = fit_options(loss, scale, lift, fix, group, sequential=sequential, minimum_norm=minimum_norm)
+    options = fit_options(
+        loss,
+        scale,
+        lift,
+        fix,
+        group,
+        sequential=sequential,
+        minimum_norm=minimum_norm,
+        reference_power_dbm=reference_power,
+    )
     check_places(output, pdf, figures, force=force)
     with Console(file=sys.stderr).status("loading") as status:
         campaign = calib.run_campaign(

@@ -18,7 +18,7 @@ HIGHEST_TAG = 65_535
 class FitSettings(TypedDict, total=False):
     """The keyword arguments of `calib.fit`."""
 
-    loss: str
+    loss: str | None
     scale_ns: float | None
     lift: str
     alpha_dbm: float
@@ -26,6 +26,7 @@ class FitSettings(TypedDict, total=False):
     groups: Mapping[str, tuple[int, ...]] | None
     sequential: bool
     minimum_norm: bool
+    reference_power_dbm: float | None
 
 
 def check_fit(
@@ -37,6 +38,7 @@ def check_fit(
     fixed_ns: Mapping[int, float],
     groups: Mapping[str, Iterable[int]],
     sequential: bool,
+    reference_power_dbm: float | None = None,
 ) -> None:
     """Raise `BadInputError` that names the parameter of `calib.fit` that cannot be used."""
     check_loss(loss)
@@ -45,6 +47,8 @@ def check_fit(
         raise BadInputError(f"found {scale_ns!r}, expected a positive number of ns", parameter="scale_ns")
     if not _is_finite(alpha_dbm):
         raise BadInputError(f"found {alpha_dbm!r}, expected a power in dBm", parameter="alpha_dbm")
+    if reference_power_dbm is not None and not _is_finite(reference_power_dbm):
+        raise BadInputError(f"found {reference_power_dbm!r}, expected a power in dBm", parameter="reference_power_dbm")
     if sequential and loss == MIXTURE:
         raise BadInputError("goes with a loss, not with the mixture; leave one of the two away", parameter="sequential")
     for tag, delay in fixed_ns.items():

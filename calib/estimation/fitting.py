@@ -1,10 +1,9 @@
 """The fit: antenna delays and the bias curve together, then the curve of standard deviation.
 
-A constant in the curve and a shift common to all delays are the same thing (docs/theory.md), so the fit
-must choose: the curve's average over the populated range of lifted power is zero. Delays then do not
-depend on how often a flight happened to see each power, only on the range. Curve and delays together put the
-centre of the core of the calibrated errors at zero: the core is told from the tail of reflections by its shape
-(`calib.estimation.error_mixture`), so the tail does not pull it.
+A constant in the curve and a shift common to all delays are the same thing (docs/theory.md), so delays are stated for a
+curve that is zero at a reference power (`calib.estimation.gauge`): the same boards then get the same delays whatever
+powers a recording holds. A fit is held against its own residuals and against what hardware can do before it is
+returned (`calib.estimation.doubts`, `plausibility`).
 """
 
 from __future__ import annotations
@@ -20,8 +19,12 @@ import uwblink
 from calib.calibration.json_format import Matrix
 from calib.calibration.model import Calibration, TagGroup, Uncertainty
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve
+from calib.calibration.power_curves import lift as lift_power
 from calib.estimation.arguments import check_fit
+from calib.estimation.doubts import doubts
 from calib.estimation.error_mixture import fit_error_mixture
+from calib.estimation.losses import MIXTURE
+from calib.estimation.plausibility import implausible, one_way, refuse_impossible
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.result import FitResult
 from calib.estimation.sigma_curve import fit_sigma
@@ -33,12 +36,14 @@ from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 INLIER_SIGMAS: Final = 3.0
+SEQUENTIAL_LOSS: Final = "cauchy"
+"""The loss of ICRA 2023."""
 
 
 def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its default
     data: Data | Iterable[Data],
     *,
-    loss: str = "cauchy",
+    loss: str | None = None,
     scale_ns: float | None = None,
     lift: str = "mean-of-lifted",
     alpha_dbm: float = ALPHA_DBM,
@@ -46,27 +51,32 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     groups: Mapping[str, tuple[int, ...]] | None = None,
     sequential: bool = False,
     minimum_norm: bool = False,
+    reference_power_dbm: float | None = None,
 ) -> FitResult:
     """Fit antenna delays and the curves of bias and standard deviation to ranges with known truth.
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `loss` is
-    "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added, or "mixture", the likelihood of core, tail and
-    outliers.
+    "mixture" (the default), the likelihood of core, reflections and outliers with a share of reflections by pair, or a
+    robust loss of residuals: "cauchy" (the default of a sequential fit), "huber", "soft_l1", "l2", one that
+    `register_loss` added.
 
     `scale_ns` is the scale of the robust loss in time of flight, estimated from the data by default; `fixed_ns` are
     delays that are known; `groups` name tags that share a curve (by default all do). `sequential` is the recipe of ICRA
-    2023, section V: delays first, then the curve on what they leave. `minimum_norm` fits even where the pairs leave
-    delays free, with the smallest ones that agree with the data. Raises `UnanswerableError` when there are too few
-    ranges, their power does not vary, or the pairs do not determine the delays, and `BadInputError` for pinned tags or
-    groups that are not in the data, and for a parameter that cannot be used.
+    2023, sections IV and V: delays first, then the curve on what they leave. `reference_power_dbm` is the power at
+    which the curve is zero, `alpha_dbm` by default (a sequential fit keeps the recipe's own constant, unless one is
+    given). `minimum_norm` fits even where the pairs leave delays free, with the smallest ones that agree with the data.
+    Raises `UnanswerableError` when there are too few ranges, their power does not vary, or the pairs do not determine
+    the delays, and `BadInputError` for pinned tags or groups that are not in the data, and for a parameter that cannot
+    be used.
 
     >>> import calib
     >>> result = calib.fit(calib.sample_flight())
     >>> delays = result.calibration.delays_ns
     >>> f"{delays[2] - delays[1]:.2f} ns, planted 0.40 ns"
-    '0.40 ns, planted 0.40 ns'
+    '0.41 ns, planted 0.40 ns'
     """
     fixed, groups = dict(fixed_ns or {}), dict(groups or {})
+    loss = loss or (SEQUENTIAL_LOSS if sequential else MIXTURE)
     check_fit(
         loss=loss,
         scale_ns=scale_ns,
@@ -75,20 +85,43 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         fixed_ns=fixed,
         groups=groups,
         sequential=sequential,
+        reference_power_dbm=reference_power_dbm,
     )
     fixed = {int(tag): float(delay) for tag, delay in fixed.items()}
     groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
     ranges = load_ranges(data)
+    refuse_impossible(ranges)
     problem = build_problem(
-        ranges, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups, minimum_norm=minimum_norm
+        ranges,
+        lift=lift,
+        alpha_dbm=alpha_dbm,
+        fixed=fixed,
+        groups=groups,
+        minimum_norm=minimum_norm,
+        sequential=sequential,
     )
-    found = solve(problem, loss, None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT, sequential=sequential)
-    calibration = _calibration(problem, found, loss, lift, alpha_dbm, fixed, groups)
+    reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
+    found = solve(
+        problem,
+        loss,
+        None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT,
+        sequential=sequential,
+        reference=None if reference is None else _lifted(reference, alpha_dbm),
+    )
+    doubted = doubts(problem, found)
+    calibration = _calibration(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
     applied = calibration.apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
     inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
-    warnings = warnings_of(ranges, applied, float(np.mean(inliers)), problem.free)
-    provenance = _provenance(ranges, inliers, fixed, sequential, problem, warnings)
+    warnings = [
+        *_stopped(found),
+        *doubted.sentences,
+        *one_way(ranges),
+        *implausible(calibration.delays_ns, residuals),
+        *_beyond(reference, alpha_dbm, problem),
+        *warnings_of(ranges, applied, float(np.mean(inliers)), problem.free),
+    ]
+    provenance = _provenance(ranges, inliers, fixed, sequential, problem, found, warnings, reference)
     return FitResult(
         calibration=replace(calibration, provenance=provenance),
         ranges=ranges,
@@ -100,25 +133,52 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     )
 
 
+def _reference(power_dbm: float | None, alpha_dbm: float, *, sequential: bool) -> float | None:
+    """Return the power at which curves are zero; None leaves them as they were fitted."""
+    return alpha_dbm if power_dbm is None and not sequential else power_dbm
+
+
+def _lifted(power_dbm: float, alpha_dbm: float) -> float:
+    """Return a power, lifted."""
+    return float(lift_power(np.array(power_dbm), alpha_dbm))
+
+
+def _stopped(found: Solved) -> list[str]:
+    if found.success:
+        return []
+    return [f"the fit stopped after {found.steps} steps before it settled: delays and intervals are not final"]
+
+
+def _beyond(reference: float | None, alpha_dbm: float, problem: Problem) -> list[str]:
+    """Warn where the reference power is not among those recorded, so that the delays are stated at the nearest."""
+    if reference is None or all(gauge is None for gauge in problem.gauges):
+        return []
+    low, high = problem.span
+    if low <= _lifted(reference, alpha_dbm) <= high:
+        return []
+    near = low if _lifted(reference, alpha_dbm) < low else high
+    return [
+        f"no ranges at the reference power of {reference:.1f} dBm: delays are stated at "
+        f"{alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others stated there"
+    ]
+
+
 def _calibration(
     problem: Problem,
     found: Solved,
+    covariance: Floats,
     loss: str,
     lift: str,
     alpha_dbm: float,
     fixed: dict[int, float],
     groups: Mapping[str, tuple[int, ...]],
 ) -> Calibration:
-    """Turn parameters into a calibration: find the core of the errors, centre it, and draw sigma."""
-    core = problem.error + problem.design @ found.parameters
+    """Turn stated parameters into a calibration, and draw sigma about the centre of the core of the errors."""
+    delays = problem.directions @ found.parameters[: problem.rank]
+    biases = _bias_curves(problem, found)
+    core = found.residuals
     mixture = fit_error_mixture(core, problem.bins.number, len(problem.bins.count))
     sigma = fit_sigma(problem, core - mixture.location_m, mixture)
-    # The centre of the core goes into a constant of the curve if delays are pinned, else into the delays.
-    constant = mixture.location_m if fixed else 0.0
-    shift_ns = 0.0 if fixed else -mixture.location_m / SPEED_OF_LIGHT * 1e9
-    delays = problem.directions @ found.parameters[: problem.rank] + shift_ns
-    covariance = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
-    biases = _bias_curves(problem, found, constant)
     return Calibration(
         delays_ns=dict(zip(problem.tags, delays.tolist(), strict=True)) | fixed,
         delays_std_ns=dict(zip(problem.tags, _standard_errors(problem, covariance), strict=True))
@@ -137,13 +197,12 @@ def _calibration(
     )
 
 
-def _bias_curves(problem: Problem, found: Solved, constant: float) -> dict[str, Curve]:
+def _bias_curves(problem: Problem, found: Solved) -> dict[str, Curve]:
     knots = tuple(problem.knots.tolist())
-    curves = {}
-    for name, columns in problem.curves():
-        shape = found.parameters[columns]
-        curves[name] = Curve(knots, tuple((shape - problem.averages @ shape + constant).tolist()), DEGREE, problem.span)
-    return curves
+    return {
+        name: Curve(knots, tuple(found.parameters[columns].tolist()), DEGREE, problem.span)
+        for name, columns in problem.curves()
+    }
 
 
 def _standard_errors(problem: Problem, covariance: Floats) -> list[float]:
@@ -154,13 +213,12 @@ def _standard_errors(problem: Problem, covariance: Floats) -> list[float]:
 
 
 def _bias_covariance(problem: Problem, found: Solved) -> Floats:
-    """Covariance of the coefficients of the plain curve, which is the groups' average, less its own average."""
-    each = len(problem.averages)
+    """Covariance of the coefficients of the plain curve, which is the groups' average."""
+    each = problem.centres.shape[1]
     average = np.zeros((each, len(found.parameters)))
     for _, columns in problem.curves():
         average[:, columns] = np.eye(each) / len(problem.groups)
-    centred = (np.eye(each) - np.outer(np.ones(each), problem.averages)) @ average
-    return np.asarray(centred @ found.covariance @ centred.T)
+    return np.asarray(average @ found.covariance @ average.T)
 
 
 def _average(curves: list[Curve]) -> Curve:
@@ -179,21 +237,35 @@ def _provenance(
     fixed: dict[int, float],
     sequential: bool,
     problem: Problem,
+    found: Solved,
     warnings: list[str],
+    reference: float | None,
 ) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    more: dict[str, Any] = {}
     if fixed:
-        found["fixed_ns"] = {str(tag): delay for tag, delay in sorted(fixed.items())}
+        more["fixed_ns"] = {str(tag): delay for tag, delay in sorted(fixed.items())}
     if problem.free:
-        found["undetermined"] = problem.free
-    return found | {
+        more["undetermined"] = problem.free
+    if reference is not None:
+        more["reference_power_dbm"] = reference
+    return more | {
         "writer": f"uwbcal {uwblink.__version__}",
         "recordings": ranges.source.split(", "),
         "exchanges": len(ranges),
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,
         "recipe": "sequential" if sequential else "joint",
-        "standard_errors": f"sandwich over {int(problem.blocks[-1]) + 1} blocks of time",
+        "converged": found.success,
+        "standard_errors": f"sandwich over {found.lasting.stretches:.0f} independent stretches of time",
         "warnings": warnings,
-        "gauge": "average of the bias curve over its range is zero; the delays carry the constant",
+        "gauge": _gauge(problem, reference),
     }
+
+
+def _gauge(problem: Problem, reference: float | None) -> str:
+    """Say which of the delays that fit equally well were chosen."""
+    if all(gauge is None for gauge in problem.gauges):
+        return "pinned delays; the curve carries the constant"
+    if reference is None:
+        return "that of the recipe: delays as fitted without a curve, which carries the constant"
+    return f"the bias curve is zero at {reference:g} dBm; the delays carry the constant"

@@ -26,10 +26,9 @@ from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 
 FEWEST: Final = 100
-BLOCK_S: Final = 2.0
-"""Errors of neighbouring ranges may share a cause (a reflection, a pose) for about as long as tags take to move on."""
+SPANNED: Final = 1e-4
+"""Delays can make up for a constant of a curve if no more than this of it is left, in squares."""
 
-FEWEST_BLOCKS: Final = 200
 ROWS_AT_ONCE: Final = 65_536
 
 
@@ -38,10 +37,12 @@ class Problem:
     """Residuals `error + design @ x` (n,) metres; x = delays by way of `directions`, then the curves' coefficients.
 
     `directions` (tags, rank) turns the first parameters into delays of `tags` in ns; it is the identity where the data
-    determine all. The splines of each of `groups` are less their average over the range, so that a constant is left to
-    the delays; `shares` say how much of each group's curve is in a range, None for all of it. What pinned tags add is
-    in `error` already. `bins` hold the rows of the whole problem, `span` is the range of power with data. `blocks` (n,)
-    number spans of time, and rows are in order of time. `free` are the groups of tags that nothing determines.
+    determine all. `gauges` hold for each of `groups` the first parameters (rank,) that make up for a constant metre in
+    its curve, None where pinned delays leave none that do; the splines of a group are less `centres` (groups, splines),
+    their averages over the range where a constant is left to the delays. `shares` say how much of each group's curve is
+    in a range, None for all of it. What pinned tags add is in `error` already. `bins` hold the rows of the whole
+    problem, `span` is the range of power with data. Rows are in order of time. `free` are the groups of tags that
+    nothing determines.
     """
 
     ranges: Ranges
@@ -53,9 +54,9 @@ class Problem:
     bins: Bins
     span: tuple[float, float]
     knots: Floats
-    averages: Floats
+    centres: Floats
+    gauges: tuple[Floats | None, ...]
     groups: tuple[str, ...]
-    blocks: Ints
     shares: list[Floats | None]
     free: list[list[int]]
 
@@ -71,7 +72,7 @@ class Problem:
 
     def sample(self, rows: Ints) -> Problem:
         """Return the problem of some rows only."""
-        chosen = ("error", "design", "lifted", "blocks")
+        chosen = ("error", "design", "lifted")
         return replace(self, ranges=self.ranges[rows], **{name: getattr(self, name)[rows] for name in chosen})
 
     def penalties(self) -> list[Floats]:
@@ -85,7 +86,7 @@ class Problem:
 
     def curves(self) -> Iterator[tuple[str, slice]]:
         """Yield the groups and the columns of their splines."""
-        each = len(self.averages)
+        each = self.centres.shape[1]
         for k, name in enumerate(self.groups):
             yield name, slice(self.rank + k * each, self.rank + (k + 1) * each)
 
@@ -98,8 +99,12 @@ def build_problem(
     fixed: Mapping[int, float],
     groups: Mapping[str, tuple[int, ...]],
     minimum_norm: bool,
+    sequential: bool = False,
 ) -> Problem:
-    """Put a fit into columns; raises what `calib.estimation.fitting.fit` raises."""
+    """Put a fit into columns; raises what `calib.estimation.fitting.fit` raises.
+
+    In a `sequential` one the curves keep their constants, and ranges of all powers stay, for the delays.
+    """
     if len(ranges) < FEWEST:
         raise UnanswerableError(
             f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST} are needed"
@@ -107,13 +112,17 @@ def build_problem(
     if np.any(np.diff(ranges.time_ns) < 0):
         ranges = ranges[np.argsort(ranges.time_ns, kind="stable")]
     lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
-    order = np.argsort(lifted)
-    ordered = lifted[order]
-    low, high = populated(ordered)
+    low, high = populated(np.sort(lifted))
     if not high - low > 1e-6:
         raise UnanswerableError(
             f"{ranges.source}: the first-path power never changes, so no curve over power can be fitted"
         )
+    # Beyond the populated powers a curve is held constant: what it is there is not for these ranges to say.
+    if not sequential:
+        inside = (lifted >= low) & (lifted <= high)
+        ranges, lifted = ranges[inside], lifted[inside]
+    order = np.argsort(lifted)
+    ordered = lifted[order]
     everyone = ranges.tags()
     tags = _free_tags(everyone, fixed)
     shares = _shares(ranges, groups, everyone)
@@ -123,25 +132,37 @@ def build_problem(
     if not minimum_norm:
         require_determined(free)
     known = matrix[:, ~unpinned] @ np.array([fixed[tag] for tag in everyone if tag in fixed])
-    knots = knots_for(ordered, BIAS_SEGMENTS)
+    knots = knots_for(ordered, BIAS_SEGMENTS, (low, high))
     # The integral of a B-spline is its coefficients times a quarter of each one's span.
     averages = (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (high - low)
+    delays = matrix[:, unpinned] @ directions
+    gauges = tuple(_making_up(delays, share) for share in shares)
+    centred = [gauge is not None and not sequential for gauge in gauges]
+    centres = np.outer(np.array(centred, dtype=float), averages)
     return Problem(
         ranges=ranges,
         tags=tags,
         directions=directions,
         error=ranges.raw_m - ranges.truth_m + known,
-        design=_columns(matrix[:, unpinned] @ directions, lifted, knots, averages, shares),
+        design=_columns(delays, lifted, knots, centres, shares),
         lifted=lifted,
         bins=equal_bins(lifted, order=order),
         span=(low, high),
         knots=knots,
-        averages=averages,
+        centres=centres,
+        gauges=gauges,
         groups=tuple(groups) or ("",),
-        blocks=_blocks(ranges.time_ns),
         shares=shares,
         free=free,
     )
+
+
+def _making_up(delays: Floats, share: Floats | None) -> Floats | None:
+    """Return the parameters that make up for a constant in a curve with a `share` in ranges (n,), None if none do."""
+    aim = np.ones(len(delays)) if share is None else share
+    pull = delays.T @ aim
+    found = np.linalg.lstsq(delays.T @ delays, pull, rcond=1e-12)[0]
+    return np.asarray(found) if float(aim @ aim - pull @ found) < SPANNED * float(aim @ aim) else None
 
 
 def _free_tags(everyone: list[int], fixed: Mapping[int, float]) -> list[int]:
@@ -170,23 +191,16 @@ def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]], everyone: lis
     return [0.5 * np.isin(ranges.initiator, tags) + 0.5 * np.isin(ranges.target, tags) for tags in groups.values()]
 
 
-def _columns(delays: Floats, lifted: Floats, knots: Floats, averages: Floats, shares: list[Floats | None]) -> Floats:
+def _columns(delays: Floats, lifted: Floats, knots: Floats, centres: Floats, shares: list[Floats | None]) -> Floats:
     """Return delays beside the splines of every group, filled in pieces to keep memory at one copy."""
-    rank, each = delays.shape[1], len(averages)
+    rank, each = delays.shape[1], centres.shape[1]
     columns = np.empty((len(lifted), rank + each * len(shares)))
     columns[:, :rank] = delays
     for begin in range(0, len(lifted), ROWS_AT_ONCE):
         rows = slice(begin, begin + ROWS_AT_ONCE)
-        splines = averages - basis(lifted[rows], knots)
+        splines = basis(lifted[rows], knots)
         for k, share in enumerate(shares):
-            part = splines if share is None else splines * share[rows, None]
+            part = centres[k] - splines
+            part = part if share is None else part * share[rows, None]
             columns[rows, rank + k * each : rank + (k + 1) * each] = part
     return columns
-
-
-def _blocks(time_ns: Ints) -> Ints:
-    """Number spans of `BLOCK_S` seconds, of less in a short recording, without gaps."""
-    since = time_ns - time_ns[0]
-    length = max(min(int(BLOCK_S * 1e9), int(since[-1]) // FEWEST_BLOCKS), 1)
-    spans = since // length
-    return np.cumsum(np.diff(spans, prepend=spans[0]) > 0)

@@ -10,7 +10,7 @@ import numpy as np
 from calib.estimation.losses import LOSSES, Weights
 from calib.ranges import Ranges
 from calib.spread import robust_spread
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 SCALE_OF_SPREAD: Final = 0.5
@@ -70,7 +70,6 @@ def robust_fit(
     scale: float | None = None,
     penalty: Floats | None = None,
     start: Floats | None = None,
-    blocks: Ints | None = None,
     *,
     near: bool = False,
 ) -> Solution:
@@ -78,9 +77,8 @@ def robust_fit(
 
     `matrix` (n, m) and `error` (n,) share a unit, which is that of `scale` (estimated from the
     residuals where not given). The covariance is the sandwich H^-1 S H^-1, which holds under a heavy
-    tail where the usual one does not. S sums the scores of each of the `blocks` (n,), numbered from 0 in the order of
-    rows, before it squares them, so errors that persist within a block do not pass for independent ones; by default
-    every row is a block of its own. `near` says that `start` is so near the optimum that Newton's steps may begin at
+    tail where the usual one does not, but takes every row for independent (`calib.estimation.intervals` does not).
+    `near` says that `start` is so near the optimum that Newton's steps may begin at
     once.
     """
     ridge = np.zeros((matrix.shape[1],) * 2) if penalty is None else penalty
@@ -108,7 +106,7 @@ def robust_fit(
             width = scale_of(residual)
     return Solution(
         x,
-        sandwich(matrix, residual, function, width, ridge, blocks),
+        sandwich(matrix, residual, function, width, ridge),
         residual,
         width,
         steps,
@@ -173,9 +171,7 @@ def quadratic_model(matrix: Floats, residual: Floats, loss: str, width: float) -
     )
 
 
-def sandwich(
-    matrix: Floats, residual: Floats, function: Weights, width: float, ridge: Floats, blocks: Ints | None = None
-) -> Floats:
+def sandwich(matrix: Floats, residual: Floats, function: Weights, width: float, ridge: Floats) -> Floats:
     """Return the covariance of parameters at the optimum, where `residual` (n,) is what is left.
 
     The penalty counts as what is known beforehand (Wahba 1983; Nychka 1988), so that bands of a penalised curve hold
@@ -185,20 +181,5 @@ def sandwich(
     bread = np.linalg.pinv(_normal(matrix, slope, ridge), rcond=1e-12)
     score = weight * residual
     dispersion = float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope))
-    meat = summed_squares(matrix, score, blocks) + dispersion * ridge
+    meat = _normal(matrix, score**2, np.zeros_like(ridge)) + dispersion * ridge
     return np.asarray(bread @ meat @ bread)
-
-
-def summed_squares(matrix: Floats, score: Floats, blocks: Ints | None) -> Floats:
-    """Return the sum over blocks of the outer square of the block's summed score, (m, m)."""
-    columns = matrix.shape[1]
-    if blocks is None:
-        return _normal(matrix, score**2, np.zeros((columns, columns)))
-    count = int(blocks[-1]) + 1
-    sums = np.zeros((count, columns))
-    for begin in range(0, len(matrix), CHUNK):
-        some = blocks[begin : begin + CHUNK]
-        starts = np.flatnonzero(np.diff(some, prepend=-1))
-        part = matrix[begin : begin + CHUNK] * score[begin : begin + CHUNK, None]
-        sums[some[starts]] += np.add.reduceat(part, starts)
-    return np.asarray(sums.T @ sums) * (count / max(count - 1, 1))

@@ -7,12 +7,16 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.losses import MIXTURE
-from calib.estimation.mixture_fit import refine
+from calib.estimation.gauge import stating
+from calib.estimation.intervals import blocks_of, intervals
+from calib.estimation.losses import LOSSES, MIXTURE
+from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
+from calib.estimation.persistence import Persistence
 from calib.estimation.problem import Problem
-from calib.estimation.robust import quadratic_model, robust_fit, scale_of
+from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of
+from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import reml_penalty
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 
 PILOT: Final = 6000
 """Rows of the sample on which a start is found; from there, a few Newton steps over all rows suffice."""
@@ -21,44 +25,103 @@ FIRST_SMOOTHNESS: Final = 1e-6
 """Of the pilot's curve, before the data are asked: a row's share of the penalty's trace."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Solved:
-    """Parameters (m,) and their covariance (m, m), the scale of the loss in metres, and how it ended."""
+    """Parameters (m,) and their covariance (m, m), stated by the gauge, and how it ended.
+
+    `residuals` (n,) are fitted less true ranges, `scale` is that of the loss, in metres. `scores` are the slopes at the
+    optimum by what determined the delays, with the `inverse` (D, D) of information and penalty; `delays` (tags, k)
+    turns the parameters behind them into stated delays. `lasting` is how long errors last, `mixture` what they are made
+    of, where that was fitted.
+    """
 
     parameters: Floats
     covariance: Floats
+    residuals: Floats
     scale: float
     steps: int
     success: bool
+    scores: Scores
+    inverse: Floats
+    delays: Floats
+    lasting: Persistence
+    mixture: PairMixture | None = None
 
 
-def solve(problem: Problem, loss: str, scale_m: float | None, *, sequential: bool) -> Solved:
+def solve(
+    problem: Problem, loss: str, scale_m: float | None, *, sequential: bool, reference: float | None = None
+) -> Solved:
     """Return the optimum.
 
     A sample gives a start: delays alone first, which a curve cannot lead astray, then both. Over all rows the scale of
-    the loss, unless given, comes from the residuals of that start, the smoothness of the curves from the data.
+    the loss, unless given, comes from the residuals of that start, the smoothness of the curves from the data. Delays
+    are stated for curves that are zero at the lifted power `reference`.
     """
-    robust = "cauchy" if loss == MIXTURE else loss
     if sequential:
-        return _one_after_the_other(problem, robust, scale_m)
+        return _one_after_the_other(problem, loss, scale_m, reference)
+    robust = "cauchy" if loss == MIXTURE else loss
     start, steps = _pilot(problem, robust, scale_m)
     residual = problem.error + problem.design @ start
     width = scale_m or scale_of(residual)
     near = quadratic_model(problem.design, residual, robust, width)
     ridge, start = reml_penalty(near, start, problem.penalties())
-    joint = robust_fit(problem.design, problem.error, robust, width, ridge, start, problem.blocks, near=True)
-    steps += joint.steps
-    if loss != MIXTURE:
-        return Solved(joint.parameters, joint.covariance, joint.scale, steps, joint.success)
-    likely = refine(
-        problem.design,
-        problem.error,
-        joint.parameters,
-        ridge / near.dispersion,
-        problem.bins.number,
-        problem.blocks,
+    mixture = None
+    if loss == MIXTURE:
+        mixture = fit_pair_mixture(_errors(problem), start, ridge / near.dispersion)
+        parameters, success, steps = mixture.of("design"), mixture.success, steps + mixture.steps
+        scores, inverse, prior = mixture.scores, mixture.covariance, mixture.precision
+    else:
+        joint = robust_fit(problem.design, problem.error, robust, width, ridge, start, near=True)
+        parameters, success, steps = joint.parameters, joint.success, steps + joint.steps
+        scores, inverse, prior = _slopes(problem.design, joint, robust, ridge)
+    stated = stating(problem, reference)
+    delays = problem.directions @ stated[: problem.rank]
+    blocks, seconds = blocks_of(problem.ranges.time_ns)
+    known = intervals(scores, inverse, prior, delays, problem.rank, blocks=blocks, seconds=seconds)
+    return Solved(
+        parameters=stated @ parameters,
+        covariance=stated @ known.covariance @ stated.T,
+        residuals=problem.error + problem.design @ parameters,
+        scale=width,
+        steps=steps,
+        success=success,
+        scores=scores,
+        inverse=inverse,
+        delays=delays,
+        lasting=known.lasting,
+        mixture=mixture,
     )
-    return Solved(likely.parameters, likely.covariance, joint.scale, steps + likely.steps, likely.success)
+
+
+def _errors(problem: Problem) -> Errors:
+    """Return what the mixture is fitted to."""
+    bins = problem.bins
+    return Errors(
+        error=problem.error,
+        design=problem.design,
+        pair=pairs_of(problem.ranges.initiator, problem.ranges.target),
+        cell=bins.number * CELLS // len(bins.count),
+        density=1 / (float(np.ptp(problem.error)) + 1e-9),
+    )
+
+
+def pairs_of(initiator: Ints, target: Ints) -> Ints:
+    """Number the pairs of tags of ranges (n,), whoever initiated."""
+    low, high = np.minimum(initiator, target), np.maximum(initiator, target)
+    return np.unique(low * (int(high.max()) + 1) + high, return_inverse=True)[1]
+
+
+def _slopes(design: Floats, found: Solution, loss: str, ridge: Floats) -> tuple[Scores, Floats, Floats]:
+    """Return the slopes of a robust loss at its optimum, the inverse of its curvature, and its penalty's pull.
+
+    The penalty counts as what is known beforehand (Wahba 1983; Nychka 1988), so that bands of a penalised curve hold
+    its bias too.
+    """
+    weight, slope = LOSSES[loss](found.residuals / found.scale)
+    score = -weight * found.residuals
+    scores = Scores(design=design, score=score, curvature=slope)
+    dispersion = float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope))
+    return scores, inverse_of(scores.information() + ridge), dispersion * ridge
 
 
 def _pilot(problem: Problem, loss: str, scale_m: float | None) -> tuple[Floats, int]:
@@ -84,21 +147,40 @@ def _first_ridge(problem: Problem) -> Floats:
     return ridge + np.diag(1e-9 * count * curves)
 
 
-def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None) -> Solved:
-    """Delays first, then the curves on what they leave, as in ICRA 2023, section V, with our splines."""
+def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None, reference: float | None) -> Solved:
+    """Delays first, then the curves on what they leave, as in ICRA 2023, section IV and V, with our splines.
+
+    The curves keep their constants and the delays are those of the first step, unless a `reference` is asked for.
+    """
     rank, columns = problem.rank, problem.design.shape[1]
-    alone = robust_fit(problem.design[:, :rank], problem.error, loss, scale_m, blocks=problem.blocks)
-    # The curves' splines are less their average; a column of ones lets the curve have a constant while it is fitted.
-    design = np.hstack([np.ones((len(problem.error), 1)), problem.design[:, rank:]])
-    penalties = [np.pad(p[rank:, rank:], ((1, 0), (1, 0))) for p in problem.penalties()]
-    rough = np.pad(_first_ridge(problem)[rank:, rank:], ((1, 0), (1, 0)))
-    first = robust_fit(design, alone.residuals, loss, scale_m, rough)
+    alone = robust_fit(problem.design[:, :rank], problem.error, loss, scale_m)
+    inside = (problem.lifted >= problem.span[0]) & (problem.lifted <= problem.span[1])
+    design, left = problem.design[inside, rank:], alone.residuals[inside]
+    first = robust_fit(design, left, loss, scale_m, _first_ridge(problem)[rank:, rank:])
     near = quadratic_model(design, first.residuals, loss, first.scale)
+    penalties = [penalty[rank:, rank:] for penalty in problem.penalties()]
     ridge, start = reml_penalty(near, first.parameters, penalties)
-    curves = robust_fit(design, alone.residuals, loss, first.scale, ridge, start, problem.blocks, near=True)
+    curves = robust_fit(design, left, loss, first.scale, ridge, start, near=True)
+    blocks, seconds = blocks_of(problem.ranges.time_ns)
     covariance = np.zeros((columns, columns))
-    covariance[:rank, :rank] = alone.covariance
-    covariance[rank:, rank:] = curves.covariance[1:, 1:]
-    parameters = np.concatenate([alone.parameters, curves.parameters[1:]])
-    steps = alone.steps + first.steps + curves.steps
-    return Solved(parameters, covariance, alone.scale, steps, alone.success and curves.success)
+    scores, inverse, prior = _slopes(problem.design[:, :rank], alone, loss, np.zeros((rank, rank)))
+    known = intervals(scores, inverse, prior, problem.directions, rank, blocks=blocks, seconds=seconds)
+    covariance[:rank, :rank] = known.covariance
+    of_curves = _slopes(design, curves, loss, ridge)
+    nothing = np.zeros((0, columns - rank))
+    covariance[rank:, rank:] = intervals(
+        *of_curves, nothing, 0, blocks=blocks_of(problem.ranges.time_ns[inside])[0], seconds=seconds
+    ).covariance
+    stated = stating(problem, reference)
+    return Solved(
+        parameters=stated @ np.concatenate([alone.parameters, curves.parameters]),
+        covariance=stated @ covariance @ stated.T,
+        residuals=alone.residuals + problem.design[:, rank:] @ curves.parameters,
+        scale=alone.scale,
+        steps=alone.steps + first.steps + curves.steps,
+        success=alone.success and curves.success,
+        scores=scores,
+        inverse=inverse,
+        delays=problem.directions,
+        lasting=known.lasting,
+    )

@@ -7,12 +7,11 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.model import CorrectedRanges
-from calib.estimation.confounding import explained_by_distance
 from calib.ranges import STATIC, Ranges
 
 MANY_MISSING: Final = 0.05
 MANY_OUTLIERS: Final = 0.3
-SHORT_S: Final = 10.0
+SHORT_S: Final = 25.0
 
 
 def warnings_of(ranges: Ranges, applied: CorrectedRanges, inliers: float, free: list[list[int]]) -> list[str]:
@@ -22,12 +21,6 @@ def warnings_of(ranges: Ranges, applied: CorrectedRanges, inliers: float, free: 
         groups = "; ".join(", ".join(map(str, group)) for group in free)
         found.append(
             f"the data leave the delays of tags {groups} free; those written are the smallest that agree with the data"
-        )
-    share = explained_by_distance(applied.lifted, ranges.truth_m)
-    if share is not None:
-        found.append(
-            f"power and distance are confounded: distance explains {100 * share:.0f} % of the power, so the curve may "
-            "hold what belongs to distance; turn the antennas while recording"
         )
     if np.any(ranges.protocol == "ss"):
         found.append(

@@ -30,8 +30,9 @@ def test_intervals_hold(outcomes, loss):
     assert np.std(np.concatenate([run[loss].scores for runs in outcomes.values() for run in runs])) > 0.8
 
 
-@pytest.mark.parametrize(("loss", "bound_mm"), [("cauchy", 17), ("mixture", 9)])
+@pytest.mark.parametrize(("loss", "bound_mm"), [("cauchy", 24), ("mixture", 9)])
 def test_the_curve_is_found(outcomes, loss, bound_mm):
-    # 3.5 times the bounds of the whole flight (5 and 2.5 mm), for a twelfth of it.
+    # 3.5 times the bounds of the whole flight (7 and 2.5 mm), for a twelfth of it. Cauchy's loss, which nothing centres
+    # any more, leaves some millimetres of the reflections' tail in the constant.
     for runs in outcomes.values():
         assert np.median([run[loss].curve_mm for run in runs]) < bound_mm

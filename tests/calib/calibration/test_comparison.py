@@ -18,10 +18,11 @@ def test_fits_of_the_same_tags_are_the_same_nineteen_times_in_twenty():
     found = [compare(a, b) for a, b in itertools.pairwise(fits)]
     # 16 comparisons, 0.8 expected to differ; more than four come by chance less than once in a thousand.
     assert sum(one.same for one in found) >= 12
-    # Four delays less a shift: chi-square with 3 degrees of freedom, whose mean over 16 is known to 0.6 or so.
-    assert 1.3 < np.mean([one.chi_square for one in found]) < 5.0
+    # Four delays less a shift: chi-square with 3 degrees of freedom, whose mean over 16 is known to 0.6 or so;
+    # intervals reckon with small samples and with reflections of unknown shape, and are a little wide for it.
+    assert 0.9 < np.mean([one.chi_square for one in found]) < 5.0
     scores = [d / one.std_ns[t] for one in found for t, d in one.difference_ns.items()]
-    assert 0.75 < np.std(scores) < 1.3
+    assert 0.55 < np.std(scores) < 1.3
 
 
 def test_a_delay_that_moved_is_seen():

@@ -31,7 +31,7 @@ def test_the_file_has_the_documented_keys(fitted):
         "bias_curve", "sigma_curve", "provenance", "uncertainty",
     } == set(document)  # fmt: skip
     assert set(document["bias_curve"]) == {"knots", "coefficients", "degree", "range"} == set(document["sigma_curve"])
-    assert document["loss"] == "cauchy"
+    assert document["loss"] == "mixture"
     assert document["lift"] == "mean-of-lifted"
     assert document["speed_of_light"] == SPEED_OF_LIGHT
 
@@ -58,7 +58,7 @@ def test_an_unknown_tag_is_named(fitted):
     ("old", "new"),
     [
         ('"degree": 3', '"degree": 9'),
-        ('"loss": "cauchy"', '"loss": 5'),
+        ('"loss": "mixture"', '"loss": 5'),
         ('"delays_ns": {', '"delays_ns": {"x": 1, '),
         ('"alpha_dbm": -82.0', '"alpha_dbm": "low"'),
         ('"speed_of_light": 299702547.0', '"speed_of_light": NaN'),

@@ -16,7 +16,7 @@ from tests.calib.synthetic import ranges
     ("parameter", "value"),
     [
         ("loss", "arctan"),
-        ("loss", None),
+        ("reference_power_dbm", math.nan),
         ("scale_ns", -1),
         ("scale_ns", 0.0),
         ("scale_ns", math.nan),

@@ -1,0 +1,160 @@
+"""What a fit has to say against itself: residuals that its intervals do not promise, values that hardware lacks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.calibration.power_curves import basis
+from calib.estimation.intervals import blocks_of
+from calib.estimation.misfit import MATTERS, SMALLEST_M, Finding, examine, families, told
+from calib.estimation.persistence import FEWEST_STRETCHES
+from calib.estimation.problem import Problem
+from calib.estimation.solver import Solved, pairs_of
+from uwblink.arrays import Floats
+from uwblink.ticks import SPEED_OF_LIGHT
+
+FAR_M: Final = 0.1
+"""Detours of less may as well be an error that wanders."""
+
+DECIBEL: Final = float(10**0.1)
+SHAPE: Final = 0.1
+"""Noise by which a range is off that is surely reflected, if detours are not of the shape that a fit takes them for.
+
+Detours of gamma's shape, or of two lengths, put delays off by as much (docs/accuracy.md).
+"""
+
+SCALE: Final = 0.01
+"""An error of distances by distance that a recording may have and not show."""
+
+CONFOUNDED_M: Final = 0.006
+OFTEN_REFLECTED: Final = 0.45
+FOUR: Final = 4
+MOSTLY_REFLECTED: Final = 0.8
+"""A pair with such a share of reflected ranges may as well be off by a constant."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doubts:
+    """The covariance (tags, tags) of the stated delays in ns^2 with what doubts add, and the doubts as sentences."""
+
+    covariance_ns2: Floats
+    sentences: list[str]
+
+
+def doubts(problem: Problem, found: Solved) -> Doubts:
+    """Hold a fit against its residuals, and widen the delays' covariance by what does not fit."""
+    plain = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
+    ranges = problem.ranges
+    blocks, seconds = blocks_of(ranges.time_ns)
+    tested = families(ranges.initiator, ranges.target, problem.lifted, ranges.truth_m, _of_a_decibel(problem, found))
+    judged = examine(
+        found.scores,
+        found.inverse,
+        found.delays,
+        blocks,
+        seconds,
+        tested=list(tested),
+        shape_m=_of_another_shape(problem, found),
+    )
+    covariance = plain + judged.widening_ns2
+    matter = [finding for finding in judged.findings if _matters(finding, covariance)]
+    for finding in matter:
+        covariance = covariance + np.outer(finding.effect_ns, finding.effect_ns)
+    # A tag that was moved stands out in more than one span of time: once is enough.
+    once = {(finding.kind, finding.names): finding for finding in reversed(matter)}
+    sentences = [told(finding) for finding in matter if once[finding.kind, finding.names] is finding]
+    sentences += [*_reflected(problem, found), *_short(found), *_confounded(problem, found)]
+    return Doubts(covariance_ns2=covariance, sentences=sentences)
+
+
+def _matters(finding: Finding, covariance: Floats) -> bool:
+    std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    moved = float(np.max(np.abs(finding.effect_ns) / std))
+    if finding.kind == "time":
+        # A delay that was another one for a while is wrong by as much, then or at other times. The printed interval has
+        # grown with it already: what does not return looks like an error that lasts.
+        moved = 2e9 * abs(finding.offset_m) / SPEED_OF_LIGHT / float(np.median(std))
+    return moved > MATTERS and abs(finding.offset_m) > SMALLEST_M
+
+
+def _of_a_decibel(problem: Problem, found: Solved) -> Floats:
+    """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
+    changed = basis(problem.lifted * DECIBEL, problem.knots) - basis(problem.lifted, problem.knots)
+    curves = [found.parameters[columns] for _, columns in problem.curves()]
+    return np.asarray(changed @ np.mean(curves, axis=0))
+
+
+def _of_another_shape(problem: Problem, found: Solved) -> Floats:
+    """Return by how much ranges (n,) of a pair would be off, were its reflections of another shape than the fit's."""
+    if found.mixture is None:
+        return np.zeros(len(problem.error))
+    share = found.mixture.tail_share * found.mixture.noise * float(np.exp(np.mean(found.mixture.of("cell_noise"))))
+    return np.asarray(SHAPE * share[pairs_of(problem.ranges.initiator, problem.ranges.target)])
+
+
+def _reflected(problem: Problem, found: Solved) -> list[str]:
+    """Name the pairs of which hardly a range is direct, and tags most of whose are not, where that was fitted."""
+    if found.mixture is None:
+        return []
+    initiator, target = problem.ranges.initiator, problem.ranges.target
+    pair, share = pairs_of(initiator, target), found.mixture.tail_share
+    first = np.unique(pair, return_index=True)[1]
+    ends = np.sort(np.column_stack([initiator[first], target[first]]), axis=1)
+    tags = np.unique(ends)
+    sentences = []
+    far = found.mixture.tail_mean_m > FAR_M
+    for number in np.flatnonzero((share > MOSTLY_REFLECTED) & far).tolist():
+        a, b = ends[number].tolist()
+        others = [tag for tag in tags.tolist() if tag not in (a, b)]
+        # Over four tags, a pair's offset and that of the two others leave the same trace.
+        either = f" or pair {others[0]}-{others[1]}" if len(tags) == FOUR else ""
+        sentences.append(
+            f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or off by "
+            f"{100 * found.mixture.tail_mean_m[number]:.0f} cm; record it anew, delays rest on the other pairs"
+        )
+    for tag in tags.tolist():
+        mean = float(share[np.any(ends == tag, axis=1)].mean())
+        if mean > OFTEN_REFLECTED and not sentences:
+            sentences.append(
+                f"tag {tag}: {100 * mean:.0f} % of its ranges are reflected; what stands near its antenna?"
+            )
+    return sentences
+
+
+def _confounded(problem: Problem, found: Solved) -> list[str]:
+    """Say where a small error that grows with the distance would pass for a curve over power.
+
+    The curve is fitted beside such an error, of which `SCALE` is known beforehand, and what that takes of its certainty
+    is held against the band that is printed.
+    """
+    columns = slice(problem.rank, problem.design.shape[1])
+    if problem.design.shape[1] != found.scores.design.shape[1] or not np.ptp(problem.ranges.truth_m) > 0:
+        return []
+    far = problem.ranges.truth_m - np.median(problem.ranges.truth_m)
+    link = found.scores.with_groups(far, np.zeros(len(far), dtype=np.int64), 1)[0]
+    taken = link @ found.inverse
+    known = float(found.scores.curvature @ far**2 - taken @ link) / found.lasting.factor
+    slope = 1 / np.sqrt(SCALE**-2 + max(known, 0.0))
+    rows = basis(np.quantile(problem.lifted, np.linspace(0.02, 0.98, 25)), problem.knots)
+    rows = np.tile(rows - rows.mean(axis=0), len(problem.groups)) / len(problem.groups)
+    more = float(np.sqrt(np.mean((rows @ taken[columns] * slope) ** 2)))
+    band = float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", rows, found.covariance[columns, columns], rows))))
+    if more < max(CONFOUNDED_M, 2 * band):
+        return []
+    return [
+        f"power and distance are confounded: true distances {100 * SCALE:.0f} % off would pass for {1e3 * more:.0f} mm "
+        f"of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while recording"
+    ]
+
+
+def _short(found: Solved) -> list[str]:
+    lasting = found.lasting
+    if lasting.stretches >= FEWEST_STRETCHES:
+        return []
+    return [
+        f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} independent "
+        f"stretches of time; intervals are widened for it, and a guess below {FEWEST_STRETCHES:.0f}: record for longer"
+    ]

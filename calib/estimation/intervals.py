@@ -1,0 +1,56 @@
+"""Covariances of what was fitted, from slopes summed over short blocks of time; persistence is reckoned with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.estimation.persistence import Persistence, persistence, short_blocks
+from calib.estimation.scores import Scores
+from uwblink.arrays import Floats, Ints
+
+NORMAL95: Final = 1.959963984540054
+CURVE_SERIES: Final = 5
+"""So many values of a smooth curve are about independent."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Intervals:
+    """Covariance (m, m) of the parameters of the design, and what persistence of errors it reckons with.
+
+    1.96 of its standard errors make 95 % intervals: what a small sample takes is in it already.
+    """
+
+    covariance: Floats
+    lasting: Persistence
+
+
+def intervals(
+    scores: Scores, inverse: Floats, prior: Floats, delays: Floats, rank: int, *, blocks: Ints, seconds: float
+) -> Intervals:
+    """Return the covariance of the parameters of the design at an optimum.
+
+    `inverse` (D, D) is that of information and penalty, `prior` (D, D) the penalty as the covariance of its own pull,
+    `delays` (tags, m) turns parameters into delays, which the first `rank` stand for. Errors of delays and of curves
+    may last differently.
+    """
+    columns = scores.design.shape[1]
+    reach = inverse[:columns]
+    pulls = scores.by_block(blocks, int(blocks[-1]) + 1) @ reach.T
+    # What all delays share is the curve's constant: it would hide how long errors of single delays last.
+    apart = delays - delays.mean(axis=0) if len(delays) > 1 else delays
+    lasting = persistence(pulls @ apart.T, seconds, max(len(delays) - 1, 1))
+    factors = [lasting] * (rank > 0)
+    if columns > rank:
+        factors.append(persistence(pulls[:, rank:], seconds, CURVE_SERIES))
+    widths = [np.sqrt(each.factor) * each.quantile95 / NORMAL95 for each in factors]
+    width = np.repeat(widths, [rank, columns - rank] if rank and columns > rank else [columns])
+    covariance = (pulls.T @ pulls) * width[:, None] * width + reach @ prior @ reach.T
+    return Intervals(covariance=np.asarray(covariance), lasting=lasting if rank else factors[-1])
+
+
+def blocks_of(time_ns: Ints) -> tuple[Ints, float]:
+    """Return the short block of each range (n,), and the seconds that the ranges span."""
+    return short_blocks(time_ns), float(time_ns[-1] - time_ns[0]) * 1e-9

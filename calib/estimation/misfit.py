@@ -1,0 +1,273 @@
+"""A fit held against its own residuals: by pair, by tag over time, by tag over power.
+
+Each alternative is an offset that some ranges would have beside what was fitted. Its score test (Rao's) needs no second
+fit: slopes of the log likelihood by the offset, less what the fitted parameters would take of it, summed over short
+blocks of time and held against their own variance, persistence included. Offsets by pair can only be told from delays
+as far as pairs close (quadruples of pairs over four tags); with three tags nothing of them is left to test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.estimation.persistence import Persistence, persistence
+from calib.estimation.scores import Scores
+from uwblink.arrays import Floats, Ints
+
+ERROR_RATE: Final = 0.002
+"""Share of sound fits that may be doubted, all alternatives together."""
+
+SEGMENTS: Final = 6
+"""Spans of time of equal counts in which a tag may have an offset of its own."""
+
+SPANS: Final = 2
+"""Spans of time within which errors are looked at for how long they last, where an alternative does not end."""
+
+MATTERS: Final = 1.0
+"""An offset matters that moves some delay by so many of its printed standard errors."""
+
+SMALLEST_M: Final = 0.01
+"""An offset of less is nobody's fault: it widens intervals, and is not named."""
+
+FEWEST: Final = 30
+SAME: Final = 0.95
+"""Alternatives whose tests correlate by more than this cannot be told from each other."""
+
+MOST_NAMED: Final = 3
+REACHED: Final = 1e-3
+"""Share of an alternative's information that must be left beside the fitted parameters for it to be tested."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """Alternatives of one kind: offsets times `weight` (n,), by `place` (n,); `names` (k,) say whose they are.
+
+    `second` is the other end's place, where each range belongs to both of its tags; in a `signed` family the offset is
+    taken the other way there.
+    """
+
+    kind: str
+    names: list[str]
+    weight: Floats
+    place: Ints
+    second: Ints | None = None
+    signed: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """An alternative that the residuals ask for: its kind, whose it may be, the offset, and what it does to delays.
+
+    `effect_ns` (tags,) is by how much the delays would change, `deviation` how many standard errors the offset is from
+    none.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    offset_m: float
+    deviation: float
+    effect_ns: Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """What the residuals say: findings, the gravest first, and covariance (tags, tags) to add to that of the delays."""
+
+    findings: list[Finding]
+    widening_ns2: Floats
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tested:
+    """A family's efficient slopes: sums (k,), their covariance (k, k), information (k, k), effects (tags, k) in ns/m.
+
+    `whole` is the largest information that an alternative would have, were nothing else fitted.
+    """
+
+    total: Floats
+    covariance: Floats
+    information: Floats
+    whole: float
+    effects: Floats
+    lasting: Persistence
+
+
+def families(initiator: Ints, target: Ints, lifted: Floats, truth_m: Floats, louder_m: Floats) -> Iterator[Family]:
+    """Yield the alternatives: offsets of a pair, of a tag for a while or as its power changes, and those of arithmetic.
+
+    `louder_m` (n,) is what a decibel more would do to each range. The last two are an error that grows with the
+    distance, and one of the opposite sign with the other tag initiating, as a clock leaves it whose skew is not
+    corrected.
+    """
+    tags, ends = np.unique(np.concatenate([initiator, target]), return_inverse=True)
+    first, second = ends[: len(initiator)], ends[len(initiator) :]
+    names, ones = [f"tag {tag}" for tag in tags.tolist()], np.ones(len(initiator))
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    keys, pair = np.unique(low * len(tags) + high, return_inverse=True)
+    named = [f"pair {tags[key // len(tags)]}-{tags[key % len(tags)]}" for key in keys.tolist()]
+    yield Family(kind="pair", names=named, weight=ones, place=pair)
+    when = np.arange(len(first)) * SEGMENTS // len(first)
+    yield Family(
+        kind="time",
+        names=[name for name in names for _ in range(SEGMENTS)],
+        weight=ones,
+        place=first * SEGMENTS + when,
+        second=second * SEGMENTS + when,
+    )
+    rank = np.empty(len(lifted))
+    rank[np.argsort(lifted, kind="stable")] = np.linspace(-1, 1, len(lifted))
+    yield Family(kind="power", names=names, weight=rank, place=first, second=second)
+    size = float(np.sqrt(np.mean(louder_m**2)))
+    if size > 0:
+        yield Family(kind="decibels", names=names, weight=louder_m / size, place=first, second=second)
+    yield Family(kind="skew", names=names, weight=ones, place=first, second=second, signed=True)
+    far = (truth_m - np.median(truth_m)) / max(float(np.ptp(truth_m)), 1e-9)
+    if np.ptp(truth_m) > 0:
+        yield Family(kind="scale", names=["all tags"], weight=far, place=np.zeros(len(far), dtype=np.int64))
+
+
+def examine(
+    scores: Scores,
+    inverse: Floats,
+    delays: Floats,
+    blocks: Ints,
+    seconds: float,
+    *,
+    tested: list[Family],
+    shape_m: Floats,
+) -> Judgement:
+    """Hold a fit against alternatives.
+
+    `inverse` (D, D) is that of information and penalty, `delays` (tags, m) turns the parameters of the design into
+    delays in ns, `blocks` (n,) number short blocks of time. `shape_m` (n,) is by how much ranges would be off, were the
+    shape that the fit takes for the tail of reflections another one.
+    """
+    count = int(blocks[-1]) + 1
+    own = scores.by_block(blocks, count)
+    found, several = [], sum(len(family.names) for family in tested)
+    nowhere = np.zeros(len(shape_m), dtype=np.int64)
+    effect = -delays @ (scores.with_groups(shape_m, nowhere, 1) @ inverse)[0, : delays.shape[1]]
+    widening = np.outer(effect, effect)
+    for family in tested:
+        result = _test(family, scores, own, inverse, delays, blocks, seconds)
+        if family.kind == "pair":
+            widening += _spread_of_pairs(result)
+        found += list(_findings(family, result, several))
+    return Judgement(findings=sorted(found, key=lambda finding: -abs(finding.deviation)), widening_ns2=widening)
+
+
+def _test(
+    family: Family, scores: Scores, own: Floats, inverse: Floats, delays: Floats, blocks: Ints, seconds: float
+) -> Tested:
+    """Return a family's efficient slopes; `own` (blocks, D) are those by the fitted parameters."""
+    size, count = len(family.names), len(own)
+    link, plain = np.zeros((size, scores.size)), np.zeros((count, size))
+    square = np.zeros((size, size))
+    ends = [(family.place, 1.0)]
+    if family.second is not None:
+        ends.append((family.second, -1.0 if family.signed else 1.0))
+    slope, weighed = scores.score * family.weight, scores.curvature * family.weight**2
+    for place, sign in ends:
+        link += sign * scores.with_groups(family.weight, place, size)
+        plain += sign * np.bincount(blocks * size + place, slope, minlength=count * size).reshape(count, size)
+        for other, its in ends:
+            both = np.bincount(place * size + other, weighed, minlength=size * size).reshape(size, size)
+            square += sign * its * both
+    taken = link @ inverse
+    efficient = plain - own @ taken.T
+    information = square - taken @ link.T
+    whole = max(float(np.diag(square).max()), 1e-300)
+    free = np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True)
+    # What an alternative does must not pass for errors that last: those are judged within spans of time.
+    lasting = persistence(_spans(efficient, SEGMENTS if family.kind == "time" else SPANS), seconds, int(free))
+    return Tested(
+        total=efficient.sum(axis=0),
+        covariance=lasting.factor * (efficient.T @ efficient),
+        information=information,
+        whole=whole,
+        effects=-delays @ taken[:, : delays.shape[1]].T,
+        lasting=lasting,
+    )
+
+
+def _spans(series: Floats, count: int) -> Floats:
+    """Return slopes (blocks, k) as columns of a span of time each, less their means."""
+    length = len(series) // count
+    cut = series[: length * count].reshape(count, length, -1)
+    return np.hstack(list(cut - cut.mean(axis=1, keepdims=True)))
+
+
+def _spread_of_pairs(result: Tested) -> Floats:
+    """Return what pairs that scatter more than their slopes allow add to the delays' covariance.
+
+    Offsets of pairs are taken for draws with one variance, which is estimated by the method of moments (DerSimonian and
+    Laird 1986): the weighted square of all slopes exceeds its expectation by the variance times a trace.
+    """
+    values, vectors = np.linalg.eigh(result.information)
+    keep = values > REACHED * result.whole
+    freedom = int(np.count_nonzero(keep))
+    if not freedom:
+        return np.zeros((len(result.effects),) * 2)
+    base = vectors[:, keep]
+    inverse = np.linalg.pinv(base.T @ result.covariance @ base, rcond=1e-9, hermitian=True)
+    slope = base.T @ result.total
+    reach = base.T @ result.information
+    trace = float(np.trace(reach.T @ inverse @ reach))
+    variance = max(float(slope @ inverse @ slope) - freedom, 0.0) / max(trace, 1e-300)
+    return np.asarray(variance * result.effects @ result.effects.T)
+
+
+def _findings(family: Family, result: Tested, several: int) -> Iterator[Finding]:
+    """Yield the alternatives that stand out, one after the other, each beside those already found."""
+    from scipy.special import stdtrit
+
+    limit = float(stdtrit(max(result.lasting.freedom, 3.0), 1 - ERROR_RATE / several / 2))
+    total, covariance, information = result.total.copy(), result.covariance.copy(), result.information.copy()
+    for _ in range(MOST_NAMED):
+        std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        known = np.diag(information) > REACHED * result.whole
+        deviation = np.where(known, total / std, 0.0)
+        top = int(np.argmax(np.abs(deviation)))
+        if abs(deviation[top]) < limit:
+            return
+        # Residuals are fitted less true: an offset that they ask for is one that the ranges have too little.
+        offset = float(total[top] / information[top, top])
+        alike = np.abs(covariance[top] / (std[top] * std)) > SAME
+        close = alike & known & (np.abs(deviation) > SAME * abs(deviation[top]))
+        names = tuple(dict.fromkeys(family.names[k] for k in np.flatnonzero(close)))
+        yield Finding(
+            kind=family.kind,
+            names=names,
+            offset_m=-offset,
+            deviation=float(deviation[top]),
+            effect_ns=result.effects[:, top] * offset,
+        )
+        # With this offset fitted too, the others keep what it does not explain.
+        taken = information[:, top] / information[top, top]
+        step = np.eye(len(total))
+        step[:, top] -= taken
+        total, covariance, information = step @ total, step @ covariance @ step.T, step @ information @ step.T
+
+
+def told(finding: Finding) -> str:
+    """Return a finding as a sentence."""
+    whose = " or ".join(finding.names)
+    size = f"{100 * abs(finding.offset_m):.1f} cm"
+    worst = f"delays by up to {1e3 * float(np.max(np.abs(finding.effect_ns))):.0f} ps"
+    way = "long" if finding.offset_m > 0 else "short"
+    sentences = {
+        "pair": f"{whose}: ranges read {size} too {way} for the other pairs, which moves {worst}; record it anew",
+        "time": f"{whose}: ranges are {size} too {way} for a part of the recording, which moves {worst}; touched?",
+        "power": f"{whose}: errors change with power by {size} as no other tag's do, which moves {worst}",
+        "decibels": f"{whose}: errors are as if its powers were wrong by some decibels, {size} in its ranges, which "
+        f"moves {worst}; does it stand at another gain, or have another antenna?",
+        "skew": f"{whose}: ranges read {size} too {way} as initiator and as much the other way as target, which moves "
+        f"{worst}: clock skew is not corrected, or with the wrong sign",
+        "scale": f"ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; "
+        "see to the unit and the lever arms of the true distances",
+    }
+    return sentences[finding.kind]

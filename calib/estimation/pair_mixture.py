@@ -1,0 +1,296 @@
+"""Delays, curves and what the errors are made of, in one likelihood: reflections that differ by pair and by power.
+
+Each pair has a share of reflected ranges, a mean detour and a noise of its own; each is drawn to what all pairs have in
+common by how little the pair's own ranges say (empirical Bayes: the spreads between pairs are estimated along, by the
+fixed point of Fellner and Schall). Share and noise also vary with power, in steps. Everything is estimated together by
+Fisher's scoring with the squared slopes as information (Berndt, Hall, Hall, Hausman 1974), so the covariance of delays
+and curves contains what the rest leaves open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from calib.estimation.reflections import Shape, expected
+from calib.estimation.scores import Scores, Sort, inverse_of
+from uwblink.arrays import Floats, Ints
+
+CELLS: Final = 8
+"""Steps of power in which share and noise may differ."""
+
+LEVELS: Final = 6
+"""Each sample on which the fit converges has so many times the rows of the one before."""
+
+FIRST_SAMPLE: Final = 9000
+MAX_STEPS: Final = 60
+FULL_STEPS: Final = 10
+"""Steps after which variances between pairs stand, and steps are halved: squared slopes are not quite the curvature,
+and two points that lead to each other have their middle between them.
+"""
+
+SETTLED: Final = 1e-2
+"""A step that promises less log likelihood than this by delays and curves ends it: a tenth of a standard error."""
+
+NEARLY: Final = 0.3
+"""The same for all parameters together, of which there are many that delays do not depend on."""
+
+LONGEST_STEP: Final = 0.7
+"""Of a logarithm or a log odds."""
+
+SPREADS: Final[dict[str, tuple[float, float]]] = {"share": (1e-3, 4.0), "noise": (1e-4, 4.0), "mean": (1e-3, 0.5)}
+"""Bounds of the variances between pairs: of log odds, log noise and log mean detour."""
+
+CELL_VARIANCE: Final = 0.5
+MEAN_VARIANCE: Final = 1.0
+LEAST_VARIANCE: Final = 2.0
+"""How far from their guesses the steps of share, the mean detour and the least detour may be, in logarithms squared."""
+
+OUTLIERS: Final = -6.0
+OUTLIER_VARIANCE: Final = 9.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Which parameters stand where: those of the design, then logarithms and log odds of the rest."""
+
+    columns: int
+    pairs: int
+    cells: int = CELLS
+
+    def counts(self) -> dict[str, int]:
+        """Return how many there are of each sort."""
+        common = {"design": self.columns, "mean": 1, "least": 1, "outliers": 1}
+        return common | {
+            "cell_noise": self.cells,
+            "cell_share": self.cells,
+            "pair_share": self.pairs,
+            "pair_noise": self.pairs,
+            "pair_mean": self.pairs,
+        }
+
+    def slices(self) -> dict[str, slice]:
+        """Return where each sort stands."""
+        found, at = {}, 0
+        for name, count in self.counts().items():
+            found[name] = slice(at, at + count)
+            at += count
+        return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Errors:
+    """What is fitted: `error + design @ x` (n,) metres, the pair (n,) and the step of power (n,) of each range."""
+
+    error: Floats
+    design: Floats
+    pair: Ints
+    cell: Ints
+    density: float
+
+    def sample(self, rows: Ints) -> Errors:
+        """Return some rows."""
+        return replace(
+            self, error=self.error[rows], design=self.design[rows], pair=self.pair[rows], cell=self.cell[rows]
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prior:
+    """What is known beforehand: precision (D, D) and centre (D,) of the parameters, and variances between pairs."""
+
+    precision: Floats
+    centre: Floats
+    variances: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairMixture:
+    """The likeliest parameters (D,), their model covariance (D, D), the slopes of every range there, and how it ended.
+
+    `tail_share`, `tail_mean_m` and `noise` (pairs,) say what each pair's errors are made of, `noise` in the common one.
+    """
+
+    layout: Layout
+    parameters: Floats
+    covariance: Floats
+    precision: Floats
+    scores: Scores
+    steps: int
+    success: bool
+
+    def of(self, sort: str) -> Floats:
+        """Return the parameters of a sort."""
+        return self.parameters[self.layout.slices()[sort]]
+
+    @property
+    def tail_share(self) -> Floats:
+        """Share of reflected ranges of each pair, at the middle step of power."""
+        return np.asarray(1 / (1 + np.exp(-self.of("pair_share") - np.mean(self.of("cell_share")))))
+
+    @property
+    def tail_mean_m(self) -> Floats:
+        """Mean detour of each pair's reflected ranges."""
+        exponential = np.exp(self.of("mean")[0] + self.of("pair_mean"))
+        return np.asarray(np.exp(self.of("least")[0]) + exponential)
+
+    @property
+    def noise(self) -> Floats:
+        """Noise of each pair over the common one."""
+        return np.exp(self.of("pair_noise"))
+
+
+def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats) -> PairMixture:
+    """Return the likeliest parameters, from a robust `start` (m,) of those of the design.
+
+    `ridge` (m, m) is the inverse covariance of what is known of them beforehand, in 1/m^2.
+    """
+    layout = Layout(columns=errors.design.shape[1], pairs=int(errors.pair.max()) + 1)
+    theta, prior = _start(errors, layout, start, ridge)
+    steps, success = 0, False
+    for some in _levels(errors):
+        theta, prior, taken, success = _climb(some, layout, theta, prior)
+        steps += taken
+    scores, _ = _scores(errors, layout, theta)
+    covariance = inverse_of(scores.information() + prior.precision)
+    return PairMixture(
+        layout=layout,
+        parameters=theta,
+        covariance=covariance,
+        precision=prior.precision,
+        scores=scores,
+        steps=steps,
+        success=success,
+    )
+
+
+def _levels(errors: Errors) -> Iterator[Errors]:
+    """Yield samples of growing size, and everything last."""
+    count = len(errors.error)
+    order, size = np.random.default_rng(0).permutation(count), FIRST_SAMPLE
+    while 2 * size < count:
+        yield errors.sample(np.sort(order[:size]))
+        size *= LEVELS
+    yield errors
+
+
+def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats) -> tuple[Floats, Prior]:
+    """Return first parameters, from robust spreads of the residuals, and what is known beforehand."""
+    where = layout.slices()
+    residual = errors.error + errors.design @ start
+    spread = _spread(residual)
+    theta = np.zeros(where["pair_mean"].stop)
+    theta[where["design"]] = start
+    theta[where["mean"]] = np.log(4 * spread)
+    theta[where["least"]] = np.log(0.5 * spread)
+    theta[where["outliers"]] = OUTLIERS
+    theta[where["cell_noise"]] = np.log([0.9 * _spread(part) for part in _parts(residual, errors.cell, layout.cells)])
+    noise, odds = [], []
+    for part in _parts(residual, errors.pair, layout.pairs):
+        noise.append(_spread(part, spread))
+        beyond = np.mean(part > 2.5 * noise[-1]) - np.mean(part < -2.5 * noise[-1]) if len(part) else 0.1
+        odds.append(np.clip(1.6 * beyond, 0.01, 0.6))
+    theta[where["pair_share"]] = np.log(np.array(odds) / (1 - np.array(odds)))
+    theta[where["pair_noise"]] = np.log(np.array(noise) / np.median(noise))
+    precision, centre = np.zeros((len(theta),) * 2), np.zeros(len(theta))
+    precision[where["design"], where["design"]] = ridge
+    known = {"mean": MEAN_VARIANCE, "least": LEAST_VARIANCE, "outliers": OUTLIER_VARIANCE, "cell_share": CELL_VARIANCE}
+    for name, variance in known.items():
+        _set(precision, where[name], 1 / variance)
+    centre[: where["cell_noise"].start][-3:] = theta[where["mean"].start : where["cell_noise"].start]
+    _set(precision, where["cell_noise"], 1e-6)
+    return theta, _between(theta, Prior(precision=precision, centre=centre, variances={}), layout, None)
+
+
+def _parts(values: Floats, place: Ints, count: int) -> list[Floats]:
+    order = np.argsort(place, kind="stable")
+    return np.split(values[order], np.searchsorted(place[order], np.arange(1, count)))
+
+
+def _spread(values: Floats, otherwise: float = 1e-3) -> float:
+    if len(values) < 5:
+        return otherwise
+    return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-3)
+
+
+def _set(matrix: Floats, where: slice, value: float) -> None:
+    matrix[np.arange(where.start, where.stop), np.arange(where.start, where.stop)] = value
+
+
+def _between(theta: Floats, prior: Prior, layout: Layout, covariance: Floats | None) -> Prior:
+    """Return the prior with the variances between pairs that parameters and their covariance suggest."""
+    where, variances = layout.slices(), dict(prior.variances)
+    precision, centre = prior.precision.copy(), prior.centre.copy()
+    centre[where["pair_share"]] = theta[where["pair_share"]].mean()
+    for name, (low, high) in SPREADS.items():
+        rows = where[f"pair_{name}"]
+        square = float(np.sum((theta[rows] - centre[rows]) ** 2))
+        used = float(layout.pairs)
+        if covariance is not None:
+            used = max(used - float(np.trace(covariance[rows, rows])) / variances[name], 1e-2 * used)
+        else:
+            square = max(square, 0.05 * used)
+        variances[name] = min(max(square / used, low), high)
+        _set(precision, rows, 1 / variances[name])
+    return Prior(precision=precision, centre=centre, variances=variances)
+
+
+def _climb(errors: Errors, layout: Layout, theta: Floats, prior: Prior) -> tuple[Floats, Prior, int, bool]:
+    """Climb to the top of the likelihood of some errors: parameters, prior, steps, and whether it is the top."""
+    best, top, step, shorter = -np.inf, theta, np.zeros_like(theta), 0
+    for steps in range(1, MAX_STEPS + 1):
+        scores, likelihood = _scores(errors, layout, theta)
+        value = likelihood - 0.5 * float((theta - prior.centre) @ prior.precision @ (theta - prior.centre))
+        if value < best - SETTLED and shorter < 6:
+            step, shorter = 0.3 * step, shorter + 1
+            theta = top + step
+            continue
+        covariance = inverse_of(scores.information() + prior.precision)
+        slope = scores.gradient() - prior.precision @ (theta - prior.centre)
+        step, shorter = covariance @ slope, 0
+        own = slice(0, layout.columns)
+        if float(slope @ step) < NEARLY and abs(float(slope[own] @ step[own])) < SETTLED:
+            return theta, prior, steps, True
+        longest = float(np.max(np.abs(step[layout.columns :])))
+        step *= min(1.0 if steps <= FULL_STEPS else 0.5, LONGEST_STEP / max(longest, 1e-12))
+        top, theta = theta, theta + step
+        if steps <= FULL_STEPS:
+            prior = _between(theta, prior, layout, covariance)
+        best = likelihood - 0.5 * float((top - prior.centre) @ prior.precision @ (top - prior.centre))
+    return theta, prior, steps, False
+
+
+def _scores(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, float]:
+    """Return the slopes of the log likelihood at parameters, and its value."""
+    part = {name: theta[rows] for name, rows in layout.slices().items()}
+    residual = errors.error + errors.design @ part["design"]
+    sigma = np.exp(part["pair_noise"][:, None] + part["cell_noise"])
+    share = 1 / (1 + np.exp(-part["pair_share"][:, None] - part["cell_share"]))
+    both = errors.pair * layout.cells + errors.cell
+    shape = Shape(
+        sigma_m=sigma.ravel()[both],
+        tail_share=share.ravel()[both],
+        mean_m=np.exp(part["mean"][0] + part["pair_mean"])[errors.pair],
+        least_m=float(np.exp(part["least"][0])),
+        outlier_share=float(1 / (1 + np.exp(-part["outliers"][0]))),
+        outlier_density=errors.density,
+    )
+    found = expected(residual, shape)
+    z, noise = residual / shape.sigma_m, found.noise_m / shape.sigma_m
+    score = -(found.core * z + found.tail * noise) / shape.sigma_m
+    by_noise = found.core * (z * z - 1) + found.tail * (noise * noise + found.noise_var - 1)
+    by_share = found.tail - shape.tail_share * (found.core + found.tail)
+    by_mean = found.tail * ((residual - shape.least_m - found.noise_m) / shape.mean_m - 1)
+    pairs, cells = (errors.pair, layout.pairs), (errors.cell, layout.cells)
+    sorts = (
+        Sort(slope=by_mean),
+        Sort(slope=found.tail * noise * (shape.least_m / shape.sigma_m)),
+        Sort(slope=1 - found.core - found.tail - shape.outlier_share),
+        *(Sort(slope=slope, place=cells[0], count=cells[1]) for slope in (by_noise, by_share)),
+        *(Sort(slope=slope, place=pairs[0], count=pairs[1]) for slope in (by_share, by_noise, by_mean)),
+    )
+    scores = Scores(design=errors.design, score=score, curvature=score * score, sorts=sorts)
+    return scores, float(found.log_density.sum())

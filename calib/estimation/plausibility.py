@@ -1,0 +1,138 @@
+"""What hardware and arithmetic allow: data that cannot be what they claim are refused or named before they are
+believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+import numpy as np
+
+from calib.errors import UnanswerableError
+from calib.ranges import STATIC, Ranges
+from calib.spread import robust_spread
+from uwblink.arrays import Floats
+
+MOST_LEFT_OUT: Final = 0.5
+SCALE: Final = (0.75, 1.35)
+"""How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
+
+UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet", 1000.0: "kilometres"}
+FEWEST_SPREADS: Final = 3.0
+"""True distances must spread by so much more than errors for their scale to be known."""
+
+SKEW_PPM: Final = 100.0
+"""Clock ratios beyond this are none: crystals of these boards keep 20 ppm each, over temperature and age."""
+
+LONGEST_NS: Final = 2.5
+"""Boards of one kind differ by less in their antenna delays (published ones by 0.6 ns)."""
+
+ONE_WAY_M: Final = 0.05
+SURELY: Final = 8.0
+MEDIAN: Final = 1.2533
+"""Standard error of a median over that of a mean."""
+
+FEWEST_WAYS: Final = 20
+LOUD_M: Final = 0.5
+"""Errors that spread by more are not those of a UWB range."""
+
+
+def refuse_impossible(ranges: Ranges) -> None:
+    """Raise `UnanswerableError` where ranges cannot be fitted whatever the settings."""
+    _mostly_left_out(ranges)
+    if len(ranges) > 1 and not np.ptp(ranges.time_ns) > 0:
+        raise UnanswerableError(
+            f"{ranges.source}: all ranges have the same time, so nothing says how long errors last; give their times"
+        )
+    _scale(ranges)
+    _clock_ratios(ranges)
+
+
+def _mostly_left_out(ranges: Ranges) -> None:
+    missing = {reason: count for reason, count in ranges.excluded.items() if reason != STATIC}
+    share = sum(missing.values()) / max(len(ranges) + sum(missing.values()), 1)
+    if share > MOST_LEFT_OUT:
+        worst = max(missing, key=lambda reason: missing[reason])
+        raise UnanswerableError(
+            f"{ranges.source}: {100 * share:.0f} % of the exchanges were left out, most for {worst}; "
+            "more than half is no sample: see to the protocol and the columns of the recording"
+        )
+
+
+def _scale(ranges: Ranges) -> None:
+    """Compare how ranges and true distances spread: a unit or two columns may be wrong."""
+    raw, truth = ranges.raw_m, ranges.truth_m
+    slope = robust_slope(truth, raw)
+    rest = robust_spread(raw - slope * truth)
+    if SCALE[0] < slope < SCALE[1] or abs(slope) * robust_spread(truth) < FEWEST_SPREADS * rest:
+        return
+    near = [name for ratio, name in UNITS.items() if abs(np.log(max(slope, 1e-9) / ratio)) < 0.2]
+    guess = f"; true distances look like {near[0]}" if near else ""
+    raise UnanswerableError(
+        f"{ranges.source}: ranges grow by {slope:.3g} m in a metre of true distance{guess}; give them in metres"
+    )
+
+
+def robust_slope(x: Floats, y: Floats) -> float:
+    """Return how y (n,) grows with x (n,): the median slope between thirds (Tukey's line)."""
+    order = np.argsort(x, kind="stable")
+    third = max(len(x) // 3, 1)
+    low, high = order[:third], order[-third:]
+    run = float(np.median(x[high]) - np.median(x[low]))
+    return float(np.median(y[high]) - np.median(y[low])) / run if run > 0 else 1.0
+
+
+def _clock_ratios(ranges: Ranges) -> None:
+    """Refuse clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order."""
+    double = ranges.protocol == "ds"
+    if not double.any():
+        return
+    skew = 1e6 * float(np.median(np.abs(2 * ranges.weight_target[double] - 1)))
+    if skew > SKEW_PPM:
+        raise UnanswerableError(
+            f"{ranges.source}: clocks differ by {skew:.0f} ppm by their third messages, crystals by 40 at most; the "
+            "third leg is longer than stamps count before they wrap, or the columns of stamps are in another order"
+        )
+
+
+def one_way(ranges: Ranges) -> Iterator[str]:
+    """Name the pair whose ranges depend most on who initiates, as they do where clock skew is left in them."""
+    error = ranges.raw_m - ranges.truth_m
+    forth = ranges.initiator < ranges.target
+    low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
+    key = (low * (int(high.max()) + 1) + high) * 2 + forth
+    order = np.argsort(key, kind="stable")
+    keys, starts = np.unique(key[order], return_index=True)
+    parts = dict(zip(keys.tolist(), np.split(error[order], starts[1:]), strict=True))
+    worst, said = 0.0, ""
+    for number, part in parts.items():
+        back = parts.get(number - 1, part[:0])
+        if number % 2 == 0 or min(len(part), len(back)) < FEWEST_WAYS:
+            continue
+        differ = float(np.median(part) - np.median(back))
+        std = MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in (part, back))))
+        if abs(differ) > max(ONE_WAY_M, SURELY * std, worst):
+            a, b = divmod(number // 2, int(high.max()) + 1)
+            worst = abs(differ)
+            way = "longer" if differ > 0 else "shorter"
+            said = (
+                f"pair {a}-{b}: ranges read {100 * worst:.0f} cm {way} if tag {a} initiates: "
+                "clock skew is not corrected, or with the wrong sign of the carrier's reading"
+            )
+    if said:
+        yield said
+
+
+def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:
+    """Yield sentences on fitted values that hardware does not have."""
+    large = {tag: delay for tag, delay in delays_ns.items() if abs(delay) > LONGEST_NS}
+    if large:
+        tag = max(large, key=lambda tag: abs(large[tag]))
+        yield (
+            f"tag {tag}: a delay of {large[tag]:+.1f} ns is more than boards differ by ({LONGEST_NS} ns); see to the "
+            "unit of true distances, the order of stamps, the carrier's sign and the configured antenna delays"
+        )
+    spread = robust_spread(residuals_m)
+    if spread > LOUD_M:
+        yield f"errors spread by {spread:.2f} m after the fit, those of UWB ranges by a decimetre: whose truth is it?"

@@ -1,0 +1,107 @@
+"""Slopes of the likelihood against differences of it, and sums of them against sums written out."""
+
+import numpy as np
+import pytest
+from scipy.stats import exponnorm
+
+from calib.estimation.pair_mixture import Errors, Layout, _scores
+from calib.estimation.reflections import Shape, expected
+from calib.estimation.scores import Scores, Sort, inverse_of
+
+
+def errors(n=600, pairs=3, seed=4):
+    rng = np.random.default_rng(seed)
+    return Errors(
+        error=rng.normal(0, 0.08, n) + (rng.random(n) < 0.2) * rng.exponential(0.3, n),
+        design=rng.normal(size=(n, 2)),
+        pair=rng.integers(0, pairs, n),
+        cell=rng.integers(0, 8, n),
+        density=0.2,
+    )
+
+
+def test_slopes_are_those_of_the_likelihood():
+    some, layout = errors(), Layout(columns=2, pairs=3)
+    rng = np.random.default_rng(1)
+    theta = rng.normal(0, 0.1, layout.slices()["pair_mean"].stop)
+    for name, start in (("mean", np.log(0.3)), ("least", np.log(0.05)), ("outliers", -4), ("cell_noise", -2.4)):
+        theta[layout.slices()[name]] += start
+    scores, _ = _scores(some, layout, theta)
+    step, found = 1e-6, []
+    for k in range(len(theta)):
+        moved = np.eye(len(theta))[k] * step
+        found.append((_scores(some, layout, theta + moved)[1] - _scores(some, layout, theta - moved)[1]) / (2 * step))
+    np.testing.assert_allclose(scores.gradient(), found, rtol=1e-5, atol=1e-4)
+
+
+def test_the_density_is_that_of_scipy():
+    e = np.linspace(-0.6, 6, 400)
+    shape = Shape(
+        sigma_m=np.full(400, 0.08),
+        tail_share=np.full(400, 0.25),
+        mean_m=np.full(400, 0.3),
+        least_m=0.1,
+        outlier_share=0.02,
+        outlier_density=0.1,
+    )
+    core = np.exp(-0.5 * (e / 0.08) ** 2) / np.sqrt(2 * np.pi) / 0.08
+    tail = exponnorm.pdf(e, 0.3 / 0.08, loc=0.1, scale=0.08)
+    whole = 0.98 * (0.75 * core + 0.25 * tail) + 0.02 * 0.1
+    np.testing.assert_allclose(np.exp(expected(e, shape).log_density), whole, rtol=1e-6)
+
+
+@pytest.fixture
+def scores():
+    rng = np.random.default_rng(2)
+    n = 500
+    place = rng.integers(0, 4, n)
+    return Scores(
+        design=rng.normal(size=(n, 3)),
+        score=rng.normal(size=n),
+        curvature=rng.uniform(0.5, 1, n),
+        sorts=(
+            Sort(slope=rng.normal(size=n)),
+            Sort(slope=rng.normal(size=n), place=place, count=4),
+            Sort(slope=rng.normal(size=n), place=place, count=4),
+            Sort(slope=rng.normal(size=n), place=rng.integers(0, 2, n), count=2),
+        ),
+    )
+
+
+def written_out(scores):
+    """The matrix that `Scores` never builds."""
+    columns = [scores.design * scores.score[:, None]]
+    for sort in scores.sorts:
+        place = np.zeros(len(sort.slope), dtype=int) if sort.place is None else sort.place
+        columns.append(np.eye(sort.count)[place] * sort.slope[:, None])
+    return np.hstack(columns)
+
+
+def test_sums_are_those_of_the_matrix_written_out(scores):
+    matrix = written_out(scores)
+    np.testing.assert_allclose(scores.gradient(), matrix.sum(axis=0), atol=1e-9)
+    blocks = np.arange(500) // 30
+    expected_sums = np.array([matrix[blocks == b].sum(axis=0) for b in range(17)])
+    np.testing.assert_allclose(scores.by_block(blocks, 17), expected_sums, atol=1e-9)
+    square = matrix.T @ matrix
+    square[:3, :3] = (scores.design * scores.curvature[:, None]).T @ scores.design
+    np.testing.assert_allclose(scores.information(), square, atol=1e-9)
+
+
+def test_offsets_of_groups_are_linked_as_columns_would_be(scores):
+    rng = np.random.default_rng(3)
+    weight, place = rng.normal(size=500), rng.integers(0, 5, 500)
+    offsets = np.eye(5)[place] * weight[:, None]
+    link = scores.with_groups(weight, place, 5)
+    np.testing.assert_allclose(link[:, :3], (offsets * scores.curvature[:, None]).T @ scores.design, atol=1e-9)
+    rest = (offsets * scores.score[:, None]).T @ written_out(scores)[:, 3:]
+    np.testing.assert_allclose(link[:, 3:], rest, atol=1e-9)
+
+
+def test_the_inverse_of_metres_beside_logarithms():
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(30, 6)) * np.array([1e6, 1, 1e-4, 1, 1e3, 1])
+    matrix = root.T @ root
+    size = np.sqrt(np.diag(matrix))
+    both = np.outer(size, size)
+    np.testing.assert_allclose(inverse_of(matrix) * both, np.linalg.inv(matrix / both), rtol=1e-6)
