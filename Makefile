@@ -57,6 +57,9 @@ bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy
 
+worlds: setup ## fits in worlds that share nothing with the simulator, into docs/accuracy.md (20 minutes)
+	$(BIN)/python -m benchmarks.worlds_report
+
 bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
 	$(BIN)/python -m benchmarks.boards
 

@@ -47,7 +47,10 @@ def intervals(
         factors.append(persistence(pulls[:, rank:], seconds, CURVE_SERIES))
     widths = [np.sqrt(each.factor) * each.quantile95 / NORMAL95 for each in factors]
     width = np.repeat(widths, [rank, columns - rank] if rank and columns > rank else [columns])
-    covariance = (pulls.T @ pulls) * width[:, None] * width + reach @ prior @ reach.T
+    # What is fitted is fitted to these ranges: their slopes are smaller than those of others would be.
+    used = float(scores.size - np.sum(inverse * prior))
+    fresh = len(blocks) / max(len(blocks) - used, 0.2 * len(blocks))
+    covariance = fresh * (pulls.T @ pulls) * width[:, None] * width + reach @ prior @ reach.T
     return Intervals(covariance=np.asarray(covariance), lasting=lasting if rank else factors[-1])
 
 

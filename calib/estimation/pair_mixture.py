@@ -155,7 +155,7 @@ def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats) -> PairMixtur
         theta, prior, taken, success = _climb(some, layout, theta, prior)
         steps += taken
     scores, _ = _scores(errors, layout, theta)
-    covariance = inverse_of(scores.information() + prior.precision)
+    covariance = inverse_of(scores.information() + prior.precision, layout.pairs, len(SPREADS))
     return PairMixture(
         layout=layout,
         parameters=theta,
@@ -248,7 +248,7 @@ def _climb(errors: Errors, layout: Layout, theta: Floats, prior: Prior) -> tuple
             step, shorter = 0.3 * step, shorter + 1
             theta = top + step
             continue
-        covariance = inverse_of(scores.information() + prior.precision)
+        covariance = inverse_of(scores.information() + prior.precision, layout.pairs, len(SPREADS))
         slope = scores.gradient() - prior.precision @ (theta - prior.centre)
         step, shorter = covariance @ slope, 0
         own = slice(0, layout.columns)

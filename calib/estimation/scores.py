@@ -16,7 +16,7 @@ import numpy as np
 
 from uwblink.arrays import Floats, Ints
 
-CHUNK: Final = 2048
+CHUNK: Final = 512
 """Rows of a matrix worked on at once, so that they stay in the cache."""
 
 
@@ -131,16 +131,42 @@ def weighted_square(matrix: Floats, weight: Floats) -> Floats:
     return found
 
 
-def inverse_of(matrix: Floats) -> Floats:
-    """Return the inverse of a positive matrix; directions that nothing determines stay where they are."""
-    from scipy.linalg import lapack
+def inverse_of(matrix: Floats, places: int = 0, sorts: int = 0) -> Floats:
+    """Return the inverse of a positive matrix; directions that nothing determines stay where they are.
 
+    Its last parameters may be `sorts` of one for each of `places`, in sorts, between which no two places meet (shares
+    of pairs, noises of pairs): they are eliminated first, place by place.
+    """
     # Logarithms and metres stand side by side: scaled to a diagonal of ones, the matrix is as well posed as can be.
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-12))
-    scaled = matrix * scale[:, None] * scale
-    factor, failed = lapack.dpotrf(scaled + 1e-10 * np.eye(len(scaled)), lower=1)
+    scaled = matrix * scale[:, None] * scale + np.diag(np.full(len(matrix), 1e-10))
+    found = _eliminated(scaled, places, sorts) if places else _positive(scaled)
+    return np.asarray(found * scale[:, None] * scale)
+
+
+def _positive(matrix: Floats) -> Floats:
+    from scipy.linalg import lapack
+
+    factor, failed = lapack.dpotrf(matrix, lower=1)
     if failed:
-        return np.asarray(np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) * scale[:, None] * scale)
+        return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
     lower, _ = lapack.dpotri(factor, lower=1)
-    whole = np.tril(lower) + np.tril(lower, -1).T
-    return np.asarray(whole * scale[:, None] * scale)
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+
+
+def _eliminated(matrix: Floats, places: int, sorts: int) -> Floats:
+    """Return the inverse by Schur's complement: the parameters of a place meet those of no other, only common ones."""
+    common = len(matrix) - places * sorts
+    own = np.arange(places)[:, None] + places * np.arange(sorts) + common
+    inner = np.linalg.inv(matrix[own[:, :, None], own[:, None, :]])
+    across = np.einsum("pst,ptc->psc", inner, matrix[own, :common])
+    flat = np.empty((places * sorts, common))
+    flat[own - common] = across
+    first = _positive(matrix[:common, :common] - matrix[:common, common:] @ flat)
+    found = np.empty_like(matrix)
+    found[:common, :common] = first
+    found[:common, common:] = -first @ flat.T
+    found[common:, :common] = found[:common, common:].T
+    found[common:, common:] = flat @ first @ flat.T
+    found[own[:, :, None], own[:, None, :]] += inner
+    return found

@@ -105,3 +105,13 @@ def test_the_inverse_of_metres_beside_logarithms():
     size = np.sqrt(np.diag(matrix))
     both = np.outer(size, size)
     np.testing.assert_allclose(inverse_of(matrix) * both, np.linalg.inv(matrix / both), rtol=1e-6)
+
+
+def test_eliminating_places_first_gives_the_same_inverse():
+    rng = np.random.default_rng(6)
+    places, sorts, common = 7, 3, 5
+    columns = [rng.normal(size=(400, common))]
+    place = rng.integers(0, places, 400)
+    columns += [np.eye(places)[place] * rng.normal(size=(400, 1)) for _ in range(sorts)]
+    matrix = np.hstack(columns).T @ np.hstack(columns) + np.eye(common + places * sorts)
+    np.testing.assert_allclose(inverse_of(matrix, places, sorts), np.linalg.inv(matrix), rtol=1e-6, atol=1e-9)
