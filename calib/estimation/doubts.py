@@ -16,7 +16,7 @@ from calib.estimation.solver import Solved, pairs_of
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
-FAR_M: Final = 0.1
+FAR_M: Final = 0.12
 """Detours of less may as well be an error that wanders."""
 
 DECIBEL: Final = float(10**0.1)
@@ -49,7 +49,8 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
     plain = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
     ranges = problem.ranges
     blocks, seconds = blocks_of(ranges.time_ns)
-    tested = families(ranges.initiator, ranges.target, problem.lifted, ranges.truth_m, _of_a_decibel(problem, found))
+    louder = _of_a_decibel(problem, found)
+    tested = families(ranges.initiator, ranges.target, problem.lifted, ranges.truth_m, louder, seconds)
     judged = examine(
         found.scores,
         found.inverse,
@@ -116,7 +117,8 @@ def _reflected(problem: Problem, found: Solved) -> list[str]:
             f"{100 * found.mixture.tail_mean_m[number]:.0f} cm; record it anew, delays rest on the other pairs"
         )
     for tag in tags.tolist():
-        mean = float(share[np.any(ends == tag, axis=1)].mean())
+        own = np.any(ends == tag, axis=1)
+        mean = float(np.where(far, share, 0.0)[own].mean())
         if mean > OFTEN_REFLECTED and not sentences:
             sentences.append(
                 f"tag {tag}: {100 * mean:.0f} % of its ranges are reflected; what stands near its antenna?"

@@ -18,11 +18,14 @@ from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.scores import Scores
 from uwblink.arrays import Floats, Ints
 
-ERROR_RATE: Final = 0.002
+ERROR_RATE: Final = 0.005
 """Share of sound fits that may be doubted, all alternatives together."""
 
 SEGMENTS: Final = 6
-"""Spans of time of equal counts in which a tag may have an offset of its own."""
+"""Spans of time of equal counts, at most, in which a tag may have an offset of its own."""
+
+SPAN_S: Final = 20.0
+"""Spans are no shorter, so that errors that last are known within them."""
 
 SPANS: Final = 2
 """Spans of time within which errors are looked at for how long they last, where an alternative does not end."""
@@ -96,7 +99,9 @@ class Tested:
     lasting: Persistence
 
 
-def families(initiator: Ints, target: Ints, lifted: Floats, truth_m: Floats, louder_m: Floats) -> Iterator[Family]:
+def families(
+    initiator: Ints, target: Ints, lifted: Floats, truth_m: Floats, louder_m: Floats, seconds: float
+) -> Iterator[Family]:
     """Yield the alternatives: offsets of a pair, of a tag for a while or as its power changes, and those of arithmetic.
 
     `louder_m` (n,) is what a decibel more would do to each range. The last two are an error that grows with the
@@ -110,13 +115,14 @@ def families(initiator: Ints, target: Ints, lifted: Floats, truth_m: Floats, lou
     keys, pair = np.unique(low * len(tags) + high, return_inverse=True)
     named = [f"pair {tags[key // len(tags)]}-{tags[key % len(tags)]}" for key in keys.tolist()]
     yield Family(kind="pair", names=named, weight=ones, place=pair)
-    when = np.arange(len(first)) * SEGMENTS // len(first)
+    count = segments(seconds)
+    when = np.arange(len(first)) * count // len(first)
     yield Family(
         kind="time",
-        names=[name for name in names for _ in range(SEGMENTS)],
+        names=[name for name in names for _ in range(count)],
         weight=ones,
-        place=first * SEGMENTS + when,
-        second=second * SEGMENTS + when,
+        place=first * count + when,
+        second=second * count + when,
     )
     rank = np.empty(len(lifted))
     rank[np.argsort(lifted, kind="stable")] = np.linspace(-1, 1, len(lifted))
@@ -128,6 +134,11 @@ def families(initiator: Ints, target: Ints, lifted: Floats, truth_m: Floats, lou
     far = (truth_m - np.median(truth_m)) / max(float(np.ptp(truth_m)), 1e-9)
     if np.ptp(truth_m) > 0:
         yield Family(kind="scale", names=["all tags"], weight=far, place=np.zeros(len(far), dtype=np.int64))
+
+
+def segments(seconds: float) -> int:
+    """Return in how many spans of a recording a tag may have an offset of its own."""
+    return int(min(max(seconds / SPAN_S, 2), SEGMENTS))
 
 
 def examine(
@@ -183,7 +194,7 @@ def _test(
     whole = max(float(np.diag(square).max()), 1e-300)
     free = np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True)
     # What an alternative does must not pass for errors that last: those are judged within spans of time.
-    lasting = persistence(_spans(efficient, SEGMENTS if family.kind == "time" else SPANS), seconds, int(free))
+    lasting = persistence(_spans(efficient, segments(seconds) if family.kind == "time" else SPANS), seconds, int(free))
     return Tested(
         total=efficient.sum(axis=0),
         covariance=lasting.factor * (efficient.T @ efficient),

@@ -27,6 +27,9 @@ LEVELS: Final = 6
 
 FIRST_SAMPLE: Final = 9000
 MAX_STEPS: Final = 60
+PATIENCE: Final = 20
+"""Steps after which it is enough that delays and curves stand still: a share of nothing may be any small number."""
+
 FULL_STEPS: Final = 10
 """Steps after which variances between pairs stand, and steps are halved: squared slopes are not quite the curvature,
 and two points that lead to each other have their middle between them.
@@ -252,7 +255,8 @@ def _climb(errors: Errors, layout: Layout, theta: Floats, prior: Prior) -> tuple
         slope = scores.gradient() - prior.precision @ (theta - prior.centre)
         step, shorter = covariance @ slope, 0
         own = slice(0, layout.columns)
-        if float(slope @ step) < NEARLY and abs(float(slope[own] @ step[own])) < SETTLED:
+        still = abs(float(slope[own] @ step[own])) < SETTLED
+        if still and (float(slope @ step) < NEARLY or steps > PATIENCE):
             return theta, prior, steps, True
         longest = float(np.max(np.abs(step[layout.columns :])))
         step *= min(1.0 if steps <= FULL_STEPS else 0.5, LONGEST_STEP / max(longest, 1e-12))
