@@ -110,8 +110,9 @@ class Processes:
         return found
 
     def close(self) -> None:
-        """End the processes."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """End the processes; those that still have a chunk are not waited for."""
+        # A pool that is not waited for may find its own pipe closed when the interpreter ends, and says so.
+        self._pool.shutdown(wait=not self._running, cancel_futures=True)
 
 
 class Cluster:
