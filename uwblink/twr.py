@@ -209,13 +209,21 @@ def intervals(exchanges: Exchanges) -> Intervals:
 def time_of_flight(exchanges: Exchanges) -> Floats:
     """Raw time of flight in seconds, shape (n,): each row by the formula of its protocol.
 
-    NaN or infinite where the stamps of a double-sided row are degenerate (dt53 = 0).
+    NaN or infinite where the stamps of a double-sided row are degenerate (dt53 = 0). A row without stamps (all of the
+    first four are zero), as of a device that tells ranges only, has that of its reported range.
     """
     spans = intervals(exchanges)
     flight = np.full(len(exchanges), np.nan)
     for row, rows in _rows_by_protocol(exchanges):
         flight[rows] = row.flight_ticks(_pick(spans, rows)) * TICK_S
-    return flight
+    bare = without_stamps(exchanges)
+    return np.where(bare, exchanges.range_m / SPEED_OF_LIGHT, flight) if bare.any() else flight
+
+
+def without_stamps(exchanges: Exchanges) -> Bools:
+    """Return which exchanges have a range and no stamps, (n,)."""
+    e = exchanges
+    return np.asarray((e.tx1 | e.rx1 | e.tx2 | e.rx2) == 0)
 
 
 def raw_range(exchanges: Exchanges) -> Floats:

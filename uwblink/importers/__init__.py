@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers.exchanges_csv import read_csv
+from uwblink.importers.exchange_tables import SUFFIXES, read_table
 from uwblink.importers.miluv import read_miluv
 from uwblink.output import check_output
 from uwblink.plugins import NAME, Registry
@@ -56,9 +56,9 @@ def check_importer(row: Any) -> None:
 _OWN: Final = (
     Importer(
         "csv",
-        (".csv", ".csv.gz"),
-        read_csv,
-        "Import ranging exchanges from a table.",
+        SUFFIXES,
+        read_table,
+        "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
         map_help="Names, units and constants (.toml).",
     ),
     Importer(

@@ -1,15 +1,32 @@
-"""What a table of exchanges calls its columns, and in which units: the TOML map of `import csv`.
+"""What a table of exchanges calls its columns, and in which units: the TOML map of `uwblink import csv`.
+
+Every key is optional; docs/importing.md explains each.
 
 ```toml
+layout = "exchanges"       # or "messages" (a row a message), "parts" (some rows an exchange), "ranges" (no stamps)
 bits = 32                  # of the counter that the stamps come from, 32 or 40
-protocol = "ss"            # a protocol of uwblink.twr; guessed from the columns where not given
+counter = "wrapped"        # or "signed", "unwrapped"
+protocol = "ss"            # a protocol of uwblink.twr
+delimiter = ";"
+decimal = ","
+within_s = 0.5             # rows of one exchange lie no further apart
 [columns]                  # our name = "their name"
 tx1 = "poll_tx_ticks"
 [units]
-stamps = "ticks"           # or "ns", "s"
-time = "s"                 # or "ms", "us", "ns"
+stamps = "ticks"           # or "ns", "us", "s", or the length of a unit in seconds
+time = "s"                 # or "ms", "us", "ns", "iso"
+distance = "m"             # or "cm", "mm", "ft", "in"
 [constants]                # columns that the table does not have
 from_id = 1
+[ids]                      # numbers for ids that are words or too large
+"AA:01" = 1
+[antenna_delays]           # what was programmed into the devices; zeros where nothing was
+unit = "ticks"             # or "ns"
+tx = 16436
+rx = 16436
+[antenna_delays.tags.7]
+tx = 16400
+rx = 16400
 ```
 """
 
@@ -17,33 +34,63 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from uwblink.errors import ImportTableError
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.toml import TomlReader, is_number
-from uwblink.twr import STAMPS
+from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
-LEVELS: Final = ("fpp1", "fpp2", "skew1", "skew2", "gt_range_m")
-NAMES: Final = ("time_s", "from_id", "to_id", *STAMPS, *LEVELS, *POSITIONS)
+LEVELS: Final = ("fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2")
+DISTANCES: Final = ("range_m", "gt_range_m", *POSITIONS)
+MESSAGE_NAMES: Final = ("sequence", "message", "tx", "rx", "fpp", "rxp", "skew")
+IDS: Final = ("from_id", "to_id")
+NAMES: Final = ("time_s", *IDS, *STAMPS, *LEVELS, *DISTANCES, *MESSAGE_NAMES)
 
-STAMP_UNITS: Final = {"ticks": 1.0, "ns": TICKS_PER_SECOND * 1e-9, "s": float(TICKS_PER_SECOND)}
+LAYOUTS: Final = ("exchanges", "messages", "parts", "ranges")
+COUNTERS: Final = ("wrapped", "signed", "unwrapped")
+STAMP_UNITS: Final = {
+    "ticks": 1.0,
+    "ps": TICKS_PER_SECOND * 1e-12,
+    "ns": TICKS_PER_SECOND * 1e-9,
+    "us": TICKS_PER_SECOND * 1e-6,
+    "s": float(TICKS_PER_SECOND),
+}
 TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-KEYS: Final = ("bits", "protocol", "columns", "units", "constants")
+ISO: Final = "iso"
+DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
+DELIMITERS: Final = (",", ";", "\t", "|", " ")
+KEYS: Final = (
+    "layout", "bits", "counter", "protocol", "delimiter", "decimal", "within_s",
+    "columns", "units", "constants", "ids", "antenna_delays",
+)  # fmt: skip
+REGISTER_MAX: Final = 65_535
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnMap:
-    """How to read a table: names of its columns, units, and values for columns it lacks."""
+    """How to read a table; what is None is found out from the table itself.
 
-    bits: int = 32
+    `ticks_per_unit` turns stamps into ticks. `antenna_delays` is what was programmed, in ticks: for all devices under
+    None, for single ones under their ids.
+    """
+
+    layout: str | None = None
+    bits: int | None = None
+    counter: str | None = None
     protocol: str | None = None
+    delimiter: str | None = None
+    decimal: str | None = None
+    within_s: float = 1.0
     columns: dict[str, str] = field(default_factory=dict)
-    stamp_unit: str = "ticks"
-    time_unit: str = "s"
-    constants: dict[str, float] = field(default_factory=dict)
+    ticks_per_unit: float = 1.0
+    time_unit: str | None = None
+    metres_per_unit: float = 1.0
+    constants: dict[str, float | str] = field(default_factory=dict)
+    ids: dict[str, int] = field(default_factory=dict)
+    antenna_delays: dict[int | None, dict[str, int]] = field(default_factory=dict)
 
     def header(self, name: str) -> str:
         """Return what the table calls one of `NAMES`."""
@@ -53,20 +100,72 @@ class ColumnMap:
 def load_map(path: Path) -> ColumnMap:
     """Read a map; raises `ImportTableError` that names the key."""
     file = TomlReader(path, ImportTableError, "map")
-    file.known(file.table, KEYS)
-    columns, units, constants = (file.section(name) for name in ("columns", "units", "constants"))
+    table = file.table
+    file.known(table, KEYS)
+    columns, units, constants, ids = (file.section(name) for name in ("columns", "units", "constants", "ids"))
     file.known(columns, NAMES, "columns.")
     file.known(constants, NAMES, "constants.")
-    file.known(units, ("stamps", "time"), "units.")
+    file.known(units, ("stamps", "time", "distance"), "units.")
     for name, value in columns.items():
         file.check(f"columns.{name}", value, isinstance(value, str), "the name of a column")
     for name, value in constants.items():
-        file.check(f"constants.{name}", value, is_number(value), "a finite number")
+        good = is_number(value) or (name in IDS and isinstance(value, str))
+        file.check(f"constants.{name}", value, good, "a finite number")
+    for name, value in ids.items():
+        file.check(f"ids.{name}", value, _is_id(value), f"a whole number from 0 to {LARGEST_ID}")
+    within = table.get("within_s", 1.0)
+    file.check("within_s", within, is_number(within) and within > 0, "seconds")
     return ColumnMap(
-        bits=file.choice("bits", file.table.get("bits", 32), (32, 40)),
-        protocol=file.choice("protocol", file.table.get("protocol"), (None, *PROTOCOLS)),
+        layout=file.choice("layout", table.get("layout"), (None, *LAYOUTS)),
+        bits=file.choice("bits", table.get("bits"), (None, *BITS)),
+        counter=file.choice("counter", table.get("counter"), (None, *COUNTERS)),
+        protocol=file.choice("protocol", table.get("protocol"), (None, *PROTOCOLS)),
+        delimiter=file.choice("delimiter", table.get("delimiter"), (None, *DELIMITERS)),
+        decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
+        within_s=float(within),
         columns=columns,
-        stamp_unit=file.choice("units.stamps", units.get("stamps", "ticks"), STAMP_UNITS),
-        time_unit=file.choice("units.time", units.get("time", "s"), TIME_UNITS),
-        constants={name: float(value) for name, value in constants.items()},
+        ticks_per_unit=_ticks_per_unit(file, units.get("stamps", "ticks")),
+        time_unit=file.choice("units.time", units.get("time"), (None, ISO, *TIME_UNITS)),
+        metres_per_unit=DISTANCE_UNITS[file.choice("units.distance", units.get("distance", "m"), DISTANCE_UNITS)],
+        constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
+        ids=ids,
+        antenna_delays=_antenna_delays(file),
     )
+
+
+def _is_id(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_ID
+
+
+def _ticks_per_unit(file: TomlReader, unit: Any) -> float:
+    if is_number(unit) and unit > 0:
+        return float(unit * TICKS_PER_SECOND)
+    return STAMP_UNITS[file.choice("units.stamps", unit, STAMP_UNITS)]
+
+
+def _antenna_delays(file: TomlReader) -> dict[int | None, dict[str, int]]:
+    section = file.section("antenna_delays")
+    if not section:
+        return {}
+    file.known(section, ("unit", "tx", "rx", "tags"), "antenna_delays.")
+    unit = file.choice("antenna_delays.unit", section.get("unit", "ticks"), ("ticks", "ns"))
+    scale = STAMP_UNITS[unit]
+    found: dict[int | None, dict[str, int]] = {None: _registers(file, "antenna_delays", section, scale)}
+    tags = section.get("tags", {})
+    file.check("antenna_delays.tags", tags, isinstance(tags, dict), "a table for each device")
+    for name, row in tags.items():
+        where = f"antenna_delays.tags.{name}"
+        file.check(where, row, isinstance(row, dict) and name.isdecimal(), "a table with tx and rx, named by an id")
+        file.known(row, ("tx", "rx"), f"{where}.")
+        found[int(name)] = _registers(file, where, row, scale)
+    return found
+
+
+def _registers(file: TomlReader, where: str, row: dict[str, Any], scale: float) -> dict[str, int]:
+    found = {}
+    for name in ("tx", "rx"):
+        value = row.get(name, 0)
+        good = is_number(value) and 0 <= value * scale <= REGISTER_MAX
+        file.check(f"{where}.{name}", value, good, f"a delay of 0 to {REGISTER_MAX} ticks")
+        found[name] = round(value * scale)
+    return found

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.table import CsvTable
+from uwblink.importers.stamps import NEVER, clocks, to_ticks, whole
+from uwblink.importers.table import Table
 from uwblink.recording.schema import CirRow, Fault, Poses
 from uwblink.ticks import REPORT_BITS, TICKS_PER_SECOND
 from uwblink.twr import STAMPS, Exchanges
@@ -33,13 +34,7 @@ _OVERHEARD: Final = {
     **{f"skew{k}_n_ppm": f"skew{k}_n" for k in (1, 2)},
 }
 _LISTENER_STAMPS: Final = ("rx1", "rx2", "rx3")
-_CLOCKS: Final = (("tx1", "rx2", "rx3"), ("rx1", "tx2", "tx3"))
-"""The stamps of an exchange by the clock that they were taken with."""
-
-_MASK: Final = (1 << REPORT_BITS) - 1
-_NEVER: Final = np.iinfo(np.int64).min
-"""In place of a whole number that is missing; rows with it are left out."""
-
+_CLOCKS: Final = clocks("ds")
 _OPTIONAL: Final = ("_dbm", "_ppm", "measured_m")
 
 
@@ -81,7 +76,7 @@ def read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
     return exchanges, measured
 
 
-def _exchange_rows(table: CsvTable) -> Columns:
+def _exchange_rows(table: Table) -> Columns:
     raw = "_raw" if "tx1_raw" in table.names else ""
     cells = _cells(
         table,
@@ -102,17 +97,17 @@ def read_overheard(flight: Flight) -> Columns:
     return _collected(flight, "uwb_passive.csv", _overheard_rows, ("listener", "initiator", "target", "rx1"))
 
 
-def _overheard_rows(table: CsvTable) -> Columns:
+def _overheard_rows(table: Table) -> Columns:
     raw = "_raw" if "rx1_raw" in table.names else ""
     own = {name: f"{name}{raw}" for name in _LISTENER_STAMPS}
     neighbours = {f"{name}_n": f"{name}{raw}_n" for name in STAMPS}
     ids = {"listener": "my_id", "initiator": "from_id", "target": "to_id"}
     required = ("timestamp", *ids.values(), *own.values(), *neighbours.values())
     cells = _cells(table, required, tuple(_OVERHEARD.values()))
-    clocks = (_LISTENER_STAMPS, *(tuple(f"{name}_n" for name in clock) for clock in _CLOCKS))
+    by_clock = (_LISTENER_STAMPS, *(tuple(f"{name}_n" for name in clock) for clock in _CLOCKS))
     return {
         **_ends(cells, ids),
-        **_ticks(cells, own | neighbours, clocks),
+        **_ticks(cells, own | neighbours, by_clock),
         **{name: cells[column] for name, column in _OVERHEARD.items()},
     }
 
@@ -131,7 +126,7 @@ def cir_rows(columns: Columns) -> list[CirRow]:
     return [CirRow(*row) for row in zip(*whole, columns["first_path_index"].tolist(), taps, strict=True)]
 
 
-def _cir_rows(table: CsvTable) -> Columns:
+def _cir_rows(table: Table) -> Columns:
     ids = {"board": "my_id", "initiator": "from_id", "target": "to_id"}
     cells = _cells(table, ("timestamp", *ids.values(), "idx"), ())
     taps = table.lists("cir")
@@ -155,7 +150,7 @@ def read_heights(flight: Flight) -> Columns:
 def _readings(flight: Flight, name: str, columns: Mapping[str, str]) -> Columns:
     """Return what a sensor of each robot read, in order of time; nothing where no robot has the file."""
 
-    def read(table: CsvTable) -> Columns:
+    def read(table: Table) -> Columns:
         cells = _cells(table, ("timestamp", *columns.values()), ())
         body = np.full(len(cells["timestamp"]), table.path.parent.name)
         return {"time_ns": _time_ns(cells), "body": body, **{n: cells[c] for n, c in columns.items()}}
@@ -178,7 +173,7 @@ def read_poses(flight: Flight) -> Poses:
     return Poses(columns["time_ns"][good], columns["body"][good], position[good], attitude[good] / norm[good, None])
 
 
-def _collected(flight: Flight, name: str, read: Callable[[CsvTable], Columns], key: tuple[str, ...] | None) -> Columns:
+def _collected(flight: Flight, name: str, read: Callable[[Table], Columns], key: tuple[str, ...] | None) -> Columns:
     """Return the rows of all robots' files of one name in order of time, each once by `key` and time.
 
     Rows in which a number is missing that is needed go to the faults.
@@ -188,7 +183,7 @@ def _collected(flight: Flight, name: str, read: Callable[[CsvTable], Columns], k
         path = robot / name
         if not path.exists():
             continue
-        with CsvTable(path) as table:
+        with Table(path) as table:
             columns = read(table)
         good = _usable(columns)
         for row in np.flatnonzero(~good):
@@ -212,13 +207,13 @@ def _usable(columns: Columns) -> Bools:
     good = np.ones(len(columns["time_ns"]), dtype=bool)
     for name, column in columns.items():
         if column.dtype.kind == "i":
-            good &= column != _NEVER
+            good &= column != NEVER
         elif column.dtype.kind == "f" and not name.endswith(_OPTIONAL):
             good &= np.isfinite(column)
     return good
 
 
-def _cells(table: CsvTable, required: Iterable[str], optional: Iterable[str]) -> dict[str, Floats]:
+def _cells(table: Table, required: Iterable[str], optional: Iterable[str]) -> dict[str, Floats]:
     """Return columns as numbers; those that are optional are NaN where the table does not have them."""
     extra = list(optional)
     needed = list(required)
@@ -227,14 +222,8 @@ def _cells(table: CsvTable, required: Iterable[str], optional: Iterable[str]) ->
     return cells | {name: np.full(count, np.nan) for name in extra if name not in cells}
 
 
-def _whole(values: Floats) -> Ints:
-    """Return numbers rounded to whole ones, `_NEVER` where there is none."""
-    good = np.isfinite(values) & (np.abs(values) < 2.0**62)
-    return np.where(good, np.rint(np.where(good, values, 0.0)), _NEVER).astype(np.int64)
-
-
 def _time_ns(cells: dict[str, Floats]) -> Ints:
-    return _whole(cells["timestamp"] * 1e9)
+    return whole(cells["timestamp"] * 1e9)
 
 
 def _ends(cells: dict[str, Floats], ids: Mapping[str, str]) -> Columns:
@@ -244,25 +233,11 @@ def _ends(cells: dict[str, Floats], ids: Mapping[str, str]) -> Columns:
         values = cells[column]
         with np.errstate(invalid="ignore"):
             good = (values >= 0) & (values <= 65_535) & (values == np.rint(values))
-        found[name] = _whole(np.where(good, values, np.nan))
+        found[name] = whole(np.where(good, values, np.nan))
     return found
 
 
-def _ticks(cells: dict[str, Floats], names: Mapping[str, str], clocks: Iterable[tuple[str, ...]]) -> Columns:
-    """Return stamps in unwrapped nanoseconds as ticks of the boards' counter.
-
-    The nanoseconds were multiplied, added up and written as floats, so a long flight is off by a fraction of a tick
-    that grows; what lies between two stamps of one clock is not. Hence the first stamp of each clock is rounded, and
-    the others by their distance from it.
-    """
-    found: Columns = {}
-    scale = TICKS_PER_SECOND * 1e-9
-    for first, *others in clocks:
-        start = cells[names[first]]
-        ticks = _whole(start * scale)
-        found[first] = np.where(ticks == _NEVER, _NEVER, ticks & _MASK)
-        for name in others:
-            between = _whole((cells[names[name]] - start) * scale)
-            missing = (ticks == _NEVER) | (between == _NEVER)
-            found[name] = np.where(missing, _NEVER, (ticks + between) & _MASK)
-    return found
+def _ticks(cells: dict[str, Floats], names: Mapping[str, str], by_clock: Iterable[tuple[str, ...]]) -> Columns:
+    """Return stamps in unwrapped nanoseconds as ticks of the boards' counter."""
+    named = {name: cells[column] for name, column in names.items()}
+    return {**to_ticks(named, by_clock, TICKS_PER_SECOND * 1e-9, REPORT_BITS)}

@@ -321,6 +321,12 @@ class Recording:
         """Return what height sensors read as columns of the table `height`, in order of time."""
         return self._readings("height")
 
+    def powers(self) -> dict[str, NDArray[Any]]:
+        """Return the total powers of exchanges as columns of the table `powers`, in order of time; NaN where none."""
+        found = {name: _filled(column) for name, column in self.columns("powers").items()}
+        order = np.argsort(found["time_ns"], kind="stable")
+        return {name: column[order] for name, column in found.items()}
+
     def _readings(self, table: str) -> dict[str, NDArray[Any]]:
         found = self.columns(table)
         order = np.argsort(_filled(found["time_ns"]), kind="stable")
@@ -375,6 +381,7 @@ _APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
     "faults": Recording.append_faults,
     "imu": lambda recording, columns: recording.append_columns("imu", columns),
     "height": lambda recording, columns: recording.append_columns("height", columns),
+    "powers": lambda recording, columns: recording.append_columns("powers", columns),
 }
 
 _EMPTY: Final = {"BIGINT": np.int64, "DOUBLE": np.float64, "USMALLINT": np.uint16}

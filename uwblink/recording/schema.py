@@ -68,12 +68,18 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         **dict.fromkeys(("wx", "wy", "wz", "ax", "ay", "az"), "DOUBLE"),
     },
     "height": {"time_ns": "BIGINT", "body": "VARCHAR", "height_m": "DOUBLE"},
+    "powers": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("initiator", "target"), "USMALLINT"),
+        **dict.fromkeys(("rxp1_dbm", "rxp2_dbm"), "DOUBLE"),
+    },
 }
 
 ADDED_LATER: Final = {
     "faults": frozenset({"initiator", "target"}),
     "imu": frozenset(TABLES["imu"]),
     "height": frozenset(TABLES["height"]),
+    "powers": frozenset(TABLES["powers"]),
 }
 """Columns that a recording may lack, because it is older than they are; where all of a table's are, the table."""
 

@@ -31,6 +31,7 @@ INSTEAD = {
         "body": np.array(["z"]),
         **{n: np.ones(1) for n in TABLES["imu"] if n[0] in "wa"},
     },
+    "powers": {name: np.array([1.0]) for name in TABLES["powers"]},
     "height": {"time_ns": np.array([3]), "body": np.array(["z"]), "height_m": np.array([np.nan])},
 }
 
@@ -48,6 +49,7 @@ def full(tmp_path):
         r.append_frames([FrameRow(9, "1", "in", bytes(range(256))), FrameRow(8, "2", "out", b"C01\r")])
         readings = {"time_ns": np.array([7, 6]), "body": np.array(["a", "b"])}
         r.append_columns("imu", {name: np.array([1.5, 2.5]) for name in TABLES["imu"]} | readings)
+        r.append_columns("powers", {name: np.array([2, 1]) for name in TABLES["powers"]})
         r.append_columns("height", {"height_m": np.array([0.5, 0.25])} | readings)
         r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "failed exchange", "é", 2, 1)])
     with duckdb.connect(str(path)) as db:

@@ -1,0 +1,401 @@
+"""Tables as people have them: their own writer here, which shares nothing with the importer, and planted values."""
+
+import csv
+import gzip
+import json
+
+import duckdb
+import numpy as np
+import pytest
+
+from uwblink.errors import ImportTableError
+from uwblink.importers import import_recording
+from uwblink.importers.exchange_tables import read_table, read_tables
+from uwblink.recording.contents import load
+
+TICKS = 128 * 499_200_000
+AIR = 299_702_547.0
+HEADER = ["time_s", "from_id", "to_id", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3", "fpp1", "fpp2"]
+
+
+def flights(count=60, third="target", bits=32, seed=1):
+    """Exchanges between tags 1, 2, 3 as unwrapped ticks of two clocks, and their true distances (whole ticks)."""
+    random = np.random.default_rng(seed)
+    rows = []
+    for k in range(count):
+        one, two = [(1, 2), (2, 3), (3, 1)][k % 3]
+        flight = int(random.integers(200, 3000))
+        mine, other = (int(random.integers(2**41)) for _ in range(2))
+        reply, later = int(random.integers(20_000_000, 40_000_000)), int(random.integers(80_000_000, 90_000_000))
+        tx1, rx1 = mine, other + flight
+        tx2 = rx1 + reply
+        rx2 = tx1 + 2 * flight + reply
+        tx3 = (tx2 if third == "target" else rx2) + later
+        rx3 = tx3 - other + mine + flight if third == "target" else tx3 - mine + other + flight
+        stamps = dict(zip(HEADER[3:9], (tx1, rx1, tx2, rx2, tx3, rx3), strict=True))
+        row = {"time_s": 10 + k / 4, "from_id": one, "to_id": two, **stamps}
+        rows.append({**row, "fpp1": -80 - k / 8, "fpp2": -81 - k / 8, "truth": flight / TICKS * AIR})
+    return rows
+
+
+def wrapped(rows, bits=32):
+    return [{n: v % 2**bits if n in HEADER[3:9] else v for n, v in row.items() if n != "truth"} for row in rows]
+
+
+def write(path, rows, delimiter=",", text=str):
+    names = list(rows[0])
+    lines = [delimiter.join(names), *(delimiter.join(text(row[n]) for n in names) for row in rows)]
+    data = ("\n".join(lines) + "\n").encode()
+    path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
+    return path
+
+
+def mapped(tmp_path, text):
+    (tmp_path / "map.toml").write_text(text)
+    return tmp_path / "map.toml"
+
+
+def stamps(exchanges):
+    return [[int(getattr(exchanges, n)[k]) for n in HEADER[3:9]] for k in range(len(exchanges))]
+
+
+def same(found, rows, bits=32):
+    assert found.exchanges.bits == bits
+    assert stamps(found.exchanges) == [[row[n] % 2**bits for n in HEADER[3:9]] for row in rows]
+    np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", "|"])
+def test_any_delimiter(tmp_path, delimiter):
+    rows = flights()
+    same(read_table(write(tmp_path / "t.csv", wrapped(rows), delimiter)), rows)
+
+
+def test_a_byte_order_mark_comments_and_windows_lines(tmp_path):
+    rows = flights()
+    write(tmp_path / "t.csv", wrapped(rows))
+    text = "\ufeff# what this is\n" + (tmp_path / "t.csv").read_text()
+    (tmp_path / "t.csv").write_bytes(text.replace("\n", "\r\n").encode())
+    same(read_table(tmp_path / "t.csv"), rows)
+
+
+def test_decimal_comma(tmp_path):
+    rows = flights()
+    write(tmp_path / "t.csv.gz", wrapped(rows), ";", lambda value: str(value).replace(".", ","))
+    found = read_table(tmp_path / "t.csv.gz")
+    same(found, rows)
+    assert found.exchanges.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
+    assert found.exchanges.time_ns[1] == 10_250_000_000
+
+
+def test_parquet_and_json_lines(tmp_path):
+    rows = flights()
+    write(tmp_path / "t.csv", wrapped(rows))
+    with duckdb.connect() as db:
+        db.read_csv(str(tmp_path / "t.csv")).write_parquet(str(tmp_path / "t.parquet"))
+    same(read_table(tmp_path / "t.parquet"), rows)
+    nested = [{"time_s": r["time_s"], "ids": {"a/b": r["from_id"], "to": r["to_id"]}, "s": r} for r in wrapped(rows)]
+    (tmp_path / "t.jsonl").write_text("\n".join(json.dumps(row) for row in nested) + "\n")
+    names = "\n".join(f'{n} = "s.{n}"' for n in HEADER[3:])
+    found = read_table(
+        tmp_path / "t.jsonl", mapped(tmp_path, f'[columns]\nfrom_id = "ids.a/b"\nto_id = "ids.to"\n{names}\n')
+    )
+    same(found, rows)
+
+
+def test_several_files_are_one_table(tmp_path):
+    rows = flights()
+    paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
+    same(read_tables(paths), rows[0::2] + rows[1::2])
+    assert len(read_table(tmp_path).exchanges) == len(rows)
+    write(tmp_path / "2.csv", [{"time_s": 1, "from_id": 1, "to_id": 2, "range_m": 3}])
+    with pytest.raises(ImportTableError, match="other columns than"):
+        read_table(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("ns", 1e9 / TICKS), ("us", 1e6 / TICKS), ("s", 1 / TICKS), (repr(1 / TICKS), 1.0)]
+)
+def test_unwrapped_stamps_in_any_unit(tmp_path, unit, scale):
+    rows = flights()
+    scaled = [{n: repr(v * scale) if n in HEADER[3:9] else v for n, v in row.items() if n != "truth"} for row in rows]
+    write(tmp_path / "t.csv", scaled)
+    unit = unit if unit[0].isdigit() else f'"{unit}"'
+    found = read_table(tmp_path / "t.csv", mapped(tmp_path, f"[units]\nstamps = {unit}\n"))
+    # The first stamp of a clock is off by what a float of so many seconds holds; what follows it is not.
+    np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
+    assert any("unwrapped" in note for note in found.meta["notes"])
+
+
+def test_unwrapped_ticks_that_no_float_holds(tmp_path):
+    rows = [{n: v + 2**60 if n in HEADER[3:9] else v for n, v in row.items()} for row in flights()]
+    found = read_table(write(tmp_path / "t.csv", [{n: row[n] for n in HEADER} for row in rows]))
+    np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
+
+
+@pytest.mark.parametrize("bits", [32, 40])
+def test_the_width_is_found_and_signed_stamps_are_read(tmp_path, bits):
+    rows = flights()
+    same(read_table(write(tmp_path / "t.csv", wrapped(rows, bits))), rows, bits)
+    half, whole = 2 ** (bits - 1), 2**bits
+    signed = [
+        {n: (v + half) % whole - half if n in HEADER[3:9] else v for n, v in row.items()} for row in wrapped(rows, bits)
+    ]
+    found = read_table(write(tmp_path / "s.csv", signed))
+    same(found, rows, bits)
+    assert f"stamps are signed, and are taken modulo 2^{bits}" in found.meta["notes"]
+
+
+def test_the_protocol_is_found_where_the_columns_do_not_tell(tmp_path):
+    rows = flights(third="initiator")
+    write(tmp_path / "t.csv", wrapped(rows))
+    found = read_table(tmp_path / "t.csv")
+    same(found, rows)
+    assert set(found.exchanges.protocol) == {"ds-alt"}
+    assert any('read with protocol = "ds-alt"' in note for note in found.meta["notes"])
+    with pytest.raises(ImportTableError, match='with protocol = "ds-alt" they are'):
+        read_table(tmp_path / "t.csv", mapped(tmp_path, 'protocol = "ds"'))
+
+
+def test_swapped_columns_are_named(tmp_path):
+    rows = [{**row, "rx1": row["rx2"], "rx2": row["rx1"]} for row in wrapped(flights())]
+    with pytest.raises(ImportTableError, match="the columns of rx1 and rx2 exchanged"):
+        read_table(write(tmp_path / "t.csv", rows))
+    reversed_roles = [
+        {**row, "tx1": row["rx1"], "rx1": row["tx1"], "tx2": row["rx2"], "rx2": row["tx2"]}
+        for row in [{n: row[n] for n in HEADER[:7]} for row in wrapped(flights())]
+    ]
+    with pytest.raises(ImportTableError, match="tx1 and rx1 exchanged and the columns of tx2 and rx2"):
+        read_table(write(tmp_path / "r.csv", reversed_roles))
+
+
+def test_corrupt_rows_are_faults_with_their_place(tmp_path):
+    rows = flights(count=200)
+    write(tmp_path / "t.csv", wrapped(rows))
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    lines[10] = lines[10].replace(",", ",x", 1)  # an id that is none
+    lines[20] = ",".join(lines[20].split(",")[:6])  # a short row
+    lines[30] += ",1,2,3"  # a long one
+    lines[40] = lines[40].rsplit(",", 2)[0] + ",,nan"  # powers are optional
+    lines[50] = lines[50].replace(f",{rows[49]['rx2'] % 2**32},", ",-5.5,")
+    lines.insert(60, "")
+    lines[70] = lines[70].replace(str(rows[68]["time_s"]) + ",", "soon,", 1)
+    (tmp_path / "t.csv").write_text("\n".join(lines) + "\n")
+    found = read_table(tmp_path / "t.csv")
+    details = sorted(fault.detail for fault in found.faults)
+    assert [detail.split(",")[0].split(":")[0] for detail in details] == [
+        "row 11",
+        "row 21",
+        "row 31",
+        "row 51",
+        "row 71",
+    ]
+    assert "column 'from_id': found 'x" in details[0]
+    assert "column 'tx2': found ''" in details[1] or "column 'rx2': found ''" in details[1]
+    assert details[2] == "row 31: more cells than the header has"
+    assert "found '-5.5'" in details[3]
+    assert "found 'soon', expected a time" in details[4]
+    assert len(found.exchanges) == 195
+    assert np.isnan(found.exchanges.fpp2_dbm).sum() == 1
+    kept = [row for k, row in enumerate(rows) if k not in (9, 19, 29, 49, 68)]
+    same(found, kept)
+    assert any(note.startswith("5 of ") for note in found.meta["notes"])
+
+
+def test_iso_times_names_and_programmed_delays(tmp_path):
+    rows = flights()
+    named = [
+        {**row, "time_s": f"2024-05-06T07:08:{10 + k % 50:02d}.000000{k:03d}+02:00", "from_id": f"AA:{row['from_id']}"}
+        for k, row in enumerate(wrapped(rows))
+    ]
+    text = '[ids]\n"AA:1" = 77\n[antenna_delays]\nunit = "ns"\ntx = 257.0\nrx = 258.0\n'
+    text += "[antenna_delays.tags.77]\ntx = 1.0\n"
+    found = read_table(write(tmp_path / "t.csv", named), mapped(tmp_path, text))
+    assert found.meta["configured_antenna_delay_ticks"] == {"tx": 16422, "rx": 16486}
+    assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"77": {"tx": 64, "rx": 0}}
+    assert found.meta["tag_names"]["77"] == "AA:1"
+    assert found.exchanges.initiator[0] == 77
+    assert {tag.body for tag in found.tags} >= {"AA:1", "AA:2", "AA:3"}
+    # 07:08:10 two hours east of Greenwich; zones are shifts of a time whose fraction DuckDB keeps to microseconds.
+    assert abs(int(found.exchanges.time_ns[0]) - 1714972090_000000000) < 1000
+
+
+def test_large_ids_get_numbers(tmp_path):
+    rows = [{**row, "from_id": row["from_id"] + 2**60, "to_id": row["to_id"] + 2**60} for row in wrapped(flights())]
+    found = read_table(write(tmp_path / "t.csv", rows))
+    assert set(found.exchanges.initiator) == {1, 2, 3}
+    assert found.meta["tag_names"]["1"] == str(2**60 + 1)
+
+
+def test_no_time_at_all(tmp_path):
+    rows = [{n: v for n, v in row.items() if n != "time_s"} for row in wrapped(flights())]
+    found = read_table(write(tmp_path / "t.csv", rows))
+    assert found.exchanges.time_ns[:3].tolist() == [0, 1_000_000, 2_000_000]
+    assert any("no time" in note for note in found.meta["notes"])
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1e3), ("cm", 1e2), ("ft", 1 / 0.3048)])
+def test_ranges_without_stamps_with_total_powers_and_places(tmp_path, unit, scale):
+    random = np.random.default_rng(4)
+    anchor, places = np.array([4.0, 1.0, 2.0]), random.normal(size=(30, 3))
+    rows = []
+    for k, place in enumerate(places):
+        row = {
+            "t": k * 100,
+            "from_id": 7,
+            "to_id": 8,
+            "range_m": repr(float(np.linalg.norm(place - anchor) + 0.25) * scale),
+        }
+        row |= {f"from_{a}_m": repr(float(v) * scale) for a, v in zip("xyz", place, strict=True)}
+        row |= {f"to_{a}_m": repr(float(v) * scale) for a, v in zip("xyz", anchor, strict=True)}
+        rows.append({**row, "rxp2": -79.5, "fpp2": -83.25})
+    text = f'[columns]\ntime_s = "t"\n[units]\ntime = "ms"\ndistance = "{unit}"\n'
+    import_recording(write(tmp_path / "t.csv", rows), tmp_path / "o.uwb", map_file=mapped(tmp_path, text))
+    found = load(tmp_path / "o.uwb")
+    e = found.exchanges
+    from uwblink.twr import raw_range
+
+    np.testing.assert_allclose(raw_range(e) - e.truth_m, 0.25, atol=1e-9)
+    assert e.time_ns[1] == 100_000_000
+    assert (found.powers["rxp2_dbm"][3], e.fpp2_dbm[3]) == (-79.5, -83.25)
+    assert np.isnan(found.powers["rxp1_dbm"]).all()
+    assert (found.poses.body == "tag8").sum() == 1
+    assert (found.poses.body == "tag7").sum() == 30
+
+
+def as_messages(rows, third="target", words=None):
+    found = []
+    for k, row in enumerate(rows):
+        for n in (1, 2, 3):
+            forward = n == 1 or (n == 3 and third == "initiator")
+            ends = (row["from_id"], row["to_id"])
+            sender, receiver = ends if forward else ends[::-1]
+            line = {
+                "time_s": row["time_s"] + n / 1000,
+                "seq": k % 8,
+                "from_id": sender,
+                "to_id": receiver,
+                "message": n,
+            }
+            found.append({**line, "tx": row[f"tx{n}"], "rx": row[f"rx{n}"], "fpp": row.get(f"fpp{n}", "")})
+    return found
+
+
+@pytest.mark.parametrize("third", ["target", "initiator"])
+@pytest.mark.parametrize("without", [(), ("seq",), ("message",), ("seq", "message"), ("time_s",)])
+def test_a_row_a_message(tmp_path, third, without):
+    rows = flights(third=third)
+    lines = [{n: v for n, v in line.items() if n not in without} for line in as_messages(wrapped(rows), third)]
+    if "time_s" not in without:
+        np.random.default_rng(5).shuffle(lines)
+    sequence = "" if "seq" in without else 'sequence = "seq"\n'
+    text = f"within_s = 0.1\n[columns]\n{sequence}"
+    found = read_table(write(tmp_path / "t.csv", lines), mapped(tmp_path, text))
+    assert not found.faults
+    order = np.lexsort((found.exchanges.tx1,))
+    expected = sorted(rows, key=lambda row: row["tx1"] % 2**32)
+    assert [stamps(found.exchanges)[k] for k in order] == [[r[n] % 2**32 for n in HEADER[3:9]] for r in expected]
+    assert found.exchanges.initiator[order].tolist() == [row["from_id"] for row in expected]
+    assert found.exchanges.fpp2_dbm[order].tolist() == [row["fpp2"] for row in expected]
+    assert set(found.exchanges.protocol) == {"ds" if third == "target" else "ds-alt"}
+
+
+def test_a_message_that_got_lost_is_a_fault_not_another_exchange(tmp_path):
+    rows = flights()
+    lines = as_messages(wrapped(rows))
+    del lines[7]  # message 2 of the third exchange
+    text = 'within_s = 0.1\n[columns]\nsequence = "seq"\n'
+    found = read_table(write(tmp_path / "t.csv", lines), mapped(tmp_path, text))
+    assert len(found.exchanges) == len(rows) - 1
+    assert len(found.faults) == 1
+    assert found.faults[0].detail.startswith("row 8,")
+
+
+def test_two_rows_an_exchange(tmp_path):
+    rows = flights()
+    lines = []
+    for k, row in enumerate(wrapped(rows)):
+        common = {"time_s": row["time_s"], "sequence": k, "from_id": row["from_id"], "to_id": row["to_id"]}
+        names = HEADER[3:9]
+        lines.append(common | {n: row[n] if n in ("rx1", "tx2", "tx3") else "" for n in names})
+        lines.append(common | {n: "" if n in ("rx1", "tx2", "tx3") else row[n] for n in names})
+    found = read_table(write(tmp_path / "t.csv", lines), mapped(tmp_path, 'layout = "parts"'))
+    order = np.argsort(found.exchanges.time_ns)
+    assert [stamps(found.exchanges)[k] for k in order] == [[row[n] % 2**32 for n in HEADER[3:9]] for row in rows]
+
+
+@pytest.mark.parametrize(
+    "name", ['a"; DROP TABLE x; --', "c0'); ATTACH 'evil.db'; --", "{0}", "?", "a' OR 1=1 --", "$(touch evil)", "\\"]
+)
+def test_a_hostile_name_of_a_column_is_a_name(tmp_path, name, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = flights()
+    header = [name if n == "tx1" else n for n in HEADER]
+    with (tmp_path / "t.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerows([header, *([row[n] for n in HEADER] for row in wrapped(rows))])
+    quoted = json.dumps(name)
+    found = read_table(tmp_path / "t.csv", mapped(tmp_path, f"[columns]\ntx1 = {quoted}\n"))
+    same(found, rows)
+    (tmp_path / "t.jsonl").write_text(
+        "\n".join(json.dumps(dict(zip(header, (row[n] for n in HEADER), strict=True))) for row in wrapped(rows)) + "\n"
+    )
+    same(read_table(tmp_path / "t.jsonl", tmp_path / "map.toml"), rows)
+    with duckdb.connect() as db:
+        db.read_csv(str(tmp_path / "t.csv"), header=True).write_parquet(str(tmp_path / "t.parquet"))
+    same(read_table(tmp_path / "t.parquet", tmp_path / "map.toml"), rows)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.toml", "t.csv", "t.jsonl", "t.parquet"]
+
+
+def test_duckdb_may_open_the_named_file_only(tmp_path):
+    from uwblink.importers.table import Table
+
+    write(tmp_path / "t.csv", wrapped(flights()))
+    (tmp_path / "secret.csv").write_text("a\n1\n")
+    with Table(tmp_path / "t.csv") as table:
+        for query in (f"SELECT * FROM read_csv('{tmp_path}/secret.csv')", f"COPY (SELECT 1) TO '{tmp_path}/x.csv'"):
+            with pytest.raises(duckdb.Error):
+                table._db.execute(query)
+    assert not (tmp_path / "x.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "fragment"),
+    [
+        ("bits = 33", "bits: found 33"),
+        ('layout = "tall"', "layout: found 'tall'"),
+        ("[units]\nstamps = -1.0", "units.stamps"),
+        ('[units]\ndistance = "furlong"', "units.distance"),
+        ("within_s = 0", "within_s: found 0"),
+        ('[ids]\n"a" = 70000', "ids.a: found 70000"),
+        ("[antenna_delays]\ntx = 1e9", "antenna_delays.tx"),
+        ("[antenna_delays.tags.x]\ntx = 1", "antenna_delays.tags.x"),
+        ('[columns]\ntx1 = "nothing"', "column 'nothing' is missing"),
+        ('delimiter = "--"', "delimiter: found '--'"),
+        ('[columns]\nevil = "tx1"', "columns.evil: unknown key"),
+    ],
+)
+def test_maps_that_cannot_be(tmp_path, text, fragment):
+    write(tmp_path / "t.csv", wrapped(flights()))
+    with pytest.raises(ImportTableError) as caught:
+        import_recording(tmp_path / "t.csv", tmp_path / "o.uwb", map_file=mapped(tmp_path, text))
+    assert fragment in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "o.uwb").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("t.parquet", b"PAR1 no"),
+        ("t.jsonl", b"no\n"),
+        ("t.csv.gz", b"no"),
+        ("t.csv", b"\xff\xfe\x00"),
+        ("t.csv", b"\n"),
+    ],
+)
+def test_files_that_cannot_be(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ImportTableError) as caught:
+        read_table(tmp_path / name)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,111 @@
+"""Long tables, in which an exchange has several rows, as rows of exchanges.
+
+Either each row is a message with the stamps of its sender and its receiver, or each row has some of the columns of an
+exchange, as where both devices report. Rows belong together by pair and sequence number, or by pair and time.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.importers.stamps import NEVER
+from uwblink.importers.table_rows import Bad, Rows, take
+from uwblink.twr import STAMPS
+
+_OF_MESSAGE: Final = {"fpp": "fpp", "rxp": "rxp", "skew": "skew"}
+
+
+def from_messages(rows: Rows) -> tuple[Rows, str, list[Bad]]:
+    """Return exchanges of rows that are messages, their protocol, and the rows that belong to no whole exchange.
+
+    Messages are 1, 2 and 3, by a column or by their order. The first one's sender is the initiator; who sends the third
+    tells "ds" from "ds-alt".
+    """
+    order, group, place = _groups(rows)
+    rows = take(rows, order)
+    count = int(group[-1]) + 1 if len(group) else 0
+    start = np.searchsorted(group, np.arange(count))
+    initiator, target = rows.ids["from_id"][start], rows.ids["to_id"][start]
+    sender = rows.ids["from_id"]
+    third_by_initiator = (place == 3) & (sender == initiator[group])
+    three = bool(2 * np.count_nonzero(place == 3) > np.count_nonzero(place == 2))
+    alternative = bool(2 * np.count_nonzero(third_by_initiator) > np.count_nonzero(place == 3))
+    protocol = "ss" if not three else "ds-alt" if alternative else "ds"
+    expected = np.where(place == 2, target[group], initiator[group])
+    expected = np.where((place == 3) & (not alternative), target[group], expected)
+    good = (sender == expected) & (place <= (3 if three else 2))
+    cells = {name: column[start] for name, column in rows.cells.items() if name in ("gt_range_m", "range_m")}
+    for k in (1, 2, 3)[: 3 if three else 2]:
+        mine = good & (place == k)
+        cells |= {
+            f"tx{k}": _put(rows.cells["tx"], group, mine, count),
+            f"rx{k}": _put(rows.cells["rx"], group, mine, count),
+        }
+        if k < 3:
+            named = {f"{ours}{k}": theirs for theirs, ours in _OF_MESSAGE.items() if theirs in rows.cells}
+            cells |= {name: _put(rows.cells[theirs], group, mine, count) for name, theirs in named.items()}
+    counts = np.bincount(group, weights=good, minlength=count)
+    whole = counts == (3 if three else 2)
+    bad = [Bad(int(rows.origin[row]), "message", "messages 1, 2 (and 3) of one exchange") for row in start[~whole]]
+    exchanges = take(rows, start)
+    exchanges.cells, exchanges.ids = cells, {"from_id": initiator, "to_id": target}
+    return take(exchanges, np.flatnonzero(whole)), protocol, bad
+
+
+def from_parts(rows: Rows) -> tuple[Rows, list[Bad]]:
+    """Return exchanges of rows that each have some of the columns, and the rows in which one has two values."""
+    order, group, _ = _groups(rows, numbered=False)
+    rows = take(rows, order)
+    count = int(group[-1]) + 1 if len(group) else 0
+    start = np.searchsorted(group, np.arange(count))
+    # The initiator is whoever the row with its first stamp names first.
+    leads = np.isfinite(rows.cells["tx1"]) if "tx1" in rows.cells else np.zeros(len(rows), dtype=bool)
+    lead = start.copy()
+    lead[group[leads]] = np.flatnonzero(leads)
+    exchanges = take(rows, lead)
+    exchanges.cells = {name: np.fmax.reduceat(column, start) for name, column in rows.cells.items()} if count else {}
+    twice = np.zeros(count, dtype=bool)
+    for name in STAMPS:
+        if name in rows.cells:
+            twice |= np.bincount(group, weights=np.isfinite(rows.cells[name]), minlength=count) > 1
+    bad = [Bad(int(rows.origin[row]), "sequence", "one value of each column an exchange") for row in start[twice]]
+    return take(exchanges, np.flatnonzero(~twice)), bad
+
+
+def _groups(rows: Rows, *, numbered: bool = True) -> tuple[Ints, Ints, Ints]:
+    """Return the order in which rows of one exchange stand together, their exchange, and their message, (n,) each."""
+    low, high = (f(rows.ids["from_id"], rows.ids["to_id"]) for f in (np.minimum, np.maximum))
+    time = rows.time_ns if rows.time_ns is not None else np.arange(len(rows), dtype=np.int64)
+    keys = [low, high]
+    if "sequence" in rows.cells:
+        keys.append(np.nan_to_num(rows.cells["sequence"], nan=-1).astype(np.int64))
+    order = np.lexsort((np.arange(len(rows)), time, *reversed(keys)))
+    begins: Bools = np.ones(len(rows), dtype=bool)
+    begins[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    if rows.time_ns is not None:
+        apart = np.diff(time[order].astype(np.float64)) > rows.column_map.within_s * 1e9
+        begins[1:] |= apart
+    message: Floats | None = rows.cells.get("message") if numbered else None
+    if message is not None:
+        begins[1:] |= ~(np.diff(message[order]) > 0)
+    group = np.cumsum(begins) - 1
+    first = np.flatnonzero(begins)
+    place = np.arange(len(rows)) - first[group] + 1
+    if message is not None:
+        place = np.nan_to_num(message[order], nan=9).astype(np.int64)
+    return order, group, place
+
+
+def _put(values: Floats, group: Ints, mine: Bools, count: int) -> Floats:
+    found = np.full(count, np.nan)
+    found[group[mine]] = values[mine]
+    return found
+
+
+def has_ends(rows: Rows) -> Bools:
+    """Return which rows name two different devices, (n,)."""
+    one, other = rows.ids["from_id"], rows.ids["to_id"]
+    return np.asarray((one != NEVER) & (other != NEVER) & (one != other))

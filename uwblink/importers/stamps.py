@@ -1,0 +1,95 @@
+"""Stamps of strangers as ticks of one counter: any unit, wrapped, signed or unwrapped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+import numpy as np
+
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.protocols.table import PROTOCOLS
+from uwblink.twr import STAMPS
+
+NEVER: Final = np.iinfo(np.int64).min
+"""In place of a whole number that is missing."""
+
+MANY: Final = 0.01
+"""Share of rows beyond a counter's width from which on they are how the counter is written, not faults."""
+
+ENOUGH_ROWS: Final = 20
+
+
+def whole(values: Floats) -> Ints:
+    """Return numbers rounded to whole ones, `NEVER` where there is none."""
+    with np.errstate(invalid="ignore"):
+        good = np.abs(values) < 2.0**62
+    return np.where(good, np.rint(np.where(good, values, 0.0)), NEVER).astype(np.int64)
+
+
+def clocks(protocol: str) -> tuple[tuple[str, ...], ...]:
+    """Return the stamps of an exchange by the clock that they are taken with, the initiator's first."""
+    third = PROTOCOLS[protocol].third_sender
+    if third is None:
+        return ("tx1", "rx2"), ("rx1", "tx2")
+    return (
+        ("tx1", "rx2", "tx3" if third == "initiator" else "rx3"),
+        ("rx1", "tx2", "rx3" if third == "initiator" else "tx3"),
+    )
+
+
+def to_ticks(
+    cells: Mapping[str, Floats], by_clock: Iterable[tuple[str, ...]], ticks_per_unit: float, bits: int
+) -> dict[str, Ints]:
+    """Return stamps in any unit as ticks of a counter of `bits` bits, `NEVER` where one is missing.
+
+    Stamps that are no ticks were multiplied, added up and written as floats, so that a long record is off by a part of
+    a tick that grows; what lies between two stamps of one clock is not. Hence the first stamp of each clock is rounded,
+    and the others by their distance from it.
+    """
+    found: dict[str, Ints] = {}
+    mask = np.int64((1 << bits) - 1)
+    for first, *others in by_clock:
+        start = cells[first]
+        ticks = whole(start * ticks_per_unit)
+        found[first] = np.where(ticks == NEVER, NEVER, ticks & mask)
+        for name in others:
+            between = whole((cells[name] - start) * ticks_per_unit)
+            missing = (ticks == NEVER) | (between == NEVER)
+            found[name] = np.where(missing, NEVER, (ticks + between) & mask)
+    return found
+
+
+def how_counted(ticks: Mapping[str, Floats], bits: int | None, counter: str | None) -> tuple[int, str]:
+    """Return a counter's bits and how it is written, as far as they are not given, from stamps in ticks.
+
+    Numbers that fit 32 bits are taken for 32, larger ones for 40, and those that fit neither for unwrapped; negative
+    ones for signed where they fit. Less than `MANY` of the rows do not count: they are faults.
+    """
+    joined = np.concatenate([column[np.isfinite(column)] for column in ticks.values()])
+    if len(joined) < ENOUGH_ROWS:
+        return bits or 32, counter or "wrapped"
+
+    def fit(low: float, high: float) -> bool:
+        return float(np.mean((joined < low) | (joined >= high))) <= MANY
+
+    for width in (bits,) if bits else (32, 40):
+        if counter in (None, "wrapped") and fit(0, 2.0**width):
+            return width, "wrapped"
+        if counter in (None, "signed") and fit(-(2.0 ** (width - 1)), 2.0 ** (width - 1)):
+            return width, "signed"
+    return bits or 32, counter or "unwrapped"
+
+
+def beyond(ticks: Floats, bits: int, counter: str) -> Bools:
+    """Return which stamps in ticks (n,) a counter cannot have shown."""
+    if counter == "unwrapped":
+        return np.zeros(len(ticks), dtype=bool)
+    low = -(2.0 ** (bits - 1)) if counter == "signed" else 0.0
+    with np.errstate(invalid="ignore"):
+        return np.asarray((ticks < low) | (ticks >= low + 2.0**bits))
+
+
+def stamps_of(protocol: str) -> tuple[str, ...]:
+    """Return the names of the stamps that an exchange of a protocol has."""
+    return STAMPS[: 2 * len(PROTOCOLS[protocol].messages)]
