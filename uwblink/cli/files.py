@@ -18,6 +18,7 @@ def add_to(app: typer.Typer) -> None:
     app.command()(show)
     imports.callback()(_imports)
     app.add_typer(imports, name="import")
+    app.command()(export)
     app.command()(poses)
     app.command()(replay)
 
@@ -43,6 +44,20 @@ def show(
     from uwblink.cli.tables import print_summary
 
     print_summary(summary, Console(highlight=False))
+
+
+def export(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    to: Annotated[str, typer.Option(help="csv, parquet or tum.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
+    force: Force = False,
+) -> None:
+    """Write a recording as files that others read: tables, or the trajectories of its bodies."""
+    from uwblink.exporters import export_recording
+
+    written = export_recording(recording, output, to=to, force=force)
+    for name, rows in written.items():
+        typer.echo(f"{output / name}: {rows} rows")
 
 
 def poses(

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.exchange_tables import SUFFIXES, read_table
+from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
 from uwblink.output import check_output
 from uwblink.plugins import NAME, Registry
@@ -61,6 +62,7 @@ _OWN: Final = (
         "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
         map_help="Names, units and constants (.toml).",
     ),
+    Importer("exported", (), read_exported, "Import a folder that 'uwblink export' wrote as CSV or Parquet."),
     Importer(
         "miluv",
         (),

@@ -59,15 +59,15 @@ class Table:
         self._rejected: list[int] = []
         ending = path.name.lower().removesuffix(".gz")
         if ending.endswith(".parquet"):
-            self._db = _confined(path)
+            self._db = confined(path)
             self._relation = self._parquet()
         elif ending.endswith((".jsonl", ".ndjson", ".json")):
             self._relation = _json_lines(path)
-            self._db = _confined(path)
+            self._db = confined(path)
         else:
             self._dialect = detect(path, delimiter, decimal)
             self._relation = _csv(self._dialect)
-            self._db = _confined(path)
+            self._db = confined(path)
         self.names = self._relation.names
 
     def __enter__(self) -> Self:
@@ -280,7 +280,7 @@ def first_line(error: Exception) -> str:
     return (str(error).splitlines() or [""])[0][:200]
 
 
-def _confined(path: Path) -> duckdb.DuckDBPyConnection:
+def confined(path: Path) -> duckdb.DuckDBPyConnection:
     """Return a connection that can open this file and no other, and whose settings are locked."""
     import duckdb
 

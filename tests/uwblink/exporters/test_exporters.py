@@ -1,0 +1,121 @@
+"""What leaves the project: every column of every table comes back, and other readers read it."""
+
+import csv
+
+import duckdb
+import numpy as np
+import pytest
+
+from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is a fixture
+from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
+from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
+from uwblink.importers import import_recording
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import TABLES, Fault, Poses
+
+
+@pytest.fixture
+def whole(full):  # noqa: F811
+    """A recording with rows in every table, and without what only a stranger's hand leaves missing."""
+    with duckdb.connect(str(full)) as db:
+        db.execute("DELETE FROM exchanges WHERE tx1 IS NULL")
+        db.execute("DELETE FROM cirs WHERE magnitudes IS NULL")
+        db.execute("DELETE FROM faults WHERE board IS NULL")
+    with Recording.open(full, update=True) as recording:
+        recording.append_faults([Fault(3, "", 'odd, "quoted"', "two\nlines; nan")])
+    return full
+
+
+def in_order(path):
+    # Contents are saved in order of time, the exchanges as they are.
+    return {table: found if table == "exchanges" else sorted(found) for table, found in rows(path).items()}
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_every_column_of_every_table_comes_back(whole, tmp_path, form):
+    counts = export_recording(whole, tmp_path / "out", to=form)
+    expected = in_order(whole)
+    assert all(expected.values()), "the test needs rows in every table"
+    assert counts == {f"{table}.{form}": len(found) for table, found in expected.items()}
+    import_recording(tmp_path / "out", tmp_path / "back.uwb", importer="exported")
+    assert in_order(tmp_path / "back.uwb") == expected
+
+
+def test_others_read_the_tables(whole, tmp_path):
+    export_recording(whole, tmp_path / "csv", to="csv")
+    export_recording(whole, tmp_path / "parquet", to="parquet")
+    with Recording.open(whole) as recording:
+        e = recording.exchanges()
+    with (tmp_path / "csv" / "exchanges.csv").open(newline="") as file:
+        found = list(csv.DictReader(file))
+    assert [int(row["rx2"]) for row in found] == e.rx2.tolist()
+    assert [float(row["fpp1_dbm"]) for row in found] == e.fpp1_dbm.tolist()
+    with duckdb.connect() as db:
+        table = db.execute("SELECT rx2, fpp1_dbm FROM read_parquet(?)", [str(tmp_path / "parquet/exchanges.parquet")])
+        assert table.fetchnumpy()["rx2"].tolist() == e.rx2.tolist()
+
+
+def test_trajectories(tmp_path):
+    turned = np.array([[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]] * 3)
+    time = np.array([1_706_822_508_042_560_815, 1_706_822_508_042_560_816, 1_706_822_509_000_000_000])
+    poses = Poses(
+        time, np.array(["a/b", "c", "a/b"]), np.array([[1.5, -2.0, 0.1], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]), turned
+    )
+    with Recording.create(tmp_path / "r.uwb") as recording:
+        recording.append_poses(poses)
+    assert export_recording(tmp_path / "r.uwb", tmp_path / "tum", to="tum") == {"a_b.tum": 2, "c.tum": 1}
+    lines = (tmp_path / "tum" / "a_b.tum").read_text().splitlines()
+    assert lines[0].split()[0] == "1706822508.042560815"
+    assert [float(cell) for cell in lines[0].split()[1:]] == [1.5, -2.0, 0.1, *turned[0]]
+    # As evo reads it: eight numbers a line, separated by one blank.
+    assert all(len(line.split(" ")) == 8 for line in lines)
+
+
+def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(ArgumentError, match="to: found 'xls', allowed: csv, parquet, tum"):
+        export_recording(whole, tmp_path / "out", to="xls")
+    with pytest.raises(RecordingError, match="no such recording"):
+        export_recording(tmp_path / "no.uwb", tmp_path / "out", to="csv")
+    with pytest.raises(RecordingError, match="does not exist"):
+        export_recording(whole, tmp_path / "no" / "out", to="csv")
+    assert sorted(tmp_path.iterdir()) == before
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("mine")
+    with pytest.raises(RecordingExistsError, match="exists already"):
+        export_recording(whole, tmp_path / "out", to="csv")
+    assert (tmp_path / "out" / "mine").exists()
+    export_recording(whole, tmp_path / "out", to="csv", force=True)
+    assert sorted(path.stem for path in (tmp_path / "out").iterdir()) == sorted(TABLES)
+
+
+def test_a_path_with_quotes(whole, tmp_path):
+    folder = tmp_path / "it's; DROP TABLE x"
+    export_recording(whole, folder, to="csv")
+    import_recording(folder, tmp_path / "back.uwb", importer="exported")
+    assert in_order(tmp_path / "back.uwb") == in_order(whole)
+
+
+def test_a_folder_that_is_no_export(whole, tmp_path):
+    with pytest.raises(ImportTableError, match=r"holds no exchanges\.csv"):
+        import_recording(tmp_path, tmp_path / "o.uwb", importer="exported")
+    export_recording(whole, tmp_path / "out", to="csv")
+    path = tmp_path / "out" / "exchanges.csv"
+    path.write_text(path.read_text().replace(",", ",x", 1).replace("\n", "\nx", 1))
+    with pytest.raises(ImportTableError, match="not as 'uwblink export' wrote it"):
+        import_recording(tmp_path / "out", tmp_path / "o.uwb", importer="exported")
+    assert not (tmp_path / "o.uwb").exists()
+
+
+def test_a_form_of_ones_own(whole, tmp_path):
+    def write(recording, folder):
+        (folder / "name.txt").write_text(recording.name)
+        return {"name.txt": 1}
+
+    register_exporter(Exporter("names", write, "the name"))
+    try:
+        assert export_recording(whole, tmp_path / "out", to="names") == {"name.txt": 1}
+    finally:
+        EXPORTERS.remove("names")
+    with pytest.raises(ArgumentError, match="the project's own"):
+        register_exporter(Exporter("csv", write, "mine"))

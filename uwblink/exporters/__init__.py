@@ -1,0 +1,95 @@
+"""Turns recordings into files that others read: one row a form."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
+from uwblink.exporters.tables import write_csv, write_parquet
+from uwblink.exporters.tum import write_tum
+from uwblink.plugins import NAME, Registry
+
+
+@dataclass(frozen=True, slots=True)
+class Exporter:
+    """A form that a recording can leave in.
+
+    `write(recording, folder)` writes files into an empty folder and returns what each holds, rows by the file's name;
+    it raises `RecordingError`.
+    """
+
+    name: str
+    write: Callable[[Path, Path], dict[str, int]]
+    help: str
+
+
+def check_exporter(row: Any) -> None:
+    """Raise `ArgumentError` for a row that cannot be an exporter."""
+    if not isinstance(row, Exporter):
+        raise ArgumentError(f"exporter: found {row!r:.60}, expected an Exporter")
+    if not isinstance(row.name, str) or not NAME.fullmatch(row.name):
+        raise ArgumentError(f"exporter: name: found {row.name!r:.60}, expected a word such as 'csv'")
+    if not callable(row.write):
+        raise ArgumentError(f"exporter {row.name!r}: write: found {row.write!r:.60}, expected a function of two paths")
+
+
+_OWN: Final = (
+    Exporter("csv", write_csv, "a CSV file a table"),
+    Exporter("parquet", write_parquet, "a Parquet file a table"),
+    Exporter("tum", write_tum, "a trajectory a body (time x y z qx qy qz qw)"),
+)
+
+EXPORTERS: Final[Registry[Exporter]] = Registry("exporter", "uwbcal.exporters", _OWN, check_exporter)
+"""Exporters by name: the project's, those of `register_exporter`, and those of installed distributions."""
+
+
+def register_exporter(row: Exporter, *, replace: bool = False) -> None:
+    """Add a form to `EXPORTERS`: `export_recording` and `uwblink export` then know it.
+
+    `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken.
+    """
+    EXPORTERS.register(row, replace=replace)
+
+
+def export_recording(
+    recording: str | os.PathLike[str], folder: str | os.PathLike[str], *, to: str, force: bool = False
+) -> dict[str, int]:
+    """Write a recording as files in a new folder; returns the rows of each file.
+
+    `to` names a row of `EXPORTERS`. Files are written to a hidden folder, which takes the name when all went well.
+    Raises `ArgumentError`, `RecordingError` and `RecordingExistsError` (a folder that is there, unless `force`).
+
+    >>> import pathlib, tempfile, uwblink
+    >>> from uwblink.exporters import export_recording
+    >>> place = pathlib.Path(tempfile.mkdtemp())
+    >>> x = uwblink.Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    >>> uwblink.Contents(exchanges=x).save(place / "mine.uwb")
+    >>> export_recording(place / "mine.uwb", place / "mine", to="csv")["exchanges.csv"]
+    1
+    """
+    if to not in EXPORTERS:
+        raise ArgumentError(f"to: found {to!r:.40}, allowed: {', '.join(EXPORTERS)}")
+    final = Path(folder)
+    if final.exists() and (not force or not final.is_dir()):
+        raise RecordingExistsError(f"{final}: exists already; give another name, or --force to replace it")
+    if not final.parent.is_dir():
+        raise RecordingError(f"{final}: the folder {final.parent} does not exist; create it first")
+    partial = final.with_name(f".{final.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir()
+        written = EXPORTERS[to].write(Path(recording), partial)
+        if final.exists():
+            shutil.rmtree(final)
+        partial.replace(final)
+    except OSError as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{final}: cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return written
