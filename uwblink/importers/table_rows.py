@@ -201,8 +201,7 @@ def _times(table: Table, column_map: ColumnMap, headers: dict[str, str], cells: 
 
 
 def _is_wordy(cells: Floats) -> bool:
-    with np.errstate(invalid="ignore"):
-        return float(np.mean(~_is_id(cells))) > WORDS_FROM
+    return bool(np.count_nonzero(~_is_id(cells)) > WORDS_FROM * len(cells))
 
 
 def _is_id(cells: Floats) -> Bools:
