@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,19 +24,44 @@ class ImportGroup(TyperGroup):
         """Return the names of the importers."""
         from uwblink.importers import IMPORTERS
 
-        return list(IMPORTERS)
+        return [*IMPORTERS, "guess"]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command of one importer, None where there is none of the name."""
         from uwblink.importers import IMPORTERS
 
+        if cmd_name == "guess":
+            return _made("guess", "Look at a table and write the map that it would be imported with.", guess)
         return _command(IMPORTERS[cmd_name]) if cmd_name in IMPORTERS else None
 
 
 def _command(row: Importer) -> Any:
+    return _made(row.name, row.help, _with_map(row) if row.map_help else _without_map(row))
+
+
+def _made(name: str, text: str, function: Callable[..., None]) -> Any:
     app = typer.Typer(add_completion=False)
-    app.command(row.name, help=row.help)(_with_map(row) if row.map_help else _without_map(row))
+    app.command(name, help=text)(function)
     return typer.main.get_command(app)
+
+
+def guess(
+    table: Annotated[Path, typer.Argument(help="Table (.csv, .csv.gz, .parquet, .jsonl).")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Map to write (.toml); else printed.")] = None,
+    force: Force = False,
+) -> None:
+    """Look at a table and write the map that it would be imported with, and why."""
+    from uwblink.importers.guess import guess_map
+    from uwblink.recording.file import check_output
+
+    if output is not None:
+        check_output(output, force=force)
+    found = guess_map(table)
+    if output is None:
+        typer.echo(found.text, nl=False)
+        return
+    output.write_text(found.text, encoding="utf-8")
+    typer.echo(f"{output}: {'import with --map' if found.complete else 'fill in what is missing, then import'}")
 
 
 def _with_map(row: Importer) -> Any:

@@ -1,8 +1,9 @@
 """Tables of exchanges, of messages or of plain ranges, as CSV, Parquet or JSON lines, one file or several.
 
-What cannot be used is kept as a fault with its row; a table of which that is half or more is refused. Ranges are
-recomputed from the stamps. `gt_range_m`, or the distance between the two antenna positions (`from_x_m` ... `to_z_m`),
-is stored beside the exchange as its measured truth; antennas of which the table has positions are bodies with poses.
+What cannot be used is kept as a fault with its row; a table of which that is half or more is refused. `range_m` is what
+the device reported, or else the range by the stamps. `gt_range_m`, or the distance between the two antenna positions
+(`from_x_m` ... `to_z_m`), is stored beside the exchange as its measured truth; antennas of which the table has positions
+are bodies with poses.
 """
 
 from __future__ import annotations
@@ -117,7 +118,8 @@ def _from_stamps(
         notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
     reading = _reading(rows, Reading(chosen, bits), stated, notes)
     exchanges = _exchanges(rows, reading)
-    exchanges.range_m[:] = raw_range(exchanges)
+    reported = _optional(rows, "range_m")
+    exchanges.range_m[:] = np.where(np.isfinite(reported), reported, raw_range(exchanges))
     return exchanges, rows
 
 

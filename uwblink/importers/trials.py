@@ -101,8 +101,10 @@ class Sample:
 
     def _scatter_m(self, ranges: Floats) -> float:
         rest = ranges - np.where(np.isfinite(self.truth_m), self.truth_m, 0)
-        spreads = [np.ptp(np.nanpercentile(rest[self.pair == p], [25, 75])) for p in np.unique(self.pair)]
-        return float(np.median(spreads)) if np.isfinite(rest).all() else float("inf")
+        if not np.isfinite(rest).all():
+            return float("inf")
+        spreads = [np.ptp(np.percentile(rest[self.pair == p], [25, 75])) for p in np.unique(self.pair)]
+        return float(np.median(spreads))
 
 
 def try_others(sample: Sample, reading: Reading) -> tuple[Trial, Trial | None]:

@@ -227,6 +227,13 @@ def test_large_ids_get_numbers(tmp_path):
     assert found.meta["tag_names"]["1"] == str(2**60 + 1)
 
 
+def test_what_the_device_reported_is_kept_beside_the_stamps(tmp_path):
+    rows = [{**row, "range_m": "" if k else 7.5} for k, row in enumerate(wrapped(flights()))]
+    found = read_table(write(tmp_path / "t.csv", rows)).exchanges
+    assert found.range_m[0] == 7.5
+    assert found.range_m[1] == pytest.approx(flights()[1]["truth"])
+
+
 def test_no_time_at_all(tmp_path):
     rows = [{n: v for n, v in row.items() if n != "time_s"} for row in wrapped(flights())]
     found = read_table(write(tmp_path / "t.csv", rows))

@@ -1,0 +1,84 @@
+"""What a table is taken for, and that the map says so in words that work."""
+
+import pytest
+
+from tests.shared_data import shared
+from tests.uwblink.importers.test_table_forms import HEADER, as_messages, flights, same, wrapped, write
+from uwblink.importers.column_map import load_map
+from uwblink.importers.exchange_tables import read_table
+from uwblink.importers.guess import guess_map
+from uwblink.ticks import TICKS_PER_SECOND
+
+POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
+
+
+def renamed(rows, names, change=None):
+    return [{names.get(n, n): change(n, v) if change else v for n, v in row.items()} for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("names", "scale", "third"),
+    [
+        (dict(zip(HEADER[3:9], (f"{name}_ticks" for name in POLL), strict=True)), 1.0, "target"),
+        (dict(zip(HEADER[3:9], (f"T{k}" for k in range(1, 7)), strict=True)), 1.0, "initiator"),
+        (dict(zip(HEADER[3:9], (f"{n}_raw" for n in HEADER[3:9]), strict=True)), 1e9 / TICKS_PER_SECOND, "target"),
+        (dict(zip(HEADER[3:9], (f"{n} [us]" for n in HEADER[3:9]), strict=True)), 1e6 / TICKS_PER_SECOND, "target"),
+    ],
+)
+def test_a_guess_reads_the_table_right(tmp_path, names, scale, third):
+    rows = flights(third=third)
+    names = names | {"time_s": "timestamp", "from_id": "Tag ID", "to_id": "anchor_id", "fpp1": "fp_power_1"}
+    table = [{n: v * scale if n in HEADER[3:9] and scale != 1 else v for n, v in row.items()} for row in wrapped(rows)]
+    path = write(tmp_path / "t.csv", renamed(table, names), ";")
+    guess = guess_map(path)
+    assert guess.complete
+    (tmp_path / "map.toml").write_text(guess.text)
+    found = read_table(path, tmp_path / "map.toml")
+    same(found, rows)
+    assert found.exchanges.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
+    assert found.exchanges.time_ns.tolist() == [round(row["time_s"] * 1e9) for row in rows]
+
+
+def test_messages_ranges_and_units(tmp_path):
+    rows = flights()
+    path = write(tmp_path / "m.csv", as_messages(wrapped(rows)))
+    (tmp_path / "map.toml").write_text(guess_map(path).text)
+    assert load_map(tmp_path / "map.toml").layout == "messages"
+    assert len(read_table(path, tmp_path / "map.toml").exchanges) == len(rows)
+    plain = [{"t_ms": k, "src": 1, "dst": 2, "dist_mm": 1500 + k, "rssi": -80} for k in range(30)]
+    path = write(tmp_path / "r.csv", plain)
+    (tmp_path / "map.toml").write_text(guess_map(path).text)
+    found = read_table(path, tmp_path / "map.toml")
+    assert found.exchanges.range_m[3] == pytest.approx(1.503)
+    assert found.exchanges.time_ns[3] == 3_000_000
+    assert found.powers["rxp2_dbm"][0] == -80
+
+
+def test_what_is_not_there_is_said(tmp_path):
+    path = write(tmp_path / "t.csv", [{"tx1": 1, "rx1": 2, "tx2": 3, "colour": 4}] * 3)
+    guess = guess_map(path)
+    assert not guess.complete
+    assert "neither stamps nor ranges were recognised" in guess.text
+    assert "from_id = 1  # no column names it" in guess.text
+    assert '# not used: "colour"' in guess.text
+
+
+def test_hostile_names_stay_text(tmp_path):
+    rows = flights()
+    name = 'tx1_raw"\n[constants]\nfrom_id = 9 #'
+    path = tmp_path / "t.csv"
+    quoted = ",".join('"' + (name if n == "tx1" else n).replace('"', '""') + '"' for n in HEADER)
+    path.write_text("\n".join([quoted, *(",".join(str(row[n]) for n in HEADER) for row in wrapped(rows))]) + "\n")
+    (tmp_path / "map.toml").write_text(guess_map(path).text)
+    assert set(load_map(tmp_path / "map.toml").constants) == set()
+
+
+def test_the_public_table_of_single_sided_ranges(tmp_path):
+    guess = guess_map(shared("hanyang_sstwr.csv.gz"))
+    assert guess.complete
+    (tmp_path / "map.toml").write_text(guess.text)
+    found = load_map(tmp_path / "map.toml")
+    assert (found.protocol, found.bits, found.layout) == ("ss", 32, "exchanges")
+    assert [found.columns[n] for n in ("tx1", "rx1", "tx2", "rx2")] == [f"{name}_ticks" for name in POLL[:4]]
+    assert (found.columns["fpp2"], found.columns["gt_range_m"]) == ("fpp_dbm", "gt_range_m")
+    assert (found.columns["time_s"], found.columns["range_m"]) == ("host_t_s", "device_range_m")

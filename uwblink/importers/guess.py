@@ -1,0 +1,208 @@
+"""What a table might mean: a map that it would be read with, and the reason for each line of it.
+
+Columns are recognised by their names; units by the ends of the names, by the size of the numbers, and by which of them
+makes plausible ranges of the stamps; the protocol by trying all.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from uwblink.arrays import Floats
+from uwblink.errors import ImportTableError
+from uwblink.importers.column_map import DISTANCE_UNITS, ISO, LAYOUTS, POSITIONS, STAMP_UNITS
+from uwblink.importers.stamps import how_counted, stamps_of
+from uwblink.importers.table import Table
+from uwblink.importers.trials import CLEARLY, SAMPLE, Reading, Sample, Trial
+from uwblink.twr import PROTOCOLS, STAMPS
+
+_END: Final = r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|dbm|db|ppm))*"
+_ID: Final = r"(_?(id|addr|address|mac|name))?"
+_RANGE: Final = r"(range|dist|distance)"
+_PATTERNS: Final = {
+    "time_s": r"(ros_?|host_?|unix_?|utc_?)?(time|timestamp|stamp|t|datetime|date|epoch)(_(utc|iso))?",
+    "from_id": rf"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|id_?from|id_?1){_ID}",
+    "to_id": rf"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|id_?to|id_?2){_ID}",
+    "tx1": r"(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
+    "rx1": r"(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
+    "tx2": r"(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
+    "rx2": r"(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
+    "tx3": r"(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
+    "rx3": r"(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
+    "fpp1": r"(fpp?|fp_?power|first_?path(_?power)?)_?1",
+    "fpp2": r"(fpp?|fp_?power|first_?path(_?power)?)_?2?",
+    "rxp1": r"(rxp|rx_?power|rssi|total_?power|pr)_?1",
+    "rxp2": r"(rxp|rx_?power|rssi|total_?power|pr)_?2?",
+    "skew1": r"(skew|cfo|carrier|clock_?offset)_?1",
+    "skew2": r"(skew|cfo|carrier|clock_?offset)_?2?",
+    "gt_range_m": rf"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|actual)_?{_RANGE}|ground_?truth",
+    "range_m": rf"(device_?|measured?_?|uwb_?|est(imated)?_?)?{_RANGE}",
+    "sequence": r"(seq|sequence)(_?(no|num|nr|number|id))?",
+    "message": r"(msg|message|frame)(_?(no|num|nr|number|type|id))?",
+    "tx": r"tx",
+    "rx": r"rx",
+    "fpp": r"(fpp?|fp_?power|first_?path(_?power)?)",
+    "rxp": r"(rxp|rx_?power|rssi|total_?power)",
+    "skew": r"(skew|cfo|carrier|clock_?offset)",
+} | {name: rf"{name[:-4]}_?{name[-3]}".replace("_", "_?") for name in POSITIONS}
+_OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sequence", "message")
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """A map as TOML text with its reasons as comments, and whether it is enough to import the table."""
+
+    text: str
+    complete: bool
+
+
+def guess_map(path: Path) -> Guess:
+    """Look at a table and return the map that it would be read with; raises `ImportTableError`."""
+    with Table(path) as table:
+        columns = _columns(table.names)
+        numbers = table.read(numbers=columns.values())[0]
+    cells = {name: numbers[header][:100_000] for name, header in columns.items()}
+    if not len(next(iter(cells.values()), np.empty(0))):
+        raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(table.names)}")
+    layout = _layout(cells)
+    top = [f'layout = "{layout}"  # {_WHY[layout]}' if layout in LAYOUTS else f"# {_WHY[layout]}"]
+    units = _unit_lines(columns, cells)
+    if layout in ("exchanges", "messages"):
+        stamps, unit = _stamp_lines(columns, cells, layout)
+        top, units = top + stamps, unit + units
+    named = [f"{name} = {json.dumps(header)}" for name, header in columns.items() if _belongs(name, layout)]
+    missing = [name for name in ("from_id", "to_id") if name not in columns]
+    constants = [f"{name} = {k}  # no column names it; say who it is" for k, name in enumerate(missing, start=1)]
+    left = [name for name in table.names if name not in columns.values()]
+    # Names are a stranger's, and a line break in one would end the comment.
+    lines = [
+        f"# {json.dumps(path.name)}, as it would be read; every line can be changed",
+        *top,
+        "",
+        "[columns]",
+        *named,
+    ]
+    lines += ["", "[units]", *units] if units else []
+    lines += ["", "[constants]", *constants] if constants else []
+    lines += ["", f"# not used: {', '.join(map(json.dumps, left))[:300]}"] if left else []
+    lines += ["# what was programmed into the devices is not in the table: [antenna_delays] says it"]
+    needed = {"exchanges": STAMPS[:4], "messages": ("tx", "rx"), "ranges": ("range_m",), "nothing": ()}[layout]
+    return Guess("\n".join(lines) + "\n", layout != "nothing" and all(name in columns for name in needed))
+
+
+_WHY: Final = {
+    "exchanges": "a row has the stamps of a whole exchange",
+    "messages": "a row has one stamp of a sender and one of a receiver",
+    "ranges": "there are ranges and no stamps",
+    "nothing": "neither stamps nor ranges were recognised: rename columns below",
+}
+
+
+def _columns(names: Iterable[str]) -> dict[str, str]:
+    """Return which column each of our names is, raw ones before others, first ones before later ones."""
+    found: dict[str, str] = {}
+    listed = sorted(names, key=lambda name: "raw" not in name.lower())
+    for ours, pattern in _PATTERNS.items():
+        whole = re.compile(f"({pattern}){_END}")
+        for header in listed:
+            plain = re.sub(r"[^a-z0-9]+", "_", header.lower()).strip("_")
+            if whole.fullmatch(plain) and listed.count(header) == 1 and _free(ours, header, found):
+                found[ours] = header
+                break
+    return found
+
+
+def _free(ours: str, header: str, found: dict[str, str]) -> bool:
+    """A column is one thing; only the names of messages may repeat those of exchanges, until the layout is known."""
+    return header not in [taken for name, taken in found.items() if (name in _OF_MESSAGES) == (ours in _OF_MESSAGES)]
+
+
+def _layout(cells: dict[str, Floats]) -> str:
+    if all(name in cells for name in STAMPS[:4]):
+        return "exchanges"
+    if "tx" in cells and "rx" in cells:
+        return "messages"
+    return "ranges" if "range_m" in cells else "nothing"
+
+
+def _belongs(name: str, layout: str) -> bool:
+    if layout == "messages":
+        return name not in (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2")
+    return name not in _OF_MESSAGES and not (layout == "ranges" and name in STAMPS)
+
+
+def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str) -> tuple[list[str], list[str]]:
+    """Return lines of the map on protocol and counter, and on the unit of the stamps, with their reasons."""
+    names = [name for name in (STAMPS if layout == "exchanges" else ("tx", "rx")) if name in cells]
+    stamps: dict[str, Floats] = {name: cells[name] for name in names}
+    whole = all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
+    ended = {_suffix(columns[name], STAMP_UNITS) for name in names}
+    if layout == "messages":
+        unit = next(iter(ended - {None}), None) or ("ticks" if whole else "ns")
+        bits, counter = how_counted({n: c * STAMP_UNITS[unit] for n, c in stamps.items()}, None, None)
+        why = "whole numbers" if whole else "not whole numbers"
+        return [f"bits = {bits}", f'counter = "{counter}"'], [f'stamps = "{unit}"  # {why}']
+    units = [u for u in ended if u] or (["ticks", "ns", "us", "s", "ps"] if whole else ["ns", "us", "s", "ps", "ticks"])
+    trials = [trial for unit in units for trial in _trials(stamps, cells, unit)]
+    unit, counter, best = max(trials, key=lambda found: round(found[2].plausible, 2))
+    sure = best.plausible >= CLEARLY
+    share = f"{100 * best.plausible:.0f} % of its ranges are plausible, {best.low_m:.3g} to {best.high_m:.3g} m"
+    lines = [
+        f'protocol = "{best.reading.protocol}"  # {share}' + ("" if sure else "; check columns and units"),
+        f"bits = {best.reading.bits}  # the stamps fit",
+        f'counter = "{counter}"',
+    ]
+    why = "by the columns' names" if ended - {None} else "whole numbers" if whole else "as ranges are plausible"
+    return lines, [f'stamps = "{unit}"  # {why}']
+
+
+def _trials(stamps: dict[str, Floats], cells: dict[str, Floats], unit: str) -> list[tuple[str, str, Trial]]:
+    chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE]
+    if not len(chosen):
+        raise ImportTableError("its stamps are no numbers in any row")
+    sampled = {name: column[chosen] for name, column in stamps.items()}
+    bits, counter = how_counted({n: c * STAMP_UNITS[unit] for n, c in sampled.items()}, None, None)
+    truth = cells["gt_range_m"][chosen] if "gt_range_m" in cells else np.full(len(chosen), np.nan)
+    sample = Sample(sampled, np.zeros(len(chosen), dtype=np.int64), truth, STAMP_UNITS[unit])
+    names = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
+    names = [name for name in names if name not in ("ss-cfo", "ds-sym")] or ["ss"]
+    return [(unit, counter, sample.attempt(Reading(name, bits))) for name in names]
+
+
+def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:
+    lines = []
+    if "time_s" in columns:
+        unit, why = _time_unit(columns["time_s"], cells["time_s"])
+        lines.append(f'time = "{unit}"  # {why}')
+    distances = [n for n in ("range_m", "gt_range_m", *POSITIONS) if n in columns]
+    units = {_suffix(columns[name], DISTANCE_UNITS) for name in distances} - {None}
+    if len(units) == 1 and units != {"m"}:
+        lines.append(f'distance = "{units.pop()}"  # by the columns\' names')
+    return lines
+
+
+def _time_unit(header: str, values: Floats) -> tuple[str, str]:
+    if not np.isfinite(values).any():
+        return ISO, "no numbers"
+    ended = _suffix(header, ("ns", "us", "ms", "s"))
+    if ended:
+        return ended, "by the column's name"
+    largest = float(np.nanmax(np.abs(values)))
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
+        if largest > least:
+            return unit, f"{largest:.3g} would be no date in seconds"
+    return "s", f"numbers up to {largest:.6g}"
+
+
+def _suffix(header: str, units: Iterable[str]) -> str | None:
+    """Return the unit that a name ends with, as in `range_mm` or `time [ns]`."""
+    last = re.split(r"[^a-z0-9]+", header.lower().strip(")] "))[-1]
+    last = {"tick": "ticks", "dtu": "ticks", "sec": "s"}.get(last, last)
+    return last if last in units and last != header.lower() else None
