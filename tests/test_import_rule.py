@@ -35,7 +35,7 @@ FLOORS = {
         ("twr",),
         ("wire",),
         ("recording",),
-        ("boards", "importers"),
+        ("boards", "exporters", "importers"),
         ("cli",),
     ),
     "uwbsim": (

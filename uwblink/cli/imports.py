@@ -52,7 +52,7 @@ def guess(
 ) -> None:
     """Look at a table and write the map that it would be imported with, and why."""
     from uwblink.importers.guess import guess_map
-    from uwblink.recording.file import check_output
+    from uwblink.output import check_output, write_text
 
     if output is not None:
         check_output(output, force=force)
@@ -60,7 +60,7 @@ def guess(
     if output is None:
         typer.echo(found.text, nl=False)
         return
-    output.write_text(found.text, encoding="utf-8")
+    write_text(output, found.text, force=force)
     typer.echo(f"{output}: {'import with --map' if found.complete else 'fill in what is missing, then import'}")
 
 

@@ -76,7 +76,7 @@ def export_recording(
         raise ArgumentError(f"to: found {to!r:.40}, allowed: {', '.join(EXPORTERS)}")
     final = Path(folder)
     if final.exists() and (not force or not final.is_dir()):
-        raise RecordingExistsError(f"{final}: exists already; give another name, or --force to replace it")
+        raise RecordingExistsError(f"{final}: exists already; give another name, or `force` to replace it")
     if not final.parent.is_dir():
         raise RecordingError(f"{final}: the folder {final.parent} does not exist; create it first")
     partial = final.with_name(f".{final.name}.{os.getpid()}.partial")

@@ -2,8 +2,8 @@
 
 What cannot be used is kept as a fault with its row; a table of which that is half or more is refused. `range_m` is what
 the device reported, or else the range by the stamps. `gt_range_m`, or the distance between the two antenna positions
-(`from_x_m` ... `to_z_m`), is stored beside the exchange as its measured truth; antennas of which the table has positions
-are bodies with poses.
+(`from_x_m` ... `to_z_m`), is stored beside the exchange as its measured truth; antennas of which the table has
+positions are bodies with poses.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ from uwblink.importers.column_map import DISTANCE_UNITS, ISO, LAYOUTS, POSITIONS
 from uwblink.importers.stamps import how_counted, stamps_of
 from uwblink.importers.table import Table
 from uwblink.importers.trials import CLEARLY, SAMPLE, Reading, Sample, Trial
-from uwblink.twr import PROTOCOLS, STAMPS
+from uwblink.protocols.table import PROTOCOLS
+from uwblink.twr import STAMPS
 
 _END: Final = r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|dbm|db|ppm))*"
 _ID: Final = r"(_?(id|addr|address|mac|name))?"

@@ -15,8 +15,8 @@ import numpy as np
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.importers.stamps import ENOUGH_ROWS, NEVER, clocks, stamps_of, to_ticks
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals, raw_range
 
 SAMPLE: Final = 2000
