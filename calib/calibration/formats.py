@@ -68,7 +68,8 @@ def _miluv(calibration: Calibration) -> str:
 
 def _ros_yaml(calibration: Calibration) -> str:
     _one_curve(calibration, "ros-yaml")
-    lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}", "  tags:"]
+    lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}"]
+    lines += [f"  power_at: {calibration.power_at}", "  tags:"]
     for tag, (tx, rx) in registers(calibration).items():
         lines += [
             f"    '{tag}':",
@@ -120,8 +121,8 @@ def export(
 def read_miluv(path: Path) -> Calibration:
     """Read the JSON form of MILUV's published calibration; raises `BadInputError`.
 
-    Its bias curve is meant for each reception, ours for the mean of an exchange's lifted powers: where the two powers
-    of an exchange are equal they are the same thing. What has no place here is kept, so that exporting gives it back.
+    Its bias curve is meant for each reception (`power_at="reception"`), ours for the mean of an exchange's lifted
+    powers. What has no place here is kept, so that exporting gives it back.
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -144,6 +145,7 @@ def read_miluv(path: Path) -> Calibration:
         speed_of_light=speed,
         bias_curve=bias,
         sigma_curve=sigma,
+        power_at="reception",
         provenance={"imported_from": path.name, "miluv": {key: rest.get(key) for key in order}},
     )
 

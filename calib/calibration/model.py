@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from calib.calibration.display import as_html, as_text
 from calib.calibration.json_format import Matrix, Reader
-from calib.calibration.power_curves import LIFTS, Curve, basis, lifted_power
+from calib.calibration.power_curves import LIFTS, Curve, basis, ends, lift, lifted_power
 from calib.calibration.runtime import CorrectedColumns, CorrectedRange, RangeCorrector
 from calib.errors import BadInputError
 from calib.ranges import HALVES, Ranges
@@ -26,7 +26,11 @@ SCHEMA_VERSION: Final = 1
 GROUPED_VERSION: Final = 2
 """A calibration with groups of tags says so by its version: whoever knows only one curve must not read it."""
 
+RECEPTION_VERSION: Final = 3
+"""And one whose curve is meant for each reception: whoever takes it at the mean power is wrong by up to a decimetre."""
 
+VERSIONS: Final = (SCHEMA_VERSION, GROUPED_VERSION, RECEPTION_VERSION)
+POWER_AT: Final = ("exchange", "reception")
 SCALAR: Final = (float, int, np.generic)
 
 
@@ -77,8 +81,10 @@ class Uncertainty:
 class Calibration:
     """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation.
 
-    A standard error is infinite where the data did not determine the delay. With `groups`, each has its own curves, and
-    the plain ones are the groups' average, for a look only.
+    A standard error is infinite where the data did not determine the delay. `power_at` says where the bias curve is
+    taken: "exchange", at the lifted power of an exchange as `lift` makes it of two; or "reception", at each of the two
+    powers, half of either in a range, as curves are published that correct single stamps. With `groups`, each has its
+    own curves, and the plain ones are the groups' average, for a look only.
     """
 
     delays_ns: dict[int, float]
@@ -93,6 +99,7 @@ class Calibration:
     provenance: dict[str, Any] = field(default_factory=dict)
     uncertainty: Uncertainty | None = None
     groups: dict[str, TagGroup] = field(default_factory=dict)
+    power_at: str = "exchange"
     _corrector: RangeCorrector | None = field(default=None, init=False, compare=False)
 
     def __repr__(self) -> str:
@@ -131,7 +138,7 @@ class Calibration:
         return CorrectedRanges(
             raw_m=ranges.raw_m,
             delay_corrected_m=delays,
-            corrected_m=delays - self._curve_of(ranges, lifted, "bias_curve"),
+            corrected_m=delays - self._bias_of(ranges, lifted),
             sigma_m=self._curve_of(ranges, lifted, "sigma_curve"),
             lifted=lifted,
             clamped=~self.bias_curve.inside(lifted),
@@ -203,6 +210,13 @@ class Calibration:
         object.__setattr__(self, "_corrector", made)
         return made
 
+    def _bias_of(self, ranges: Ranges, lifted: Floats) -> Floats:
+        if self.power_at == "exchange":
+            return self._curve_of(ranges, lifted, "bias_curve")
+        powers = ends(ranges.fpp1_dbm, ranges.fpp2_dbm)
+        first, second = (self._curve_of(ranges, lift(power, self.alpha_dbm), "bias_curve") for power in powers)
+        return (first + second) / 2
+
     def _curve_of(self, ranges: Ranges, lifted: Floats, name: str) -> Floats:
         if not self.groups:
             return np.asarray(getattr(self, name)(lifted))
@@ -229,7 +243,7 @@ class Calibration:
     def to_json(self) -> str:
         """Return the calibration as JSON text."""
         document: dict[str, Any] = {
-            "schema_version": GROUPED_VERSION if self.groups else SCHEMA_VERSION,
+            "schema_version": self._version(),
             "delays_ns": {str(t): d for t, d in sorted(self.delays_ns.items())},
             "delays_std_ns": {str(t): d if math.isfinite(d) else None for t, d in sorted(self.delays_std_ns.items())},
             "loss": self.loss,
@@ -241,6 +255,8 @@ class Calibration:
             "sigma_curve": _curve_table(self.sigma_curve),
             "provenance": self.provenance,
         }
+        if self.power_at != "exchange":
+            document["power_at"] = self.power_at
         if self.groups:
             document["groups"] = {
                 name: {
@@ -254,6 +270,11 @@ class Calibration:
             document["uncertainty"] = asdict(self.uncertainty)
         return _rows_on_lines(json.dumps(document, indent=1, allow_nan=False)) + "\n"
 
+    def _version(self) -> int:
+        if self.power_at != "exchange":
+            return RECEPTION_VERSION
+        return GROUPED_VERSION if self.groups else SCHEMA_VERSION
+
     @classmethod
     def from_json(cls, text: str, where: str = "calibration") -> Self:
         """Read a calibration; raises `BadInputError` that says `where`, and which key is wrong."""
@@ -263,21 +284,24 @@ class Calibration:
             raise BadInputError(f"{where}: not JSON ({error})") from error
         if not isinstance(table, dict) or "schema_version" not in table:
             raise BadInputError(f"{where}: not a calibration (no schema_version)")
-        if table["schema_version"] not in (SCHEMA_VERSION, GROUPED_VERSION):
+        if table["schema_version"] not in VERSIONS:
             raise BadInputError(
-                f"{where}: schema version {table['schema_version']!r}, this uwbcal reads {SCHEMA_VERSION} and "
-                f"{GROUPED_VERSION}"
+                f"{where}: schema version {table['schema_version']!r}, this uwbcal reads "
+                f"{', '.join(map(str, VERSIONS[:-1]))} and {VERSIONS[-1]}"
             )
         read = Reader(table, where)
-        lift = read.word("lift")
-        if lift not in LIFTS:
-            raise BadInputError(f"{where}: lift: found {lift!r}, allowed: {', '.join(LIFTS)}")
+        how = read.word("lift")
+        if how not in LIFTS:
+            raise BadInputError(f"{where}: lift: found {how!r}, allowed: {', '.join(LIFTS)}")
+        power_at = read.word("power_at") if read.has("power_at") else "exchange"
+        if power_at not in POWER_AT:
+            raise BadInputError(f"{where}: power_at: found {power_at!r}, allowed: {', '.join(POWER_AT)}")
         return cls(
             delays_ns=read.delays("delays_ns"),
             delays_std_ns=read.delays("delays_std_ns", missing=math.inf),
             loss=read.word("loss"),
             scale_ns=read.number("scale_ns"),
-            lift=lift,
+            lift=how,
             alpha_dbm=read.number("alpha_dbm"),
             speed_of_light=read.number("speed_of_light"),
             bias_curve=read.curve("bias_curve"),
@@ -285,6 +309,7 @@ class Calibration:
             provenance=read.table("provenance"),
             uncertainty=_uncertainty(read),
             groups=_groups(read),
+            power_at=power_at,
         )
 
 

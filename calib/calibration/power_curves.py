@@ -45,9 +45,15 @@ LIFTS: Final[dict[str, Callable[[Floats, Floats, float], Floats]]] = {
 
 def lifted_power(fpp1_dbm: Floats, fpp2_dbm: Floats, how: str, alpha_dbm: float) -> Floats:
     """Lifted power of exchanges (n,); where one end's power is missing, the other's serves."""
-    first = np.where(np.isfinite(fpp1_dbm), fpp1_dbm, fpp2_dbm)
-    second = np.where(np.isfinite(fpp2_dbm), fpp2_dbm, fpp1_dbm)
-    return LIFTS[how](first, second, alpha_dbm)
+    return LIFTS[how](*ends(fpp1_dbm, fpp2_dbm), alpha_dbm)
+
+
+def ends(fpp1_dbm: Floats, fpp2_dbm: Floats) -> tuple[Floats, Floats]:
+    """Return the powers of both ends (n,); where one is missing, the other's serves."""
+    return (
+        np.where(np.isfinite(fpp1_dbm), fpp1_dbm, fpp2_dbm),
+        np.where(np.isfinite(fpp2_dbm), fpp2_dbm, fpp1_dbm),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,6 +86,7 @@ class RangeCorrector:
         self._metres = {tag: d * 1e-9 * calibration.speed_of_light for tag, d in calibration.delays_ns.items()}
         self._alpha = calibration.alpha_dbm
         self._of_mean = calibration.lift == "lift-of-mean"
+        self._at_receptions = calibration.power_at == "reception"
         self._plain = PiecewiseCurve(calibration.bias_curve), PiecewiseCurve(calibration.sigma_curve)
         groups = {
             name: (PiecewiseCurve(group.bias_curve), PiecewiseCurve(group.sigma_curve))
@@ -113,13 +114,20 @@ class RangeCorrector:
         bias, sigma = self._plain
         clamped = not bias.low <= lifted <= bias.high
         if not self._member:
-            return CorrectedRange(corrected - bias(lifted), sigma(lifted), clamped)
+            return CorrectedRange(corrected - self._bias(bias, lifted, fpp1_dbm, fpp2_dbm), sigma(lifted), clamped)
         try:
             first, second = self._member[initiator], self._member[target]
         except KeyError as error:
             raise BadInputError(f"tag {error.args[0]} is in none of the calibration's groups of tags") from None
-        mean = [0.5 * a(lifted) + 0.5 * b(lifted) for a, b in zip(first, second, strict=True)]
-        return CorrectedRange(corrected - mean[0], mean[1], clamped)
+        mean = 0.5 * sum(self._bias(curves[0], lifted, fpp1_dbm, fpp2_dbm) for curves in (first, second))
+        return CorrectedRange(corrected - mean, 0.5 * first[1](lifted) + 0.5 * second[1](lifted), clamped)
+
+    def _bias(self, curve: PiecewiseCurve, lifted: float, first: float, second: float) -> float:
+        """Return the bias at the power of the exchange, or the mean of those at its two receptions'."""
+        if not self._at_receptions:
+            return curve(lifted)
+        one, two = self._lifted(first, first), self._lifted(second, second)
+        return (curve(one if one == one else two) + curve(two if two == two else one)) / 2
 
     def _lifted(self, first: float, second: float) -> float:
         """Return the lifted power; of two powers of which one was not measured, the other serves."""

@@ -1,6 +1,8 @@
 """Calibrations in other forms, and MILUV's both ways."""
 
+import csv
 import json
+import tarfile
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +12,10 @@ from calib.calibration.formats import FORMATS, read_miluv, registers
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.estimation.fitting import fit
+from calib.ranges import Ranges
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import shared
+from uwblink.importers import read_source
 from uwblink.ticks import TICK_S
 
 
@@ -50,6 +54,48 @@ def test_miluv_is_read_and_given_back_unchanged():
     assert found.bias_curve(np.array([0.5]))[0] == pytest.approx(0.081, abs=0.002)
     r = replace(ranges(500), initiator=np.full(500, 10), target=np.full(500, 20))
     assert np.isfinite(found.apply(r).corrected_m).all()
+
+
+def test_a_published_curve_is_taken_at_each_reception():
+    found = read_miluv(shared("miluv_published_calibration.json"))
+    powers = np.array([-80.5, -95.0, -88.0]), np.array([-96.0, -81.0, -88.0])
+    n = np.zeros(3)
+    columns = found.correct(n + 3.0, *powers, np.full(3, 10), np.full(3, 20))
+    lifted = [10 ** ((power + 82) / 10) for power in powers]
+    delays = 0.299702547 * (found.delays_ns[10] + found.delays_ns[20]) / 2
+    expected = 3.0 + delays - (found.bias_curve(lifted[0]) + found.bias_curve(lifted[1])) / 2
+    np.testing.assert_allclose(columns.range_m, expected, atol=1e-12)
+    at_the_mean = replace(found, power_at="exchange").correct(n + 3.0, *powers, np.full(3, 10), np.full(3, 20))
+    assert np.abs(at_the_mean.range_m - expected)[:2].min() > 0.05, "metres; the two ways differ"
+    assert at_the_mean.range_m[2] == pytest.approx(expected[2])
+    for k in range(3):
+        one = found.correct(3.0, float(powers[0][k]), float(powers[1][k]), 10, 20)
+        assert one.range_m == pytest.approx(expected[k], abs=1e-9)
+    lonely = [found.correct(3.0, *pair, 10, 20).range_m for pair in ((-85.0, 0.0), (0.0, -85.0), (-85.0, -85.0))]
+    assert lonely == pytest.approx([lonely[0]] * 3)
+    again = Calibration.from_json(found.to_json())
+    assert (again.power_at, json.loads(found.to_json())["schema_version"]) == ("reception", 3)
+    with pytest.raises(BadInputError, match="power_at: found 'somewhere'"):
+        Calibration.from_json(found.to_json().replace('"reception"', '"somewhere"'))
+
+
+def test_the_published_calibration_gives_the_published_ranges(tmp_path):
+    """Within what a fault of the authors' code adds: it corrects the last stamp with the wrong tag's delay."""
+    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
+        archive.extractall(tmp_path, filter="data")
+    folder = tmp_path / "cirObstacles_3_random_0"
+    e = read_source(folder, importer="miluv").exchanges
+    published = {}
+    for path in folder.glob("*/uwb_range.csv"):
+        for row in csv.DictReader(path.read_text().splitlines()):
+            published[row["from_id"], row["to_id"], round(float(row["timestamp"]) * 1e9)] = float(row["range"])
+    began = 1_706_822_508_042_560_815
+    ends = zip(e.initiator.tolist(), e.target.tolist(), e.time_ns.tolist(), strict=True)
+    wanted = np.array([published[str(i), str(j), t - began] for i, j, t in ends])
+    found = read_miluv(shared("miluv_published_calibration.json")).apply(Ranges.from_exchanges(e)).corrected_m
+    assert len(wanted) == 317
+    assert np.abs(found - wanted).max() < 0.015
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.006
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"delays_ns": 3}', '{"delays_ns": {"a": 1}}'])
