@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
+from calib.calibration.c_header import c_header
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.errors import BadInputError
 from uwblink.output import write_text
+from uwblink.recording.file import Recording
 from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
 
 TX_SHARE: Final = 0.44
@@ -19,25 +22,62 @@ RX_SHARE: Final = 0.56
 """How an aggregate delay is split between transmitter and receiver (APS014, section 2; the authors' code)."""
 
 
-def registers(calibration: Calibration) -> dict[int, tuple[int, int]]:
-    """Return the values of the DW1000's TX and RX antenna-delay registers by tag, on top of the boards' 16436.
+REGISTER_MAX: Final = 65_535
 
-    The chip adds the one to transmit stamps and takes the other from receive stamps. A recorded stamp is the true one
-    plus d_t = 0.44 d or d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md).
+
+@dataclass(frozen=True, slots=True)
+class Programmed:
+    """What stood in the antenna-delay registers (TX, RX) of devices when they were recorded, in ticks."""
+
+    every: tuple[int, int] = (ANTENNA_DELAY_TICKS, ANTENNA_DELAY_TICKS)
+    single: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+
+    def of(self, tag: int) -> tuple[int, int]:
+        """Return the registers of one device."""
+        return self.single.get(tag, self.every)
+
+
+def programmed(recording: str | os.PathLike[str]) -> Programmed:
+    """Return what a recording says was programmed into its devices; raises what `Recording.open` raises."""
+    with Recording.open(recording) as opened:
+        meta = opened.meta()
+    try:
+        every = meta["configured_antenna_delay_ticks"]
+        single = meta.get("configured_antenna_delay_ticks_by_tag", {})
+        by_tag = {int(tag): (int(row["tx"]), int(row["rx"])) for tag, row in single.items()}
+        return Programmed((int(every["tx"]), int(every["rx"])), by_tag)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise BadInputError(f"{recording}: does not say what was programmed into its devices") from error
+
+
+def registers(calibration: Calibration, base: Programmed | None = None) -> dict[int, tuple[int, int]]:
+    """Return the values of the DW1000's TX and RX antenna-delay registers by tag, on top of what stood there.
+
+    `base` is what that was (`programmed`); without it the boards' 16436 in both. The chip adds the one to transmit
+    stamps and takes the other from receive stamps. A recorded stamp is the true one plus d_t = 0.44 d or
+    d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md). Raises `BadInputError` for a value that
+    16 bits do not hold.
     """
-    found = {}
+    found, known = {}, base or Programmed()
     for tag, delay in sorted(calibration.delays_ns.items()):
         ticks = -delay * 1e-9 / TICK_S
-        found[tag] = (round(ANTENNA_DELAY_TICKS + TX_SHARE * ticks), round(ANTENNA_DELAY_TICKS + RX_SHARE * ticks))
+        tx, rx = known.of(tag)
+        found[tag] = (round(tx + TX_SHARE * ticks), round(rx + RX_SHARE * ticks))
+        if not all(0 <= value <= REGISTER_MAX for value in found[tag]):
+            raise BadInputError(
+                f"tag {tag}: its registers would be {found[tag][0]} and {found[tag][1]}, which 16 bits do not hold; "
+                "give the recording that the calibration was fitted to",
+                parameter="base",
+            )
     return found
 
 
-def _registers(calibration: Calibration) -> str:
-    rows = [f"{tag},{tx},{rx}" for tag, (tx, rx) in registers(calibration).items()]
+def _registers(calibration: Calibration, base: Programmed | None = None) -> str:
+    rows = [f"{tag},{tx},{rx}" for tag, (tx, rx) in registers(calibration, base).items()]
     return "\n".join(["tag,tx_antenna_delay,rx_antenna_delay", *rows]) + "\n"
 
 
-def _csv(calibration: Calibration) -> str:
+def _csv(calibration: Calibration, _base: Programmed | None = None) -> str:
     rows = [
         f"{tag},{delay!r},{calibration.delays_std_ns.get(tag, 0.0)!r}"
         for tag, delay in sorted(calibration.delays_ns.items())
@@ -54,7 +94,7 @@ def _one_curve(calibration: Calibration, form: str) -> None:
         )
 
 
-def _miluv(calibration: Calibration) -> str:
+def _miluv(calibration: Calibration, _base: Programmed | None = None) -> str:
     _one_curve(calibration, "miluv")
     original = calibration.provenance.get("miluv")
     document = dict(original) if isinstance(original, dict) else {}
@@ -66,11 +106,11 @@ def _miluv(calibration: Calibration) -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
-def _ros_yaml(calibration: Calibration) -> str:
+def _ros_yaml(calibration: Calibration, base: Programmed | None = None) -> str:
     _one_curve(calibration, "ros-yaml")
     lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}"]
     lines += [f"  power_at: {calibration.power_at}", "  tags:"]
-    for tag, (tx, rx) in registers(calibration).items():
+    for tag, (tx, rx) in registers(calibration, base).items():
         lines += [
             f"    '{tag}':",
             f"      delay_ns: {calibration.delays_ns[tag]!r}",
@@ -88,23 +128,47 @@ def _ros_yaml(calibration: Calibration) -> str:
     return "\n".join(lines) + "\n"
 
 
-FORMATS: Final[dict[str, Callable[[Calibration], str]]] = {
+def _json(calibration: Calibration, _base: Programmed | None = None) -> str:
+    return calibration.to_json()
+
+
+def _c_header(calibration: Calibration, _base: Programmed | None = None) -> str:
+    _one_curve(calibration, "c-header")
+    return c_header(calibration)
+
+
+class Format(Protocol):
+    """What turns a calibration, and what was programmed into its devices, into text."""
+
+    def __call__(self, calibration: Calibration, base: Programmed | None = None, /) -> str:
+        """Return the text; raises `BadInputError`."""
+        ...
+
+
+FORMATS: Final[dict[str, Format]] = {
     "registers": _registers,
-    "json": Calibration.to_json,
+    "json": _json,
     "csv": _csv,
     "miluv": _miluv,
     "ros-yaml": _ros_yaml,
+    "c-header": _c_header,
 }
 
 
 def export(
-    calibration: Calibration, to: str, path: str | os.PathLike[str] | None = None, *, force: bool = False
+    calibration: Calibration,
+    to: str,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    base: Programmed | None = None,
+    force: bool = False,
 ) -> str:
     """Return a calibration as text in another form, and write it to `path` where one is given.
 
-    `to` is "registers" (values for the DW1000's antenna-delay registers, as CSV), "json", "csv" (delays), "miluv" or
-    "ros-yaml". Raises `BadInputError` for another, and for a calibration with groups of tags in a form that has one
-    curve.
+    `to` is "registers" (values for the DW1000's antenna-delay registers, as CSV), "json", "csv" (delays), "miluv",
+    "ros-yaml" or "c-header" (tables and a function that corrects a range). Registers are on top of `base`, what was
+    programmed when the devices were recorded (`programmed`), else of the boards' own 16436. Raises `BadInputError` for
+    another form, and for a calibration with groups of tags in a form that has one curve.
 
     >>> import calib
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[0])
@@ -112,7 +176,7 @@ def export(
     """
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
-    text = FORMATS[to](calibration)
+    text = FORMATS[to](calibration, base)
     if path is not None:
         write_text(Path(path), text, force=force)
     return text

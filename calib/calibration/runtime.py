@@ -62,6 +62,13 @@ class PiecewiseCurve:
         solved = np.linalg.solve(np.vander(place), values.T).T
         self._pieces = [tuple(row) for row in solved.tolist()]
 
+    def table(self) -> tuple[list[float], list[float], list[tuple[float, ...]]]:
+        """Return where each polynomial begins, one over its length, and its coefficients, the highest power first.
+
+        A polynomial takes how far a lifted power is from its beginning, in units of its length.
+        """
+        return self._left, self._scale, self._pieces
+
     def __call__(self, lifted: float) -> float:
         """Return the curve at a lifted power, in metres."""
         x = min(max(lifted, self.low), self.high)

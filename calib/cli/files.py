@@ -37,15 +37,21 @@ def apply(
 def export(
     calibration: Annotated[Path, typer.Argument(help="Calibration to turn (.json).")],
     to: Annotated[
-        str, typer.Option(help="registers (DW1000 antenna delays), json, csv (delays in ns), miluv or ros-yaml.")
+        str,
+        typer.Option(help="registers (DW1000 antenna delays), json, csv (delays in ns), miluv, ros-yaml or c-header."),
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; else it is printed.")] = None,
+    base: Annotated[
+        Path | None, typer.Option(help="Recording that says what was programmed into the devices; else 16436.")
+    ] = None,
     force: Force = False,
 ) -> None:
-    """Write a calibration as register values, CSV, MILUV's JSON or YAML for ROS."""
+    """Write a calibration as register values, CSV, MILUV's JSON, YAML for ROS or a C header."""
     import calib
+    from calib.calibration.formats import programmed
 
-    text = calib.export(calib.load_calibration(calibration), to, output, force=force)
+    registers = programmed(base) if base else None
+    text = calib.export(calib.load_calibration(calibration), to, output, base=registers, force=force)
     if output is None:
         typer.echo(text, nl=False)
     else:

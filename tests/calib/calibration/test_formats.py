@@ -2,20 +2,26 @@
 
 import csv
 import json
+import math
+import shutil
+import subprocess
 import tarfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from calib.calibration.formats import FORMATS, read_miluv, registers
+import calib
+from calib.calibration.formats import FORMATS, Programmed, programmed, read_miluv, registers
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.estimation.fitting import fit
 from calib.ranges import Ranges
+from calib.samples import sample_flight
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import shared
 from uwblink.importers import read_source
+from uwblink.recording.contents import Contents
 from uwblink.ticks import TICK_S
 
 
@@ -33,6 +39,69 @@ def test_registers_undo_the_delay(fitted):
         assert (tx - 16436) + 0.44 * d == pytest.approx(0, abs=0.5)
         assert -(rx - 16436) - 0.56 * d == pytest.approx(0, abs=0.5)
         assert (tx - 16436) + (rx - 16436) == pytest.approx(-d, abs=1)
+
+
+def test_registers_go_on_top_of_what_was_programmed(tmp_path, fitted):
+    known = replace(fitted, delays_ns={1: 0.25, 2: -513.5})
+    single = {"configured_antenna_delay_ticks_by_tag": {"1": {"tx": 16440, "rx": 16430}}}
+    meta = {"configured_antenna_delay_ticks": {"tx": 0, "rx": 0}, **single}
+    Contents(exchanges=sample_flight(10).exchanges, meta=meta).save(tmp_path / "r.uwb")
+    found = registers(known, programmed(tmp_path / "r.uwb"))
+    d = 0.25e-9 / TICK_S
+    assert found[1] == (round(16440 - 0.44 * d), round(16430 - 0.56 * d))
+    # A device with nothing programmed: both registers together are its whole delay, not 32872 ticks more.
+    assert sum(found[2]) == pytest.approx(513.5e-9 / TICK_S, abs=1)
+    with pytest.raises(BadInputError, match="tag 1: its registers would be -7 and -9"):
+        registers(known, Programmed((0, 0)))
+    text = calib.export(known, "registers", base=programmed(tmp_path / "r.uwb"))
+    assert text.splitlines()[1] == f"1,{found[1][0]},{found[1][1]}"
+
+
+MAIN = """
+#include <stdio.h>
+#include "calibration.h"
+int main(void)
+{
+    double range, one, two, corrected = 0, sigma = 0;
+    int initiator, target;
+    while (scanf("%lf %lf %lf %d %d", &range, &one, &two, &initiator, &target) == 5) {
+        int status = uwb_correct(range, one, two, initiator, target, &corrected, &sigma);
+        printf("%d %.17g %.17g\\n", status, corrected, sigma);
+    }
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("change", [{}, {"lift": "lift-of-mean"}, {"power_at": "reception"}])
+def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler on this machine")
+    known = replace(fitted, delays_ns=DELAYS_NS, **change)
+    calib.export(known, "c-header", tmp_path / "calibration.h")
+    (tmp_path / "main.c").write_text(MAIN)
+    strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+    subprocess.run([compiler, *strict, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
+    random = np.random.default_rng(8)
+    tags = sorted(DELAYS_NS)
+    rows = [
+        (float(r), float(a), float(b), *map(int, random.choice(tags, 2, replace=False)))
+        for r, a, b in zip(random.uniform(0, 50, 500), *random.uniform(-110, -70, (2, 500)), strict=True)
+    ]
+    one, two = tags[:2]
+    rows += [(1.0, 0.0, -85.0, one, two), (1.0, -85.0, math.nan, one, two), (1.0, 0.0, 0.0, one, two)]
+    lines = "\n".join(" ".join(map(str, row)) for row in [*rows, (1.0, -85.0, -85.0, 9999, one)])
+    done = subprocess.run(["./main"], cwd=tmp_path, input=lines, capture_output=True, text=True, check=True)
+    found = [line.split() for line in done.stdout.splitlines()]
+    assert len(found) == len(rows) + 1
+    for row, (status, corrected, sigma) in zip(rows, found, strict=False):
+        expected = known.correct(*row)
+        assert float(corrected) == pytest.approx(expected.range_m, abs=1e-12)
+        assert float(sigma) == pytest.approx(expected.sigma_m, abs=1e-12, nan_ok=True)
+        assert (status != "0") == expected.clamped
+    assert {status for status, *_ in found} == {"0", "1", "2", "-1"}
+    assert found[-1][0] == "-1"
 
 
 def test_every_form_holds_the_delays(fitted):
@@ -105,7 +174,7 @@ def test_what_is_no_miluv_calibration(tmp_path, text):
         read_miluv(tmp_path / "m.json")
 
 
-@pytest.mark.parametrize("form", ["miluv", "ros-yaml"])
+@pytest.mark.parametrize("form", ["miluv", "ros-yaml", "c-header"])
 def test_a_form_with_one_curve_does_not_take_groups(form):
     grouped = fit(ranges(2000), groups={"a": (1, 2), "b": (3, 7)}).calibration
     with pytest.raises(BadInputError, match="export it as json"):
