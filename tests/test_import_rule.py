@@ -23,7 +23,7 @@ CONFINED = {
     "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path == "uwbsim/sweep/results.py",
     "pydantic": lambda path: path.startswith("uwbsim/"),
-    "rosbags": lambda path: path == "uwblink/importers/poses.py",
+    "rosbags": lambda path: path == "uwblink/importers/pose_bags.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }
 # The rooms by floor, the ground first: a room imports only rooms of lower floors, so two on one floor never meet.

@@ -62,19 +62,49 @@ def export(
 
 def poses(
     recording: Annotated[Path, typer.Argument(help="Recording to add poses to (.uwb).")],
-    source: Annotated[Path, typer.Option("--from", help="Poses: .csv, .tum or a ROS bag.")],
+    source: Annotated[
+        list[str], typer.Option("--from", help="Poses: .csv, .tum or a ROS bag; or BODY=FILE, as often as needed.")
+    ],
     offset: Annotated[str, typer.Option(help="Seconds to add to the poses' times, or auto.")] = "0",
-    tags: Annotated[Path | None, typer.Option(help="Plan or scenario (.toml) whose \\[\\[tags]] to use.")] = None,
-    body: Annotated[str | None, typer.Option(help="The body of a TUM file.")] = None,
+    tags: Annotated[
+        Path | None, typer.Option(help="File (.toml) whose \\[\\[tags]] and \\[\\[anchors]] to use.")
+    ] = None,
+    body: Annotated[str | None, typer.Option(help="The body of a TUM or EuRoC file.")] = None,
+    topic: Annotated[
+        list[str] | None, typer.Option(help="BODY=TOPIC of a bag, as often as needed; else found by their names.")
+    ] = None,
 ) -> None:
     """Add motion-capture truth to a recording of boards."""
     from uwblink.importers.motion_capture import add_poses
 
-    found = add_poses(recording, source, offset=offset, tags_from=tags, body=body)
+    files = _files(source)
+    topics = _pairs("topic", topic) if topic else None
+    found = add_poses(recording, files, offset=offset, tags_from=tags, body=body, topics=topics)
     typer.echo(
         f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
         f"{found.covered} of {found.exchanges} exchanges have a true distance"
     )
+
+
+def _files(sources: list[str]) -> Path | dict[str, Path]:
+    """Return one file, or files by body; a name that is there is a file, whatever it holds."""
+    if len(sources) == 1 and ("=" not in sources[0] or Path(sources[0]).exists()):
+        return Path(sources[0])
+    return {body: Path(name) for body, name in _pairs("from", sources).items()}
+
+
+def _pairs(option: str, words: list[str]) -> dict[str, str]:
+    """Return what stands behind each body; raises `ImportTableError` for words that are not BODY=SOMETHING."""
+    from uwblink.errors import ImportTableError
+
+    found: dict[str, str] = {}
+    for word in words:
+        body, _, rest = word.partition("=")
+        if not body or not rest or body in found:
+            what = "BODY=TOPIC" if option == "topic" else "BODY=FILE"
+            raise ImportTableError(f"--{option}: found {word!r}, expected {what}, each body once")
+        found[body] = rest
+    return found
 
 
 def replay(

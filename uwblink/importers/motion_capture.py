@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from uwblink.errors import ImportTableError
 from uwblink.importers.poses import read_poses
 from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
-from uwblink.recording.tags import load_tags
+from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.tags import load_places
 from uwblink.recording.time_offset import find_offset
 
 
@@ -28,19 +30,30 @@ class AddedPoses:
 
 
 def add_poses(
-    recording: Path, source: Path, *, offset: str = "0", tags_from: Path | None = None, body: str | None = None
+    recording: Path,
+    source: Path | Mapping[str, Path],
+    *,
+    offset: str = "0",
+    tags_from: Path | None = None,
+    body: str | None = None,
+    topics: Mapping[str, str] | None = None,
 ) -> AddedPoses:
-    """Put poses from a file in place of those of a recording; `offset` is in seconds, or "auto".
+    """Put poses from a file, or files by body, in place of those of a recording; `offset` is in seconds, or "auto".
 
-    Raises `ImportTableError` for poses that cannot be used, what `load_tags` and `Recording.open` raise; the
-    recording stays as it was then.
+    `tags_from` is a TOML file with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are those of a bag to read,
+    by body; `body` names that of a file which does not. Raises `ImportTableError` for poses that cannot be used, what
+    `load_places` and `Recording.open` raise; the recording stays as it was then.
     """
     shift_ns = None if offset == "auto" else _seconds(offset)
-    poses = read_poses(source, body)
-    tags = list(load_tags(tags_from)) if tags_from else None
+    files = source if isinstance(source, Mapping) else {body: source}
+    parts = [read_poses(path, name, topics) for name, path in files.items()]
+    what = ", ".join(str(path) for path in files.values())
+    given, anchors = load_places(tags_from) if tags_from else ((), {})
+    standing = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in anchors]
+    poses = _joined([*parts, *(Poses.from_arrays([0], f"anchor{n}", [place]) for n, place in anchors.items())])
     with Recording.open(recording, update=True) as opened:
         exchanges = opened.exchanges()
-        seats = opened.tags() if tags is None else tags
+        seats = [tag for tag in (given or opened.tags()) if tag.tag not in anchors] + standing
         if not len(exchanges):
             raise ImportTableError(f"{recording}: holds no exchanges to add truth to")
         bodies = set(np.unique(poses.body).tolist())
@@ -48,7 +61,7 @@ def add_poses(
         if len(sitting) < 2:
             found = ", ".join(sorted({tag.body for tag in seats})) or "none"
             raise ImportTableError(
-                f"{source}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
+                f"{what}: its bodies are {', '.join(sorted(bodies))}, those of the tags {found}; "
                 "say in `tags_from` where the tags sit"
             )
         if shift_ns is None:
@@ -58,12 +71,25 @@ def add_poses(
         covered = int(np.count_nonzero(np.isfinite(truth)))
         if not covered:
             raise ImportTableError(
-                f"{source}: no exchange lies within its poses, which end {_apart(exchanges.time_ns, moved.time_ns)}; "
+                f"{what}: no exchange lies within its poses, which end {_apart(exchanges.time_ns, moved.time_ns)}; "
                 "give `offset` in seconds, or auto"
             )
-        meta = {"poses_from": source.name, "poses_offset_s": shift_ns * 1e-9}
-        opened.replace_poses(moved, meta, tags)
+        meta = {"poses_from": ", ".join(path.name for path in files.values()), "poses_offset_s": shift_ns * 1e-9}
+        opened.replace_poses(moved, meta, seats if tags_from else None)
     return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(exchanges), covered)
+
+
+def _joined(parts: list[Poses]) -> Poses:
+    """Return poses in order of time; those that stand still are given the time of the first that do not."""
+    first = min((int(part.time_ns.min()) for part in parts if len(part) > 1), default=0)
+    times = [part.time_ns if len(part) > 1 else np.full(len(part), first) for part in parts]
+    order = np.argsort(np.concatenate(times), kind="stable")
+    return Poses(
+        np.concatenate(times)[order],
+        np.concatenate([part.body for part in parts])[order],
+        np.concatenate([part.position_m for part in parts])[order],
+        np.concatenate([part.quaternion for part in parts])[order],
+    )
 
 
 def _seconds(text: str) -> int:

@@ -1,30 +1,33 @@
-"""Motion-capture poses from files: CSV with a body a row, TUM trajectories, ROS bags.
+"""Motion-capture poses from files: CSV with a body a row, TUM and EuRoC trajectories, ROS bags.
 
 CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres, ENU) and `qx, qy, qz, qw` (body to world). TUM
-has `time x y z qx qy qz qw` separated by blanks, one body a file. Bags (ROS 1, ROS 2, MCAP) need the extra
-`uwbcal[bags]`; every topic of geometry_msgs/PoseStamped is a body, named after the topic.
+has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line that
+begins with `#timestamp`, one body a file. Bags (ROS 1, ROS 2, MCAP) need the extra `uwbcal[bags]`.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TextIO
 
 import numpy as np
 
 from uwblink.errors import ImportTableError
+from uwblink.importers.pose_bags import Row, read_bag
 from uwblink.recording.schema import Poses
 
 NUMBERS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
 LATEST_NS: Final = 2**62
-Row = tuple[int, str, list[float]]
 
 
-def read_poses(path: Path, body: str | None = None) -> Poses:
-    """Read poses by the file's kind; `body` names the body of a TUM file. Raises `ImportTableError`."""
+def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | None = None) -> Poses:
+    """Read poses by the file's kind; raises `ImportTableError`.
+
+    `body` names the body of a file that does not; `topics` are those of a bag to read, by body.
+    """
     if not path.exists():
         raise ImportTableError(f"{path}: no such file of poses")
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
@@ -33,15 +36,41 @@ def read_poses(path: Path, body: str | None = None) -> Poses:
         raise ImportTableError(
             f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(sorted(_READERS))}"
         )
-    poses = _as_poses(path, reader(path, body))
+    if topics and reader is not _bag:
+        raise ImportTableError(f"{path}: has no topics; only bags have")
+    poses = _as_poses(path, read_bag(path, topics) if topics else reader(path, body))
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
     return poses
 
 
+EUROC: Final = "#timestamp"
+EUROC_NUMBERS: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+def _euroc(path: Path, body: str | None, file: TextIO) -> Iterable[Row]:
+    if body is None:
+        raise ImportTableError(f"{path}: a EuRoC file does not say whose poses it holds; name it as `body`")
+    for number, line in enumerate(file, start=1):
+        cells = line.split(",")
+        if line.startswith("#") or not line.strip():
+            continue
+        if len(cells) < 8:
+            raise ImportTableError(
+                f"{path}: row {number}: found {len(cells)} cells, EuRoC has 8: time_ns, {', '.join(EUROC_NUMBERS)}"
+            )
+        found = {n: _number(path, number, n, c) for n, c in zip(EUROC_NUMBERS, cells[1:], strict=False)}
+        yield _time_ns(path, number, "time_ns", cells[0]), body, [found[name] for name in NUMBERS]
+
+
 def _csv(path: Path, body: str | None) -> Iterable[Row]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
+            if file.readline().lower().startswith(EUROC):
+                file.seek(0)
+                yield from _euroc(path, body, file)
+                return
+            file.seek(0)
             reader = csv.DictReader(file)
             names = [name.strip() for name in reader.fieldnames or []]
             reader.fieldnames = names
@@ -77,36 +106,7 @@ def _tum(path: Path, body: str | None) -> Iterable[Row]:
 
 
 def _bag(path: Path, _body: str | None) -> Iterable[Row]:
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportTableError(f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'") from error
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            topics = [c for c in reader.connections if c.msgtype == "geometry_msgs/msg/PoseStamped"]
-            if not topics:
-                found = ", ".join(sorted({c.msgtype for c in reader.connections})) or "nothing"
-                raise ImportTableError(f"{path}: no topic of geometry_msgs/PoseStamped; found {found}")
-            for connection, _, raw in reader.messages(connections=topics):
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                stamp, pose = message.header.stamp, message.pose
-                p, q = pose.position, pose.orientation
-                yield (
-                    stamp.sec * 1_000_000_000 + stamp.nanosec,
-                    _body_of(connection.topic),
-                    [p.x, p.y, p.z, q.x, q.y, q.z, q.w],
-                )
-    except (AnyReaderError, OSError, ValueError) as error:
-        if isinstance(error, ImportTableError):
-            raise
-        raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
-
-
-def _body_of(topic: str) -> str:
-    """The body of a topic: its first part that is not what motion-capture nodes call all of theirs."""
-    parts = [p for p in topic.split("/") if p not in ("", "vrpn_client_node", "mocap", "pose", "optitrack", "vicon")]
-    return parts[0] if parts else topic
+    return read_bag(path)
 
 
 _READERS: Final[dict[str, Callable[[Path, str | None], Iterable[Row]]]] = {

@@ -20,6 +20,31 @@ def load_tags(path: Path) -> tuple[Tag, ...]:
     return tags
 
 
+def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, float, float]]]:
+    """Read the `[[tags]]` of a file and the places in metres of its `[[anchors]]`, which stand still, by id.
+
+    Raises `PlanError` where there are neither, or an id is there twice.
+    """
+    file = TomlReader(path, PlanError)
+    tags, rows = read_tags(file), file.table.get("anchors", [])
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise file.error(f"{path}: anchors: expected [[anchors]] tables with id and position_m")
+    if not tags and not rows:
+        raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m, and no [[anchors]]")
+    found: dict[int, tuple[float, float, float]] = {}
+    taken = {tag.tag for tag in tags}
+    for k, row in enumerate(rows):
+        file.known(row, ("id", "position_m"), f"anchors[{k}].")
+        number, place = row.get("id"), row.get("position_m")
+        file.check(f"anchors[{k}].id", number, is_board_id(number), f"a whole number 0 to {LARGEST_BOARD_ID}")
+        if number in found or number in taken:
+            raise PlanError(f"{path}: anchors[{k}].id: found a second {number}, ids must differ")
+        good = isinstance(place, list) and len(place) == 3 and all(map(is_number, place))
+        file.check(f"anchors[{k}].position_m", place, good, "three numbers (metres)")
+        found[number] = (float(place[0]), float(place[1]), float(place[2]))
+    return tags, found
+
+
 def read_tags(file: TomlReader) -> tuple[Tag, ...]:
     """Return tags from the array of tables `tags` of a file, none where there is none; raises the file's error."""
     rows = file.table.get("tags", [])

@@ -1,0 +1,164 @@
+"""Poses as drivers of motion capture write them: messages, topics, several files, anchors."""
+
+import numpy as np
+import pytest
+
+from uwblink.errors import ImportTableError, PlanError
+from uwblink.exporters import export_recording
+from uwblink.importers.motion_capture import add_poses
+from uwblink.importers.pose_bags import body_of
+from uwblink.importers.poses import read_poses
+from uwblink.recording.contents import Contents, load
+from uwblink.recording.schema import Poses, Tag
+from uwblink.twr import Exchanges
+
+TURNED = [0.0, 0.0, 0.6, 0.8]
+
+
+@pytest.mark.parametrize(
+    ("topic", "body"),
+    [
+        ("/vrpn_mocap/drone/pose", "drone"),
+        ("/vrpn_client_node/drone/pose", "drone"),
+        ("/vicon/drone/drone", "drone"),
+        ("/natnet_ros/drone/pose", "drone"),
+        ("/qualisys/drone/odom", "drone"),
+        ("/mocap/rigid_bodies/drone/pose", "drone"),
+        ("/pose", "/pose"),
+    ],
+)
+def test_a_topic_is_called_after_its_body(topic, body):
+    assert body_of(topic) == body
+
+
+def bag(path, messages):
+    """Write a ROS 2 bag of (topic, kind, place, frame) at seconds 0, 1, 2."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the extra uwbcal[bags] is not installed")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t = {name.split("/")[-1]: kind for name, kind in store.types.items()}
+    turned, uncertain = t["Quaternion"](*TURNED), "PoseWithCovarianceStamped"
+
+    def made(kind, k, place, frame):
+        header = t["Header"](t["Time"](k, 500), "world")
+        pose = t["Pose"](t["Point"](place + k, 2.0, 3.0), turned)
+        with_covariance = t["PoseWithCovariance"](pose, np.zeros(36))
+        still = t["TwistWithCovariance"](t["Twist"](t["Vector3"](0, 0, 0), t["Vector3"](0, 0, 0)), np.zeros(36))
+        transform = t["TransformStamped"](header, frame, t["Transform"](t["Vector3"](place + k, 2.0, 3.0), turned))
+        return {
+            "geometry_msgs/msg/PoseStamped": lambda: t["PoseStamped"](header, pose),
+            f"geometry_msgs/msg/{uncertain}": lambda: t[uncertain](header, with_covariance),
+            "nav_msgs/msg/Odometry": lambda: t["Odometry"](header, frame, with_covariance, still),
+            "geometry_msgs/msg/TransformStamped": lambda: transform,
+            "tf2_msgs/msg/TFMessage": lambda: t["TFMessage"]([transform]),
+        }[kind]()
+
+    with rosbag2.Writer(path, version=9) as writer:
+        for topic, kind, place, frame in messages:
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for k in range(3):
+                writer.write(connection, k * 10**9, store.serialize_cdr(made(kind, k, place, frame), kind))
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "frame"),
+    [
+        ("/vrpn_mocap/drone/pose", "geometry_msgs/msg/PoseStamped", ""),
+        ("/natnet_ros/drone/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", ""),
+        ("/qualisys/drone/odom", "nav_msgs/msg/Odometry", "base"),
+        ("/vicon/anything", "geometry_msgs/msg/TransformStamped", "vicon/drone/drone"),
+        ("/tf", "tf2_msgs/msg/TFMessage", "drone"),
+    ],
+)
+def test_every_kind_of_message(tmp_path, topic, kind, frame):
+    bag(tmp_path / "bag", [(topic, kind, 5.0, frame)])
+    poses = read_poses(tmp_path / "bag")
+    assert poses.body.tolist() == ["drone"] * 3
+    assert poses.time_ns.tolist() == [500, 1_000_000_500, 2_000_000_500]
+    assert poses.position_m.tolist() == [[5.0, 2.0, 3.0], [6.0, 2.0, 3.0], [7.0, 2.0, 3.0]]
+    np.testing.assert_allclose(poses.quaternion, [TURNED] * 3)
+
+
+def test_topics_by_body(tmp_path):
+    pose, odometry = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+    bag(tmp_path / "bag", [("/a/pose", pose, 1.0, ""), ("/b/pose", pose, 2.0, ""), ("/c/odom", odometry, 3.0, "x")])
+    assert set(read_poses(tmp_path / "bag").body) == {"a", "b"}
+    poses = read_poses(tmp_path / "bag", topics={"drone": "/b/pose", "car": "/c/odom"})
+    assert poses[poses.body == "drone"].position_m[0, 0] == 2.0
+    assert poses[poses.body == "car"].position_m[0, 0] == 3.0
+    with pytest.raises(ImportTableError, match=r"'/d' is not there; topics with poses are /a/pose, /b/pose, /c/odom"):
+        read_poses(tmp_path / "bag", topics={"drone": "/d"})
+    (tmp_path / "t.tum").write_text("0 1 2 3 0 0 0 1\n")
+    with pytest.raises(ImportTableError, match="has no topics"):
+        read_poses(tmp_path / "t.tum", topics={"drone": "/d"})
+
+
+def test_euroc(tmp_path):
+    head = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v\n"
+    path = tmp_path / "data.csv"
+    path.write_text(head + "1403636579758555393,1,2,3,0.8,0,0,0.6,9,9\n")
+    poses = read_poses(path, "drone")
+    assert poses.time_ns.tolist() == [1403636579758555393]
+    assert poses.position_m.tolist() == [[1.0, 2.0, 3.0]]
+    np.testing.assert_allclose(poses.quaternion, [TURNED])
+    with pytest.raises(ImportTableError, match="does not say whose poses"):
+        read_poses(path)
+    path.write_text(head + "1,2,3\n")
+    with pytest.raises(ImportTableError, match="row 2: found 3 cells"):
+        read_poses(path, "drone")
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Tags 1 on a car, 2 on a drone, 9 an anchor; and a trajectory of each body as the project writes it."""
+    ids = np.array([[1, 2], [1, 9], [2, 9]] * 5)
+    when = np.arange(15) * 100_000_000
+    e = Exchanges.from_arrays(ids[:, 0], ids[:, 1], time_ns=when, tx1=[0] * 15, rx1=5, tx2=1005, rx2=3000)
+    poses = [
+        Poses.from_arrays(np.arange(20) * 10**8, body, [[x, 0.0, k / 10] for k in range(20)])
+        for body, x in (("car", 0.0), ("drone", 4.0))
+    ]
+    tags = [Tag(1, "car", (0.0, 0.0, 0.0)), Tag(2, "drone", (0.0, 0.0, 0.0)), Tag(9, "tag9", (0.0, 0.0, 0.0))]
+    for part in poses:
+        Contents(exchanges=e, poses=part).save(tmp_path / "one.uwb", force=True)
+        export_recording(tmp_path / "one.uwb", tmp_path / "tum", to="tum", force=True)
+        name = f"{part.body[0]}.tum"
+        (tmp_path / "tum" / name).rename(tmp_path / name)
+    Contents(exchanges=e, tags=tags).save(tmp_path / "r.uwb")
+    return tmp_path / "r.uwb"
+
+
+def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
+    (tmp_path / "places.toml").write_text("[[anchors]]\nid = 9\nposition_m = [0.0, 3.0, 0.0]\n")
+    files = {"car": tmp_path / "car.tum", "drone": tmp_path / "drone.tum"}
+    found = add_poses(recording, files, tags_from=tmp_path / "places.toml")
+    assert (found.bodies, found.covered, found.exchanges) == (("anchor9", "car", "drone"), 15, 15)
+    held = load(recording)
+    assert {tag.tag: tag.body for tag in held.tags} == {1: "car", 2: "drone", 9: "anchor9"}
+    assert (held.poses.body == "anchor9").sum() == 1
+    from uwblink.recording.distances import distances_m
+
+    e = held.exchanges
+    true_m = distances_m(held.poses, held.tags, e.initiator, e.target, e.time_ns)
+    np.testing.assert_allclose(true_m[0], 4.0)
+    np.testing.assert_allclose(true_m[1], np.hypot(3.0, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("text", "fragment"),
+    [
+        ("[[anchors]]\nid = 9\n", "anchors[0].position_m"),
+        ("[[anchors]]\nid = 9\nposition_m = [1, 2]\n", "three numbers"),
+        ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\n" * 2, "a second 9"),
+        ("[[anchors]]\nid = 9\nplace = [1, 2, 3]\n", "unknown key"),
+        ("anchors = 3\n", "expected [[anchors]] tables"),
+        ("a = 3\n", "no [[anchors]]"),
+    ],
+)
+def test_anchors_that_cannot_be(recording, tmp_path, text, fragment):
+    (tmp_path / "places.toml").write_text(text)
+    with pytest.raises(PlanError) as caught:
+        add_poses(recording, tmp_path / "car.tum", body="car", tags_from=tmp_path / "places.toml")
+    assert fragment in str(caught.value)
+    assert not load(recording).poses
