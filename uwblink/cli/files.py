@@ -10,7 +10,14 @@ import typer
 from uwblink.cli.imports import ImportGroup
 from uwblink.cli.shared import AsJson, Force, print_json
 
-imports = typer.Typer(cls=ImportGroup, help="Turn other files into recordings.", no_args_is_help=True)
+EXAMPLES = """Examples: \n
+uwblink import guess ranges.csv -o map.toml \n
+uwblink import csv ranges.csv --map map.toml -o ranges.uwb \n
+uwblink import csv folder_of_tables -o all.uwb \n
+uwblink import miluv cirObstacles_3_random_0 -o flight.uwb \n
+docs/importing.md explains every key of a map."""
+
+imports = typer.Typer(cls=ImportGroup, help="Turn other files into recordings.", epilog=EXAMPLES, no_args_is_help=True)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -48,7 +55,7 @@ def show(
 
 def export(
     recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
-    to: Annotated[str, typer.Option(help="csv, parquet or tum.")],
+    to: Annotated[str, typer.Option(help="csv, parquet, tum or mcap.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
     force: Force = False,
 ) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
+from uwblink.exporters.mcap import write_mcap
 from uwblink.exporters.tables import write_csv, write_parquet
 from uwblink.exporters.tum import write_tum
 from uwblink.plugins import NAME, Registry
@@ -42,6 +43,7 @@ _OWN: Final = (
     Exporter("csv", write_csv, "a CSV file a table"),
     Exporter("parquet", write_parquet, "a Parquet file a table"),
     Exporter("tum", write_tum, "a trajectory a body (time x y z qx qy qz qw)"),
+    Exporter("mcap", write_mcap, "one file of JSON messages, for Foxglove and PlotJuggler"),
 )
 
 EXPORTERS: Final[Registry[Exporter]] = Registry("exporter", "uwbcal.exporters", _OWN, check_exporter)

@@ -1,0 +1,113 @@
+"""MCAP by the letter of its specification, walked here record by record."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from uwblink.errors import RecordingError
+from uwblink.exporters import export_recording
+from uwblink.recording.contents import Contents
+from uwblink.recording.schema import Fault, Poses
+from uwblink.twr import Exchanges
+
+MAGIC = bytes([0x89]) + b"MCAP0\r\n"
+
+
+def walk(data):
+    """Yield opcode and content of every record between the two magics."""
+    assert data[:8] == data[-8:] == MAGIC
+    place = 8
+    while place < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, place)
+        yield opcode, data[place + 9 : place + 9 + length]
+        place += 9 + length
+    assert place == len(data) - 8
+
+
+def texts(data, place, count):
+    found = []
+    for _ in range(count):
+        (length,) = struct.unpack_from("<I", data, place)
+        found.append(data[place + 4 : place + 4 + length].decode())
+        place += 4 + length
+    return found
+
+
+def read(path):
+    records = list(walk(path.read_bytes()))
+    opcodes = [opcode for opcode, _ in records]
+    assert opcodes[0] == 0x01
+    assert opcodes[-2:] == [0x0F, 0x02]
+    schemas, channels, messages = {}, {}, []
+    for opcode, content in records:
+        if opcode == 0x03:
+            name, encoding, schema = texts(content, 2, 3)
+            assert encoding == "jsonschema"
+            schemas[struct.unpack_from("<H", content)[0]] = name, json.loads(schema)
+        elif opcode == 0x04:
+            number, schema = struct.unpack_from("<HH", content)
+            topic, encoding = texts(content, 4, 2)
+            assert encoding == "json"
+            channels[number] = topic, schemas[schema]
+        elif opcode == 0x05:
+            channel, _, logged, _ = struct.unpack_from("<HIQQ", content)
+            topic, (name, schema) = channels[channel]
+            content = json.loads(content[22:])
+            assert set(content) <= set(schema["properties"])
+            messages.append((logged, topic, name, content))
+    return messages
+
+
+@pytest.fixture
+def recording(tmp_path):
+    when = 1_706_822_508_042_560_815
+    e = Exchanges.from_arrays(
+        [1, 2], [2, 1], time_ns=[when + 5, when], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009],
+        fpp1_dbm=[-80.5, np.nan],
+    )  # fmt: skip
+    poses = Poses.from_arrays([when + 1], "drone", [[1.0, 2.0, 3.0]], [[0.0, 0.0, 0.6, 0.8]])
+    imu = {n: np.array([k * 1.0]) for k, n in enumerate(("wx", "wy", "wz", "ax", "ay", "az"))}
+    held = Contents(
+        exchanges=e,
+        poses=poses,
+        imu={"time_ns": np.array([when + 2]), "body": np.array(["drone"]), **imu},
+        height={"time_ns": np.array([when + 3]), "body": np.array(["drone"]), "height_m": np.array([0.5])},
+        faults=[Fault(when + 4, "7", "time-out", 'no "answer"')],
+    )
+    held.save(tmp_path / "r.uwb")
+    return tmp_path / "r.uwb", when
+
+
+def test_every_message_is_there_in_order_of_time(recording, tmp_path):
+    path, when = recording
+    assert export_recording(path, tmp_path / "out", to="mcap") == {"recording.mcap": 7}
+    messages = read(tmp_path / "out" / "recording.mcap")
+    assert [logged - when for logged, *_ in messages] == [0, 1, 1, 2, 3, 4, 5]
+    by_topic = {topic: (name, content) for _, topic, name, content in messages}
+    name, content = by_topic["/poses/drone"]
+    assert name == "foxglove.PoseInFrame"
+    assert content["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 3.0}
+    assert content["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+    assert content["timestamp"] == {"sec": 1_706_822_508, "nsec": 42_560_816}
+    name, content = by_topic["/tf"]
+    assert (name, content["parent_frame_id"], content["child_frame_id"]) == (
+        "foxglove.FrameTransform",
+        "world",
+        "drone",
+    )
+    assert by_topic["/ranges/1_2"][1]["fpp1_dbm"] == -80.5
+    assert by_topic["/ranges/1_2"][1]["range_m"] == pytest.approx(4.690357)
+    assert "fpp1_dbm" not in by_topic["/ranges/2_1"][1], "JSON has no word for what was not measured"
+    assert by_topic["/imu/drone"][1]["linear_acceleration"] == {"x": 3.0, "y": 4.0, "z": 5.0}
+    assert by_topic["/height/drone"][1]["height_m"] == 0.5
+    assert by_topic["/faults"][1]["message"] == 'time-out: no "answer"'
+
+
+def test_times_before_1970_are_refused(tmp_path):
+    e = Exchanges.from_arrays([1], [2], time_ns=[-5], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    Contents(exchanges=e).save(tmp_path / "r.uwb")
+    with pytest.raises(RecordingError, match="before 1970"):
+        export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,157 @@
+"""A recording as one MCAP file of JSON messages for Foxglove and PlotJuggler: poses, frames, ranges, readings, faults.
+
+The format is that of the MCAP specification, version 0: records of an opcode, a length and a content, little-endian.
+The file has no index; readers walk it from the beginning. Poses, frames and logs have the schemas that Foxglove knows.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from heapq import merge
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+
+from uwblink.errors import RecordingError
+from uwblink.recording.contents import Contents, load
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x0F
+WORLD: Final = "world"
+WARNING: Final = 3
+"""The level of a foxglove.Log that faults have."""
+
+Message = tuple[int, str, str, dict[str, Any]]
+"""Time in nanoseconds, topic, schema, content."""
+
+_NUMBER: Final = {"type": "number"}
+_INTEGER: Final = {"type": "integer"}
+_TEXT: Final = {"type": "string"}
+
+
+def _object(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+_TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
+_VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
+_QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+SCHEMAS: Final[dict[str, dict[str, Any]]] = {
+    "foxglove.PoseInFrame": _object(
+        timestamp=_TIME, frame_id=_TEXT, pose=_object(position=_VECTOR, orientation=_QUATERNION)
+    ),
+    "foxglove.FrameTransform": _object(
+        timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_QUATERNION
+    ),
+    "foxglove.Log": _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER),
+    "uwb.Range": _object(
+        timestamp=_TIME, initiator=_INTEGER, target=_INTEGER, protocol=_TEXT,
+        **dict.fromkeys(("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm"), _NUMBER),
+    ),
+    "uwb.Imu": _object(timestamp=_TIME, angular_velocity=_VECTOR, linear_acceleration=_VECTOR),
+    "uwb.Height": _object(timestamp=_TIME, height_m=_NUMBER),
+}  # fmt: skip
+
+
+def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
+    """Write `recording.mcap`; returns its messages. Times before 1970 cannot be written and raise `RecordingError`."""
+    held = load(recording)
+    parts = (_poses(held), _ranges(held), _imu(held), _heights(held), _faults(held))
+    messages = merge(*parts, key=lambda message: message[0])
+    with (folder / "recording.mcap").open("wb") as file:
+        count = _write(recording, file, messages)
+    return {"recording.mcap": count}
+
+
+def _write(recording: Path, file: BinaryIO, messages: Iterator[Message]) -> int:
+    file.write(MAGIC)
+    _record(file, HEADER, _text("") + _text("uwbcal"))
+    for number, (name, layout) in enumerate(SCHEMAS.items(), start=1):
+        data = json.dumps(layout).encode()
+        _record(file, SCHEMA, struct.pack("<H", number) + _text(name) + _text("jsonschema") + _bytes(data))
+    channels: dict[str, int] = {}
+    count = 0
+    for time_ns, topic, schema, content in messages:
+        if time_ns < 0:
+            raise RecordingError(f"{recording}: has times before 1970, which MCAP cannot hold")
+        if topic not in channels:
+            channels[topic] = len(channels) + 1
+            ids = struct.pack("<HH", channels[topic], list(SCHEMAS).index(schema) + 1)
+            _record(file, CHANNEL, ids + _text(topic) + _text("json") + struct.pack("<I", 0))
+        sec, nsec = divmod(time_ns, 1_000_000_000)
+        data = json.dumps({"timestamp": {"sec": sec, "nsec": nsec}} | content, allow_nan=False).encode()
+        _record(file, MESSAGE, struct.pack("<HIQQ", channels[topic], count & 0xFFFFFFFF, time_ns, time_ns) + data)
+        count += 1
+    _record(file, DATA_END, struct.pack("<I", 0))
+    _record(file, FOOTER, struct.pack("<QQI", 0, 0, 0))
+    file.write(MAGIC)
+    return count
+
+
+def _record(file: BinaryIO, opcode: int, content: bytes) -> None:
+    file.write(struct.pack("<BQ", opcode, len(content)) + content)
+
+
+def _bytes(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
+
+
+def _text(text: str) -> bytes:
+    return _bytes(text.encode())
+
+
+def _vector(x: float, y: float, z: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
+
+
+def _poses(held: Contents) -> Iterator[Message]:
+    poses = held.poses
+    columns = (poses.time_ns.tolist(), poses.body.tolist(), poses.position_m.tolist(), poses.quaternion.tolist())
+    for time_ns, body, place, (x, y, z, w) in zip(*columns, strict=True):
+        position, attitude = _vector(*place), {"x": x, "y": y, "z": z, "w": w}
+        pose = {"position": position, "orientation": attitude}
+        yield time_ns, f"/poses/{body}", "foxglove.PoseInFrame", {"frame_id": WORLD, "pose": pose}
+        frames = {"parent_frame_id": WORLD, "child_frame_id": body}
+        yield time_ns, "/tf", "foxglove.FrameTransform", frames | {"translation": position, "rotation": attitude}
+
+
+def _ranges(held: Contents) -> Iterator[Message]:
+    e = held.exchanges
+    names = ("initiator", "target", "protocol", *(n for n in SCHEMAS["uwb.Range"]["properties"] if n.endswith(_UNITS)))
+    columns = {name: getattr(e, name).tolist() for name in names}
+    for k in np.argsort(e.time_ns, kind="stable").tolist():
+        row = {name: column[k] for name, column in columns.items()}
+        yield int(e.time_ns[k]), f"/ranges/{row['initiator']}_{row['target']}", "uwb.Range", _known(row)
+
+
+_UNITS: Final = ("_m", "_dbm", "_ppm")
+
+
+def _known(row: dict[str, Any]) -> dict[str, Any]:
+    """Leave out numbers that are none: JSON has no word for them."""
+    return {name: value for name, value in row.items() if not isinstance(value, float) or np.isfinite(value)}
+
+
+def _imu(held: Contents) -> Iterator[Message]:
+    if held.imu:
+        columns = [held.imu[name].tolist() for name in ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")]
+        for time_ns, body, *values in zip(*columns, strict=True):
+            turn, pull = (_known(_vector(*part)) for part in (values[:3], values[3:]))
+            yield time_ns, f"/imu/{body}", "uwb.Imu", {"angular_velocity": turn, "linear_acceleration": pull}
+
+
+def _heights(held: Contents) -> Iterator[Message]:
+    if held.height:
+        for time_ns, body, height in zip(
+            *(held.height[n].tolist() for n in ("time_ns", "body", "height_m")), strict=True
+        ):
+            yield time_ns, f"/height/{body}", "uwb.Height", _known({"height_m": height})
+
+
+def _faults(held: Contents) -> Iterator[Message]:
+    for fault in sorted(held.faults, key=lambda fault: fault.time_ns):
+        text = {"message": f"{fault.kind}: {fault.detail}", "name": fault.board, "file": "", "line": 0}
+        yield fault.time_ns, "/faults", "foxglove.Log", {"level": WARNING, **text}
