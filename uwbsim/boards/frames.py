@@ -18,6 +18,7 @@ from uwbsim.scenario.airtime import FINAL_BYTES, POLL_BYTES, RESPONSE_BYTES
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.clocks import Clocks
+from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
@@ -144,10 +145,8 @@ class Radios:
 
     def excess_m(self) -> float:
         """Draw the detour of an exchange's signals."""
-        multipath = self.scenario.radio.multipath
-        if multipath and self._chance.random() < multipath.probability:
-            return float(self._chance.exponential(multipath.mean_excess_m))
-        return 0.0
+        share, mean_m = self.scenario.radio.independent_multipath
+        return float(self._chance.exponential(mean_m)) if share and self._chance.random() < share else 0.0
 
     def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
         """Return a frame that leaves at a transmit stamp of its sender's clock, and how every board receives it."""
@@ -173,9 +172,10 @@ class Radios:
         at, k = frame.receptions, self.place[board]
         return Received(frame, int(at.stamp[k]), float(at.printed_dbm[k]), float(at.skew_ppm[k]))
 
-    def echoes(self, sender: int, receiver: int, time: int) -> list[tuple[float, float]]:
-        """Return the reflections at a board, as `World.echoes` does."""
-        return self.world.echoes(self.place[sender], self.place[receiver], time)
+    def paths(self, frame: Frame, receiver: int) -> PathsHeard:
+        """Return the paths that a frame took to a board, as `World.paths` does."""
+        detour = frame.excess_m if frame.receiver == receiver else 0.0
+        return self.world.paths(self.place[frame.sender], self.place[receiver], frame.departure, detour)
 
     def _receptions(self, sender: int, departure: int, excess_m: Floats) -> Receptions:
         chance, count = self._chance, len(self._all)

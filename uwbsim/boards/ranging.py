@@ -194,8 +194,8 @@ def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) 
     yield board.sleep(int(board.chance.integers(*TO_CIR)))
     board.release()
     frame = last.frame
-    echoes = board.bench.radios.echoes(frame.sender, board.id, frame.departure)
-    index, taps = impulse_response(board.chance, last.stamp & MASK, echoes)
+    paths = board.bench.radios.paths(frame, board.id)
+    index, taps = impulse_response(board.chance, last.stamp & MASK, paths)
     for piece in in_transfers(encode(Cir(initiator, target, index, taps))):
         board.say(piece)
         yield board.sleep(MS + int(board.chance.integers(0, 120 * US)))

@@ -201,7 +201,7 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
 def calibrated(conditions: Conditions) -> Conditions:
     """Return the same world as a calibration leaves it: no antenna delays, no bias by power, no reflections."""
     delays = {f"{end}_delay_{side}": 0.0 for end in ("tx", "rx") for side in ("initiator", "target")}
-    return replace(conditions.with_columns(late=0.0, **delays), multipath=0.0)
+    return replace(conditions.with_columns(late=0.0, excess=0.0, **delays), multipath=0.0)
 
 
 def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[dict[str, Any]]:

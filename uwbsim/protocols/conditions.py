@@ -30,15 +30,17 @@ STEP_S: Final = 1e-3
 class Conditions:
     """The state of the world in exchanges, columns of length n; times of flight and delays in seconds.
 
+    `flight` is that of the straight line, `excess` what the first path takes longer: an error of the range.
     Clocks run at 1 + rate; `drift` is the change of the rate in 1/s, `white` its white noise, a fraction times the root
     of a second (of flicker and random walk there is only the rate that they have reached). `late` is what power adds to
-    each reception and `rx_std` its noise; `tx_std` the noise of a transmission. `at_once` and `scheduled` are the two
-    kinds of reply, `carrier_bias_ppm` and `carrier_std_ppm` those of the carrier integrator; `multipath` is the
-    probability of a detour of `detour_s` on average, which all messages of an exchange take. `quantize` says whether
-    stamps are whole ticks and delayed transmissions on the chip's grid.
+    each reception and `rx_std` its noise, both on average over the two directions; `tx_std` that of transmissions.
+    `at_once` and `scheduled` are the two kinds of reply, `carrier_bias_ppm` and `carrier_std_ppm` those of the carrier
+    integrator; `multipath` is the probability of a detour of `detour_s` on average, which all messages of an exchange
+    take. `quantize` says whether stamps are whole ticks and delayed transmissions on the chip's grid.
     """
 
     flight: Floats
+    excess: Floats
     flight_rate: Floats
     rate_initiator: Floats
     rate_target: Floats
@@ -102,12 +104,16 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     world, clocks, radio = World.of(scenario), Clocks.of(scenario), scenario.radio
     link = world.link(i, j, start)
     later = world.link(i, j, start + round(STEP_S * SUBTICKS_PER_SECOND))
-    arrival = arrive(radio, link)
+    arrivals = [arrive(radio, link)]
+    if any(tag.tx_power_db for tag in scenario.tags):
+        arrivals.append(arrive(radio, world.link(j, i, start)))
     delays = np.array([tag.antenna_delays_s for tag in scenario.tags])
     white = np.array([tag.white_sqrt_s for tag in scenario.tags])
+    share, mean_m = radio.independent_multipath
     nothing = np.zeros(len(rows))
     return Conditions(
-        flight=arrival.flight_s,
+        flight=link.distance_m / SPEED_OF_LIGHT,
+        excess=link.excess_m / SPEED_OF_LIGHT,
         flight_rate=(later.distance_m - link.distance_m) / STEP_S / SPEED_OF_LIGHT,
         rate_initiator=clocks.exchange_rate(i, start),
         rate_target=clocks.exchange_rate(j, start),
@@ -115,8 +121,8 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         drift_target=nothing,
         white_initiator=white[i],
         white_target=white[j],
-        late=arrival.bias_s,
-        rx_std=arrival.std_s,
+        late=np.mean([arrival.bias_s for arrival in arrivals], axis=0),
+        rx_std=np.sqrt(np.mean([arrival.std_s**2 for arrival in arrivals], axis=0)),
         tx_std=np.full(len(rows), radio.tx_noise_s),
         tx_delay_initiator=delays[i, 0],
         rx_delay_initiator=delays[i, 1],
@@ -127,7 +133,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         power_dbm=link.power_dbm,
         carrier_bias_ppm=radio.skew_bias_ppm,
         carrier_std_ppm=radio.skew_noise_ppm,
-        multipath=radio.multipath.probability if radio.multipath else 0.0,
-        detour_s=radio.multipath.mean_excess_m / SPEED_OF_LIGHT if radio.multipath else 0.0,
+        multipath=share,
+        detour_s=mean_m / SPEED_OF_LIGHT,
         quantize=radio.quantize,
     )

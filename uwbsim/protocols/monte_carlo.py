@@ -68,6 +68,7 @@ class _Ticks:
     def __init__(self, c: Conditions) -> None:
         scale = 1 / TICK_S
         self.flight, self.flight_rate = c.flight * scale, c.flight_rate
+        self.way = (c.flight + c.excess) * scale
         self.faster = {"initiator": 1 + c.rate_initiator, "target": 1 + c.rate_target}
         self.slower = {side: 1 / rate for side, rate in self.faster.items()}
         drifts = {"initiator": c.drift_initiator, "target": c.drift_target}
@@ -154,7 +155,7 @@ def _execute(protocol: RangingProtocol, c: _Ticks, draws: _Draws) -> Floats:
     flights: list[Floats] = []
     wander = {side: _Wander(c.white[side], steps) for side, steps in draws.clocks.items()} if draws.clocks else None
     carrier_noise: Floats | float = 0.0
-    path = c.flight if draws.detour is None else c.flight + draws.detour * c.detour
+    path = c.way if draws.detour is None else c.way + draws.detour * c.detour
     for k, message in enumerate(protocol.messages):
         sender = message.sender
         receiver = SIDES[1 - SIDES.index(sender)]

@@ -62,7 +62,7 @@ class Prediction:
 def predict(protocol: RangingProtocol, c: Conditions) -> Prediction:
     """Predict the error of a protocol under conditions (n,)."""
     spans, (leave, arrive) = _noiseless(protocol, c)
-    truth = (arrive[0] - leave[0] + arrive[1] - leave[1]) / 2 / TICK_S
+    truth = ((arrive[0] - leave[0] + arrive[1] - leave[1]) / 2 - c.excess) / TICK_S
     slopes = dict(_slopes(protocol, spans))
     stamps = _by_stamp(protocol, slopes)
     squares = {kind: _sum_of_squares(stamps, kind) for kind in ("tx", "rx")}
@@ -95,7 +95,8 @@ def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, tup
     replies = [_reply_s(protocol, k, c) for k in range(1, len(protocol.messages))]
     # True instants at the antennas, from the departure of the poll.
     leave = [np.zeros(len(c))]
-    arrive = [c.flight]
+    way = c.flight + c.excess
+    arrive = [way]
     for k, message in enumerate(protocol.messages[1:], start=1):
         side, before = message.sender, message.after
         since = arrive[k - 1] if before.startswith("rx") else leave[k - 1]
@@ -103,7 +104,7 @@ def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, tup
         added = tx[side] - (rx[side] if before.startswith("rx") else tx[side])
         true = (replies[k - 1] - added) / (1 + rate[side])
         leave.append(since + true)
-        arrive.append(leave[k] + c.flight + c.flight_rate * leave[k])
+        arrive.append(leave[k] + way + c.flight_rate * leave[k])
 
     def read(side: str, later: Floats, earlier: Floats) -> Floats:
         return (1 + rate[side]) * (later - earlier) + drift[side] / 2 * (later**2 - earlier**2)

@@ -16,7 +16,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.airtime import exchange_air_s
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints
-from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline
+from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline, TwoStateMultipath
 from uwbsim.units import MS, NS, PPM, US
 
 ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
@@ -150,7 +150,8 @@ class Tag(Section):
     The clock: `drift_ppm_per_sqrt_s` is the random walk of its rate (Allan deviation q sqrt(tau/3)),
     `white_ppm_sqrt_s` white noise of its rate (Allan deviation h/sqrt(tau)), `flicker_ppm` flicker noise of its rate
     (the same Allan deviation at every tau), `ramp_ppm_per_s` what a change of temperature adds. A `passive` tag records
-    the exchanges that it overhears.
+    the exchanges that it overhears. `tx_power_db` is how much stronger than others it sends, `power_offset_db` how much
+    too high it reads powers.
     """
 
     id: TagId
@@ -165,6 +166,8 @@ class Tag(Section):
     flicker_ppm: NotNegative = 0.0
     ramp_ppm_per_s: float = 0.0
     passive: bool = False
+    tx_power_db: float = 0.0
+    power_offset_db: float = 0.0
     clock_offset_s: NotNegative | None = None
 
     @model_validator(mode="after")
@@ -243,11 +246,21 @@ class Scenario(Section):
                 if tag_id not in ids:
                     known = ", ".join(map(str, ids))
                     raise ValueError(f"ranging.pairs: found tag {tag_id}, the tags are {known}")
+        self._check_reflections(ids)
         self._check_places()
         self._check_plan(ids)
         if not self.pairs():
             raise ValueError("ranging.pairs: no two tags sit on different bodies, so nobody ranges")
         return self
+
+    def _check_reflections(self, ids: list[int]) -> None:
+        """Pairs whose reflections are known must be pairs of tags."""
+        model = self.radio.multipath
+        for k, known in enumerate(model.pairs if isinstance(model, TwoStateMultipath) else ()):
+            for tag_id in known.tags:
+                if tag_id not in ids:
+                    there = ", ".join(map(str, ids))
+                    raise ValueError(f"radio.multipath.pairs[{k}].tags: found tag {tag_id}, the tags are {there}")
 
     def _check_places(self) -> None:
         """Bodies must be inside the room, and tags of one body further apart than a wavelength."""

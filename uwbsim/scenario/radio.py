@@ -7,9 +7,9 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from uwbsim.scenario.base import NotNegative, Positive, Section, Share, Vector
+from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId, Vector
 from uwbsim.scenario.published_curves import BIAS, SIGMA
-from uwbsim.units import PS
+from uwbsim.units import NS, PS
 
 MATERIALS: Final = {
     "air": (0.0, 1.0),
@@ -79,11 +79,83 @@ def _named(known: dict[str, dict[str, Any] | None]) -> Any:
     return BeforeValidator(look_up)
 
 
-class Multipath(Section):
-    """The positive tail: with `probability` an exchange travels an exponential excess distance."""
+class IndependentMultipath(Section):
+    """The positive tail, drawn for each exchange alone: with `probability` it travels an exponential excess distance.
 
+    All pairs are alike, nothing lasts, and neither power nor impulse response tells such an exchange from others.
+    """
+
+    model: Literal["independent"] = "independent"
     probability: Share
     mean_excess_m: Positive
+
+
+class PairMultipath(Section):
+    """What a pair of tags has of reflections where it is known; the rest is drawn."""
+
+    tags: tuple[TagId, TagId]
+    share: Share | None = None
+    life_s: Positive | None = None
+
+
+class TwoStateMultipath(Section):
+    """Reflections that last: at any time a pair's first path is the direct one or a reflection.
+
+    At random instants, on average a pair's life apart, a pair's path is drawn anew: with its share a reflection, whose
+    excess length has a gamma distribution of mean `mean_excess_m` and shape `excess_shape` (1 is exponential). So both
+    the state and the excess have the autocorrelation exp(-dt/life). Pairs' shares have the mean `share` and the
+    standard deviation `share_std` (a beta distribution), their lives the median `life_s` and `life_spread` as the
+    standard deviation of the logarithm; `pairs` has those that are known. A reflection leaves its trace: its first path
+    is weaker than the direct one by `first_path_loss_db` on average (`loss_std_db` about it) and all paths together by
+    `total_loss_db`, with most of the power in a path that comes `rise_ns` later on average.
+    """
+
+    model: Literal["two-state"]
+    share: Share = 0.1
+    share_std: NotNegative = 0.0
+    life_s: Annotated[float, Field(ge=0.01)] = 0.5
+    life_spread: Annotated[float, Field(ge=0, le=2)] = 0.0
+    mean_excess_m: Positive = 0.4
+    excess_shape: Positive = 1.0
+    first_path_loss_db: NotNegative = 8.0
+    loss_std_db: NotNegative = 2.0
+    total_loss_db: NotNegative = 2.0
+    rise_ns: Positive = 6.0
+    pairs: tuple[PairMultipath, ...] = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.share_std and self.share_std**2 >= self.share * (1 - self.share):
+            most = (self.share * (1 - self.share)) ** 0.5
+            raise ValueError(
+                f"share_std: found {self.share_std:g}, with a mean of {self.share:g} it is below {most:.3g}"
+            )
+        if self.total_loss_db > self.first_path_loss_db:
+            raise ValueError(
+                f"total_loss_db: found {self.total_loss_db:g}, at most first_path_loss_db ({self.first_path_loss_db:g})"
+            )
+        known = [frozenset(pair.tags) for pair in self.pairs]
+        for k, pair in enumerate(known):
+            if len(pair) < 2 or pair in known[:k]:
+                raise ValueError(
+                    f"pairs[{k}].tags: found {list(self.pairs[k].tags)}, give two tags, and each pair once"
+                )
+        return self
+
+    @property
+    def rise_s(self) -> float:
+        """Return in seconds how much later the strongest path comes on average."""
+        return self.rise_ns * NS
+
+
+def _independent_unless_named(value: Any) -> Any:
+    return {"model": "independent"} | value if isinstance(value, dict) else value
+
+
+Multipath = Annotated[
+    Annotated[IndependentMultipath | TwoStateMultipath, Field(discriminator="model")],
+    BeforeValidator(_independent_unless_named),
+]
 
 
 class AntennaTable(Section):
@@ -134,6 +206,13 @@ class Radio(Section):
     bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = None
     sigma: Annotated[SigmaSpline | None, _named(SIGMA)] = None
     multipath: Multipath | None = None
+
+    @property
+    def independent_multipath(self) -> tuple[float, float]:
+        """Return probability and mean in metres of detours that are drawn for each exchange alone; zeros for none."""
+        if isinstance(self.multipath, IndependentMultipath):
+            return self.multipath.probability, self.multipath.mean_excess_m
+        return 0.0, 0.0
 
     @property
     def tx_noise_s(self) -> float:

@@ -83,10 +83,11 @@ def responses(
     last = max(k for k, message in enumerate(protocol.messages) if message.sender == "target")
     stamps = getattr(exchanges, f"rx{last + 1}")
     place = {tag.id: k for k, tag in enumerate(scenario.tags)}
-    columns = (exchanges.time_ns, exchanges.initiator, exchanges.target, stamps, stamped.frames[last].departure)
+    times = (exchanges.time_ns, stamped.frames[last].departure)
+    columns = (exchanges.initiator, exchanges.target, stamps, stamped.detour_m, *times)
     rows = []
-    for time_ns, initiator, target, rx, departure in zip(*(c.tolist() for c in columns), strict=True):
-        echoes = world.echoes(place[target], place[initiator], departure)
-        index, taps = impulse_response(rng, rx, echoes)
+    for initiator, target, rx, detour_m, time_ns, departure in zip(*(c.tolist() for c in columns), strict=True):
+        paths = world.paths(place[target], place[initiator], departure, detour_m)
+        index, taps = impulse_response(rng, rx, paths)
         rows.append(CirRow(time_ns, initiator, initiator, target, index / INDEX_STEPS, taps))
     return rows

@@ -202,8 +202,7 @@ def _described(flight: Simulated) -> str:
 def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
     """Give the event loop what it needs, as plain integers, a list a host: it does no arithmetic of its own."""
     scenario, messages = run.scenario, run.protocol.messages
-    power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
-    heard = _heard(run, power)
+    heard = _heard(run, plan)
     scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
     at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
     delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in messages]
@@ -225,8 +224,7 @@ def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
 
 def _undisturbed(run: _Run, plan: Schedule) -> air.Outcomes:
     """What becomes of exchanges that do not meet: only a message too weak to be heard is lost."""
-    power = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
-    heard = _heard(run, power)
+    heard = _heard(run, plan)
     lost = np.where(heard.all(axis=0), -1, np.argmin(heard, axis=0))
     marker = round(before_marker_s(run.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
     reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
@@ -257,10 +255,14 @@ def _rules(scenario: Scenario) -> air.Rules:
     return air.Rules(radio.sensitivity_dbm, radio.capture_db, radio.preamble_symbols)
 
 
-def _heard(run: _Run, power_dbm: Floats) -> Bools:
+def _heard(run: _Run, plan: Schedule) -> Bools:
     """Whether each message (messages, n) is received; a little fading makes the edge soft."""
-    shape = (len(run.protocol.messages), len(power_dbm))
-    return run.medium.heard(power_dbm, stream(run.scenario.run.seed, "fading").normal(size=shape))
+    forth = back = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
+    if any(tag.tx_power_db for tag in run.scenario.tags):
+        back = run.world.link(plan.target, plan.initiator, plan.start).power_dbm
+    power_dbm = np.array([forth if m.sender == "initiator" else back for m in run.protocol.messages])
+    fading = stream(run.scenario.run.seed, "fading").normal(size=power_dbm.shape)
+    return run.medium.heard(power_dbm, fading)
 
 
 def _exchanges(run: _Run, kept: Ints, planned: int, rows: Begun, stamped: Stamped) -> Exchanges:

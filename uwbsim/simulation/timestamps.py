@@ -59,24 +59,27 @@ class Begun:
 class Stamped:
     """Stamps in whole ticks, not wrapped, and what the messages met on their way, (n,) each; one list item a message.
 
-    `frames` are the messages with their senders, receivers and departures.
+    `frames` are the messages with their senders, receivers and departures; `detour_m` (n,) what all travel further by
+    chance.
     """
 
     stamps: dict[str, Ints]
     frames: list[Frames]
     distance_m: list[Floats]
     power_dbm: list[Floats]
+    detour_m: Floats
 
 
 def draw(scenario: Scenario, count: int, messages: int) -> Draws:
     """Draw for `count` planned slots from the scenario's named streams."""
-    seed, radio = scenario.run.seed, scenario.radio
+    seed = scenario.run.seed
     numbers = range(messages)
     excess = np.zeros(count)
-    if radio.multipath:
+    share, mean_m = scenario.radio.independent_multipath
+    if share:
         rng = stream(seed, "multipath")
-        hit = rng.random(count) < radio.multipath.probability
-        excess = np.where(hit, rng.exponential(radio.multipath.mean_excess_m, count), 0.0)
+        hit = rng.random(count) < share
+        excess = np.where(hit, rng.exponential(mean_m, count), 0.0)
     return Draws(
         transmit=np.array([stream(seed, "transmit noise", k).normal(size=count) for k in numbers]),
         receive=np.array([stream(seed, "receive noise", k).normal(size=count) for k in numbers]),
@@ -109,7 +112,7 @@ def stamp(
     scenario, clocks = medium.scenario, medium.clocks
     delay_uus = scenario.ranging.response_delay_uus if response_delay_uus is None else response_delay_uus
     delays = medium.delays()
-    result = Stamped({}, [], [], [])
+    result = Stamped({}, [], [], [], draws.excess_m)
     ready = clocks.read(begun.initiator, begun.start)
     for k, message in enumerate(protocol.messages):
         ends = (begun.initiator, begun.target)

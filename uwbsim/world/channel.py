@@ -13,14 +13,18 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.radio import Shadow
-from uwbsim.world.propagation import Link, ellipsoid_chord_m, first_path, reflected_lengths_m, through
+from uwbsim.scenario.radio import Shadow, TwoStateMultipath
+from uwbsim.world.propagation import SURFACES, Link, ellipsoid_chord_m, first_path, reflections, through, with_path
 from uwbsim.world.radio import gain_db, path_gain_db
+from uwbsim.world.reflected_states import ReflectedStates
 
 SHORTEST_M: Final = 1e-10
 """Nearer than this two antennas have no direction."""
+
+NOTHING_MW: Final = 1e-30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,9 +42,10 @@ class Ends:
 
     `time_s` (n,) is true time; `places` are the tags at the two ends as places in the scenario's list, (n,) each;
     `antennas_m` where their antennas are, (n, 3) each, and `rotations` how they are turned, body to world, (n, 3, 3)
-    each. `shadows` are the bodies that may stand in between; `phases` (tags, harmonics) those of the tags' shadowing.
-    `distance_m` and `gain_db`, (n,) each, follow from these: the lengths of the straight lines, and what the two
-    antennas together add along them.
+    each. `shadows` are the bodies that may stand in between; `phases` (tags, harmonics) those of the tags' shadowing;
+    `states` the reflections that last by pair, where the scenario has such.
+    `distance_m` and `gain_db`, (n,) each, follow from these: the lengths of the straight lines, and what the sender's
+    power and the two antennas together add along them. The first end sends.
     """
 
     scenario: Scenario
@@ -50,6 +55,7 @@ class Ends:
     antennas_m: tuple[Floats, Floats]
     rotations: tuple[Floats, Floats]
     shadows: Sequence[PlacedShadow]
+    states: ReflectedStates | None = None
     distance_m: Floats = field(init=False)
     gain_db: Floats = field(init=False)
 
@@ -58,12 +64,22 @@ class Ends:
         apart = self.antennas_m[1] - self.antennas_m[0]
         distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
         towards = apart / np.maximum(distance, SHORTEST_M)[:, None]
-        radio, gain = self.scenario.radio, np.zeros(len(distance))
-        for tags, rotation, way in zip(self.places, self.rotations, (towards, -towards), strict=True):
+        object.__setattr__(self, "distance_m", distance)
+        object.__setattr__(self, "gain_db", self.gain_towards_db(towards, -towards))
+
+    def gain_towards_db(self, leaving: Floats, arriving: Floats) -> Floats:
+        """Return what the sender's power and the antennas add to paths, (n,).
+
+        `leaving` are the unit vectors (n, 3) in which they leave the sender, `arriving` those in which the receiver
+        sees them come.
+        """
+        radio, gain = self.scenario.radio, np.zeros(len(leaving))
+        for tags, rotation, way in zip(self.places, self.rotations, (leaving, arriving), strict=True):
             phases = self.phases[tags] if radio.shadowing_db else self.phases
             gain = gain + gain_db(radio, phases, np.einsum("ni,nij->nj", way, rotation))
-        object.__setattr__(self, "distance_m", distance)
-        object.__setattr__(self, "gain_db", gain)
+        if any(tag.tx_power_db for tag in self.scenario.tags):
+            gain = gain + np.array([tag.tx_power_db for tag in self.scenario.tags])[self.places[0]]
+        return gain
 
     def tags(self) -> tuple[Ints, Ints]:
         """Return the ids of the tags at the two ends, (n,) each."""
@@ -91,27 +107,62 @@ def _obstacles(link: Link, ends: Ends) -> Link:
     return replace(link, excess_m=excess, power_dbm=link.power_dbm - loss, total_dbm=link.total_dbm - loss)
 
 
-def _reflections(link: Link, ends: Ends) -> Link:
-    room, radio = ends.scenario.room, ends.scenario.radio
-    if room is None or room.reflection_loss_db is None:
-        return link
-    lengths = reflected_lengths_m(room, *ends.antennas_m)
-    echoes = path_gain_db(radio, lengths) + ends.gain_db[:, None] - room.reflection_loss_db
-    return first_path(link, lengths, echoes, radio.dynamic_range_db)
-
-
 def _shadows(link: Link, ends: Ends) -> Link:
+    """Bodies in the way of the direct path, before the first path is chosen."""
     for body in ends.shadows:
-        a, b = (np.einsum("nkj,nk->nj", body.rotation, spot - body.position_m) for spot in ends.antennas_m)
-        loss = ellipsoid_chord_m(body.shadow, a, b) * body.shadow.loss_db_per_m
+        loss = _shadow_db(body, *(spots[:, None] for spots in ends.antennas_m))[:, 0]
         link = replace(link, power_dbm=link.power_dbm - loss, total_dbm=link.total_dbm - loss)
     return link
 
 
+def _reflections(link: Link, ends: Ends) -> Link:
+    """Ways by the room's surfaces, through obstacles and bodies as the direct one, with their own antenna gains."""
+    room, radio = ends.scenario.room, ends.scenario.radio
+    if room is None or room.reflection_loss_db is None:
+        return link
+    by, shape = reflections(room, *ends.antennas_m), (len(ends.distance_m), SURFACES)
+    gain = np.stack([ends.gain_towards_db(by.leaving[:, k], by.arriving[:, k]) for k in range(SURFACES)], axis=1)
+    loss, excess = np.zeros(shape), np.zeros(shape)
+    for end in ends.antennas_m:
+        if ends.scenario.obstacles:
+            lost, late = through(ends.scenario.obstacles, np.repeat(end, SURFACES, axis=0), by.point_m.reshape(-1, 3))
+            loss, excess = loss + lost.reshape(shape), excess + late.reshape(shape)
+        for body in ends.shadows:
+            loss = loss + _shadow_db(body, end[:, None], by.point_m)
+    echoes = path_gain_db(radio, by.length_m) + gain - room.reflection_loss_db - loss
+    return first_path(link, by.length_m + excess, echoes, radio.dynamic_range_db)
+
+
+def _shadow_db(body: PlacedShadow, one: Floats, other: Floats) -> Floats:
+    """Return what a body takes away from straight segments (n, k or 1, 3) to (n, k, 3), in dB, (n, k)."""
+    a, b = ((spots - body.position_m[:, None]) @ body.rotation for spots in (one, other))
+    return ellipsoid_chord_m(body.shadow, a, b) * body.shadow.loss_db_per_m
+
+
+def _states(link: Link, ends: Ends) -> Link:
+    """Reflections that last: a weaker and later first path, and most of the power later still."""
+    model = ends.scenario.radio.multipath
+    if ends.states is None or not isinstance(model, TwoStateMultipath):
+        return link
+    paths = ends.states.at(ends.places, ends.time_s)
+    power = link.power_dbm - paths.first_loss_db
+    total = link.total_dbm - np.where(paths.reflected, model.total_loss_db, 0.0)
+    rest = np.maximum(10 ** (total / 10) - 10 ** (power / 10), NOTHING_MW)
+    excess = link.excess_m + paths.excess_m
+    # The strongest path comes after the first; with a direct path there is none.
+    later = with_path(
+        link,
+        link.distance_m + excess + paths.rise_s * SPEED_OF_LIGHT,
+        np.where(paths.reflected, 10 * np.log10(rest), 10 * np.log10(NOTHING_MW)),
+    )
+    return replace(later, excess_m=excess, power_dbm=power, total_dbm=total)
+
+
 CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
     "obstacles": _obstacles,
-    "reflections": _reflections,
     "shadows": _shadows,
+    "reflections": _reflections,
+    "lasting reflections": _states,
 }
 """What happens to waves on their way, in this order, for every link of every scenario; strangers' effects come last."""
 
@@ -135,7 +186,7 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     ...     return replace(link, power_dbm=link.power_dbm - loss_db, total_dbm=link.total_dbm - loss_db)
     >>> uwbsim.register_channel_effect("rain", rain)
     >>> list(CHANNEL_EFFECTS)
-    ['obstacles', 'reflections', 'shadows', 'rain']
+    ['obstacles', 'shadows', 'reflections', 'lasting reflections', 'rain']
     >>> del CHANNEL_EFFECTS["rain"]
     """
     if name in CHANNEL_EFFECTS:

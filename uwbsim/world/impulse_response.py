@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.wire.messages import Cir
 from uwbsim.units import NS
+from uwbsim.world.propagation import Link
+from uwbsim.world.radio import ALPHA_DBM, FPP_OFFSET_DB
 
 FIRST_PATH: Final = 745.0
 """Where the chip puts the first path, give or take a tap (DW1000 User Manual, 7.2.40.1)."""
 
 NOISE: Final = 45.0
-AMPLITUDE: Final = 9000.0
+NEAREST_ECHO_M: Final = 0.01
+FAINTEST_ECHO: Final = 1e-4
 DECAY_TAPS: Final = 14.0
 PULSE_TAPS: Final = 1.2
 EDGE_TO_PEAK: Final = 1.5
@@ -27,32 +32,73 @@ INDEX_STEPS: Final = 1000
 """The boards print the first path in thousandths of a tap."""
 
 
+ACCUMULATED: Final = 118
+"""Preamble symbols that the chip adds up, of 128."""
+
+LARGEST: Final = 32_767
+"""Taps are 16 bits wide."""
+
 Echo = tuple[float, float]
 """A path after the first: its delay in seconds, and its amplitude as a share of the first's."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathsHeard:
+    """What an impulse response shows of a link: the power of the first path in dBm, and the paths after it."""
+
+    power_dbm: float
+    echoes: list[Echo]
+
+
+def paths_heard(link: Link, detour_m: float = 0.0) -> PathsHeard:
+    """Return what a response shows of a single link, whose first path is `detour_m` longer still by chance."""
+    power = float(link.power_dbm[0])
+    if link.paths_m is None or link.paths_dbm is None:
+        return PathsHeard(power_dbm=power, echoes=[])
+    later_m = link.paths_m[0] - float(link.distance_m[0] + link.excess_m[0]) - detour_m
+    shares = 10 ** ((link.paths_dbm[0] - power) / 20)
+    echoes = [
+        (later / SPEED_OF_LIGHT, share)
+        for later, share in zip(later_m.tolist(), shares.tolist(), strict=True)
+        if later > NEAREST_ECHO_M and share > FAINTEST_ECHO
+    ]
+    return PathsHeard(power_dbm=power, echoes=echoes)
+
+
+def peak_amplitude(power_dbm: float) -> float:
+    """Return the peak of a first path in the chip's counts, from its power (DW1000 User Manual, 4.7.1).
+
+    The power is 10 log10((F1^2 + F2^2 + F3^2)/N^2) - 121.74 of the three taps from the leading edge on.
+    """
+    taps = np.arange(1, 4) - EDGE_TO_PEAK
+    squares = float(np.sum(np.exp(-2 * (taps / PULSE_TAPS) ** 2)))
+    return float(ACCUMULATED * np.sqrt(10 ** ((power_dbm + FPP_OFFSET_DB) / 10) / squares))
+
+
 def impulse_response(
-    rng: np.random.Generator, stamp: int | None = None, echoes: list[Echo] | None = None
+    rng: np.random.Generator, stamp: int | None = None, paths: PathsHeard | None = None
 ) -> tuple[int, tuple[int, ...]]:
     """Draw one: index of the first path in thousandths of a tap, and 1016 magnitudes.
 
-    With a receive `stamp` (ticks) the index has its fraction; `echoes` are known paths, besides the diffuse ones.
+    With a receive `stamp` (ticks) the index has its fraction; `paths` are known ones, besides the diffuse. Without them
+    the first path has the power of the boards' usual ones, -82 dBm.
     """
     fraction = rng.uniform() if stamp is None else stamp % TICKS_A_TAP / TICKS_A_TAP
     index = int(INDEX_STEPS * (FIRST_PATH + rng.integers(-1, 2) + fraction))
     taps = np.arange(Cir.TAPS)
+    amplitude = peak_amplitude(paths.power_dbm if paths else ALPHA_DBM)
     # The chip reports the leading edge; the peak of the pulse follows it.
     peak = index / INDEX_STEPS + EDGE_TO_PEAK
-    wave = AMPLITUDE * np.exp(-(((taps - peak) / PULSE_TAPS) ** 2)) + 0j
+    wave = amplitude * np.exp(-(((taps - peak) / PULSE_TAPS) ** 2)) + 0j
     count = rng.poisson(DIFFUSE)
     later = rng.exponential(DECAY_TAPS, count)
     strength = 0.25 * np.exp(-later / DECAY_TAPS) * rng.rayleigh(size=count)
-    paths = [*zip(later.tolist(), strength.tolist(), strict=True)]
-    paths += [(delay_s / TAP_S, share) for delay_s, share in echoes or []]
-    for (place, share), phase in zip(paths, rng.uniform(0, 2 * np.pi, len(paths)), strict=True):
-        wave += AMPLITUDE * share * np.exp(1j * phase - ((taps - peak - place) / PULSE_TAPS) ** 2)
+    known = [*zip(later.tolist(), strength.tolist(), strict=True)]
+    known += [(delay_s / TAP_S, share) for delay_s, share in paths.echoes] if paths else []
+    for (place, share), phase in zip(known, rng.uniform(0, 2 * np.pi, len(known)), strict=True):
+        wave += amplitude * share * np.exp(1j * phase - ((taps - peak - place) / PULSE_TAPS) ** 2)
     wave += NOISE * (rng.normal(size=Cir.TAPS) + 1j * rng.normal(size=Cir.TAPS))
-    re, im = np.abs(np.trunc(wave.real)), np.abs(np.trunc(wave.imag))
+    re, im = (np.minimum(np.abs(np.trunc(part)), LARGEST) for part in (wave.real, wave.imag))
     # The firmware's estimate of a magnitude: the larger part and a quarter of the smaller.
     return index, tuple((np.maximum(re, im) + np.minimum(re, im) // 4).astype(np.int64).tolist())
 

@@ -68,6 +68,7 @@ class SampledWorld:
                 antennas_m=(spots[origin], spots),
                 rotations=(turns[origin], turns),
                 shadows=self._shadows(index, into, count),
+                states=self._world.states,
             )
         )
 

@@ -100,4 +100,6 @@ class Medium:
         """Return first-path power in dBm and relative skew in ppm as receivers print them; noises standard normal."""
         radio, clocks, time = self.scenario.radio, self.clocks, frames.departure
         skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * PPM_PER_ONE
-        return printed_power_dbm(radio, power_dbm, power_noise), printed_skew_ppm(radio, skew, skew_noise)
+        offsets = np.array([tag.power_offset_db for tag in self.scenario.tags])
+        read_dbm = power_dbm + offsets[frames.receiver]
+        return printed_power_dbm(radio, read_dbm, power_noise), printed_skew_ppm(radio, skew, skew_noise)

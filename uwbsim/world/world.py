@@ -11,14 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses
-from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import NS, NS_PER_S
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
-from uwbsim.world.propagation import Link, reflected_lengths_m
-from uwbsim.world.radio import path_gain_db, shadowing_phases
+from uwbsim.world.impulse_response import PathsHeard, paths_heard
+from uwbsim.world.propagation import Link
+from uwbsim.world.radio import shadowing_phases
+from uwbsim.world.reflected_states import ReflectedStates
 from uwbsim.world.trajectories import Trajectory, sample
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
@@ -28,20 +29,24 @@ TRIES: Final = 60
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """Bodies on their trajectories, with tags on lever arms; `phases` are those of the tags' shadowing."""
+    """Bodies on their trajectories, with tags on lever arms.
+
+    `phases` are those of the tags' shadowing, `states` the reflections that last by pair.
+    """
 
     scenario: Scenario
     trajectories: dict[str, Trajectory]
     phases: Floats
+    states: ReflectedStates | None
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         """Sample every body's trajectory from the seed; raises `ScenarioError` where they cannot keep apart."""
         phases = [shadowing_phases(scenario.run.seed, tag.id) for tag in scenario.tags]
-        return cls(scenario, _trajectories(scenario), np.array(phases))
+        return cls(scenario, _trajectories(scenario), np.array(phases), ReflectedStates.of(scenario))
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
-        """Return what reaches one tag from another, shape (n,); the link is reciprocal.
+        """Return what reaches the second tag from the first, shape (n,); reciprocal but for the sender's power.
 
         Tags are places in the scenario's list, times true sub-ticks.
         """
@@ -54,49 +59,43 @@ class World:
             columns[:, rows] = found.distance_m, found.excess_m, found.power_dbm, found.total_dbm
         return Link(*columns)
 
-    def echoes(self, sender: int, receiver: int, time: int) -> list[tuple[float, float]]:
-        """Return the paths after the first at one instant: delays in seconds, amplitudes as shares of the first's."""
-        room, radio = self.scenario.room, self.scenario.radio
-        if room is None or room.reflection_loss_db is None:
-            return []
-        at = np.array([time / SUBTICKS_PER_SECOND])
-        spots = self._tag(sender, at)[0], self._tag(receiver, at)[0]
-        first = self.link(np.array([sender]), np.array([receiver]), np.array([time]))
-        lengths = reflected_lengths_m(room, *spots)[0]
-        power = path_gain_db(radio, lengths) - room.reflection_loss_db
-        later = lengths - float(first.distance_m[0] + first.excess_m[0])
-        direct = path_gain_db(radio, first.distance_m + first.excess_m)[0]
-        share = 10 ** ((power - direct) / 20)
-        return [(x / SPEED_OF_LIGHT, a) for x, a in zip(later.tolist(), share.tolist(), strict=True) if x > 0.01]
+    def paths(self, sender: int, receiver: int, time: int, detour_m: float = 0.0) -> PathsHeard:
+        """Return the paths at one instant as a response shows them; `detour_m` is the range's own by chance."""
+        link = self._pair(sender, receiver, np.array([time / SUBTICKS_PER_SECOND]))
+        return paths_heard(link, detour_m)
 
     def _pair(self, i: int, j: int, time_s: Floats) -> Link:
-        (one, turn), (other, turned) = (self._tag(k, time_s) for k in (i, j))
+        tags = self.scenario.tags
+        shadowing = [body.name for body in self.scenario.bodies if body.shadow is not None]
+        # Each body once, whether it carries one of the tags, stands in between, or both.
+        names = dict.fromkeys([tags[i].body, tags[j].body, *shadowing])
+        bodies = {name: _placed(self.trajectories[name], time_s) for name in names}
+        turns = bodies[tags[i].body][1], bodies[tags[j].body][1]
         return link_between(
             Ends(
                 scenario=self.scenario,
                 phases=self.phases,
                 time_s=time_s,
                 places=(np.full(len(time_s), i), np.full(len(time_s), j)),
-                antennas_m=(one, other),
-                rotations=(turn, turned),
-                shadows=self._shadows(time_s),
+                antennas_m=(self._antenna_m(i, bodies), self._antenna_m(j, bodies)),
+                rotations=turns,
+                shadows=self._shadows(bodies),
+                states=self.states,
             )
         )
 
-    def _shadows(self, time_s: Floats) -> list[PlacedShadow]:
+    def _shadows(self, bodies: dict[str, tuple[Floats, Floats]]) -> list[PlacedShadow]:
         """Place the bodies that have a shadow."""
         return [
-            PlacedShadow(shadow=body.shadow, position_m=path.position_m(time_s), rotation=_matrices(path, time_s))
+            PlacedShadow(shadow=body.shadow, position_m=bodies[body.name][0], rotation=bodies[body.name][1])
             for body in self.scenario.bodies
-            for path in [self.trajectories[body.name]]
             if body.shadow is not None
         ]
 
-    def _tag(self, index: int, time_s: Floats) -> tuple[Floats, Floats]:
+    def _antenna_m(self, index: int, bodies: dict[str, tuple[Floats, Floats]]) -> Floats:
         tag = self.scenario.tags[index]
-        body = self.trajectories[tag.body]
-        turn = _matrices(body, time_s)
-        return body.position_m(time_s) + turn @ np.array(tag.lever_arm_m), turn
+        position, turn = bodies[tag.body]
+        return np.asarray(position + turn @ np.array(tag.lever_arm_m))
 
     def motion_capture(self) -> Poses:
         """Return the poses that motion capture writes over the run, with its rate, noise, latency and gaps."""
@@ -134,6 +133,11 @@ class World:
         position = body.position_m(time_s) + rng.normal(0, 1, (len(time_s), 3)) * mocap.position_noise_m
         wobble = Rotation.from_rotvec(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
         return position, (Rotation.from_quat(body.quaternion(time_s)) * wobble).as_quat()
+
+
+def _placed(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
+    """Return a body's positions (n, 3) and rotations body to world (n, 3, 3)."""
+    return path.position_m(time_s), _matrices(path, time_s)
 
 
 def _matrices(path: Trajectory, time_s: Floats) -> Floats:

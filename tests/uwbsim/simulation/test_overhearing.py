@@ -70,5 +70,6 @@ def test_impulse_responses_agree_with_stamp_and_room():
         assert index % 1 == pytest.approx(stamp % 64 / 64, abs=0.001)
         # The floor is 1.5 m below: 5 m instead of 4 m, 3.3 ns or taps later.
         echo = round(index + 1.5 + 1.0 / 0.299702547)
-        assert taps[echo - 1 : echo + 2].max() > 1500
+        # Half the amplitude of the first path, which diffuse ones of a quarter disturb.
+        assert taps[echo - 1 : echo + 2].max() > taps.max() / 6
         assert taps[: int(index) - 6].max() < 400

@@ -9,7 +9,7 @@ from uwbsim.world.propagation import (
     box_chords_m,
     ellipsoid_chord_m,
     first_path,
-    reflected_lengths_m,
+    reflections,
     through,
 )
 
@@ -55,10 +55,25 @@ def test_loss_and_excess_add_up_over_obstacles():
 def test_reflections_have_the_lengths_of_the_two_legs():
     room = Room(min_m=(0, 0, 0), max_m=(10, 8, 3))
     a, b = np.array([[2.0, 3.0, 1.0]]), np.array([[7.0, 3.0, 1.0]])
-    lengths = reflected_lengths_m(room, a, b)[0]
+    lengths = reflections(room, a, b).length_m[0]
     assert lengths[4] == pytest.approx(np.hypot(5, 2)), "by the floor"
     assert lengths[5] == pytest.approx(np.hypot(5, 4)), "by the ceiling"
     assert lengths[0] == pytest.approx(9.0), "by the wall behind"
+
+
+def test_reflections_are_where_both_legs_make_the_same_angle():
+    room = Room(min_m=(0, 0, 0), max_m=(10, 8, 3))
+    a, b = RNG.uniform((0, 0, 0), room.max_m, (2, 20, 3))
+    found = reflections(room, a, b)
+    one, other = (found.point_m - end[:, None] for end in (a, b))
+    legs = [np.linalg.norm(leg, axis=2, keepdims=True) for leg in (one, other)]
+    np.testing.assert_allclose((legs[0] + legs[1])[:, :, 0], found.length_m, rtol=1e-12)
+    np.testing.assert_allclose(one / legs[0], found.leaving, atol=1e-9)
+    np.testing.assert_allclose(other / legs[1], found.arriving, atol=1e-9)
+    for column in range(6):
+        axis, wall = column // 2, (room.min_m, room.max_m)[column % 2][column // 2]
+        np.testing.assert_allclose(found.point_m[:, column, axis], wall, atol=1e-9)
+        np.testing.assert_allclose(found.leaving[:, column, axis], found.arriving[:, column, axis], atol=1e-9)
 
 
 def test_the_first_path_is_the_direct_one_until_it_is_too_weak():

@@ -1,0 +1,166 @@
+"""Paths between antennas: shadows and the first path, echoes' own gains, impulse responses, unequal ends."""
+
+import numpy as np
+import pytest
+
+import uwbsim
+from uwblink import Board, raw_range
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwbsim.world.impulse_response import ACCUMULATED, EDGE_TO_PEAK, TAP_S, peak_amplitude
+from uwbsim.world.lookahead import SampledWorld
+from uwbsim.world.world import World
+
+ROOM = {"min_m": [-4.0, -4.0, 0.0], "max_m": [8.0, 4.0, 3.0], "reflection_loss_db": 6.0}
+LOSS_DB = 36.0
+ZERO, ONE = np.array([0]), np.array([1])
+
+
+def scenario(places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), tags=({}, {}), **more):
+    quiet = {"rx_noise_ps": 0.0, "power_noise_db": 0.0, "quantize": False, "first_path_at_1m_dbm": -70.0}
+    bodies = [{"name": n, "motion": {"model": "static", "position_m": p}} for n, p in zip("ab", places, strict=True)]
+    base = {
+        "run": {"duration_s": 1.0, "seed": 2},
+        "ranging": {"rate_hz": 40.0, "pairs": [[1, 2]], "get_cir": True},
+        "radio": quiet | more.pop("radio", {}),
+        "bodies": bodies + more.pop("bodies", []),
+        "tags": [{"id": k + 1, "body": n} | tag for k, (n, tag) in enumerate(zip("ab", tags, strict=True))],
+    }
+    return uwbsim.load(base | more)
+
+
+def link(world, now=5_000_000):
+    return World.of(world).link(ZERO, ONE, np.array([now]))
+
+
+def sampled(world, now=5_000_000):
+    """The same link with all its paths."""
+    return SampledWorld(World.of(world)).from_sender(0, now)[ONE]
+
+
+def post(loss_db_per_m):
+    shadow = {"semi_axes_m": [0.3, 0.3, 0.3], "loss_db_per_m": loss_db_per_m}
+    return {"name": "post", "motion": {"model": "static", "position_m": [2.0, 0.0, 1.0]}, "shadow": shadow}
+
+
+BOX = {"min_m": [1.7, -0.3, 0.5], "max_m": [2.3, 0.3, 1.5], "material": {"loss_db_per_m": LOSS_DB / 0.6}}
+
+
+def test_a_body_in_the_way_lets_the_chip_take_a_reflection_for_the_first_path():
+    free, shadowed, blocked = (
+        link(scenario(room=ROOM, **more)) for more in ({}, {"bodies": [post(LOSS_DB / 0.6)]}, {"obstacles": [BOX]})
+    )
+    # The floor is a metre below: 4.47 m instead of 4 m.
+    assert free.excess_m[0] == 0
+    assert shadowed.excess_m[0] == pytest.approx(np.hypot(4, 2) - 4, abs=1e-9)
+    assert shadowed.excess_m[0] == pytest.approx(blocked.excess_m[0], abs=1e-9)
+    assert shadowed.power_dbm[0] == pytest.approx(blocked.power_dbm[0], abs=1e-9)
+    extra = [float(x.total_dbm[0] - x.power_dbm[0]) for x in (free, shadowed, blocked)]
+    assert extra[1] == pytest.approx(extra[2], abs=0.01)
+    assert extra[1] - extra[0] > 1, "the power lies in later paths"
+
+
+def test_flights_served_boards_and_sampled_worlds_take_the_same_reflection():
+    world = scenario(room=ROOM, bodies=[post(LOSS_DB / 0.6)], radio={"antenna": "dipole"})
+    flight, ports = uwbsim.simulate(world), uwbsim.VirtualPorts(world)
+    excess = link(world).excess_m[0]
+    assert excess > 0.4
+    np.testing.assert_allclose(raw_range(flight.exchanges) - flight.truth_m, excess, atol=0.006)
+    report = Board(ports.port(1)).range(2)
+    assert report.range_m == pytest.approx(4.0 + excess, abs=0.012)
+    assert report.fpp1_dbm == pytest.approx(flight.exchanges.fpp1_dbm[0], abs=2e-4)
+    for name in ("excess_m", "power_dbm", "total_dbm"):
+        np.testing.assert_allclose(getattr(sampled(world), name), getattr(link(world), name), atol=1e-9)
+
+
+def test_echoes_have_the_gains_of_their_own_directions():
+    """One dipole above the other: the direct path lies in both nulls, the way by a wall does not."""
+    world = scenario(places=((0.0, 0.0, 0.5), (0.0, 0.0, 2.5)), room=ROOM, radio={"antenna": "dipole"})
+    found = sampled(world)
+    assert found.paths_dbm[0, 0] == pytest.approx(-70 - 20 * np.log10(2) + 2 * (1.76 - 20), abs=1e-9)
+    wall = np.hypot(2, 8)  # by the wall at x = -4 m; the sine to the axis is 8/hypot(2, 8)
+    gain = 1.76 + 20 * np.log10(8 / wall)
+    assert found.paths_m[0, 1] == pytest.approx(wall, abs=1e-9)
+    assert found.paths_dbm[0, 1] == pytest.approx(-70 - 20 * np.log10(wall) + 2 * gain - 6, abs=1e-9)
+
+
+def test_echoes_go_through_obstacles_and_bodies_as_the_direct_path_does():
+    plate = {"min_m": [-4.0, -4.0, 0.4], "max_m": [8.0, 4.0, 0.5], "material": {"loss_db_per_m": 100.0, "index": 2.0}}
+    free, covered = (sampled(scenario(room=ROOM, **more)) for more in ({}, {"obstacles": [plate]}))
+    # The way by the floor crosses the plate twice, 0.1 m times 4.47/2 each.
+    crossed = 2 * 0.1 * np.hypot(4, 2) / 2
+    assert free.paths_dbm[0, 5] - covered.paths_dbm[0, 5] == pytest.approx(100 * crossed, abs=1e-9)
+    assert covered.paths_m[0, 5] - free.paths_m[0, 5] == pytest.approx(crossed, abs=1e-9)
+    np.testing.assert_allclose(covered.paths_dbm[0, 6], free.paths_dbm[0, 6], atol=1e-9)
+    low = post(50.0) | {"motion": {"model": "static", "position_m": [1.0, 0.0, 0.5]}}
+    low["shadow"] = {"semi_axes_m": [0.1, 0.1, 0.1], "loss_db_per_m": 50.0}
+    behind = sampled(scenario(room=ROOM, bodies=[low]))
+    assert free.paths_dbm[0, 0] == pytest.approx(behind.paths_dbm[0, 0]), "not in the direct way"
+    assert free.paths_dbm[0, 5] - behind.paths_dbm[0, 5] == pytest.approx(50 * 0.2, abs=1e-9), "in that by the floor"
+
+
+def test_total_power_in_free_space_is_that_of_friis():
+    for distance in (0.5, 4.0, 30.0):
+        found = link(scenario(places=((0.0, 0.0, 1.0), (distance, 0.0, 1.0))))
+        assert found.total_dbm[0] == pytest.approx(-70 - 20 * np.log10(distance), abs=0.1)
+
+
+@pytest.mark.parametrize("at_1m_dbm", [-70.0, -76.0, -82.0])
+def test_impulse_responses_follow_the_power_of_the_link(at_1m_dbm):
+    """The chip's own formula, applied to the taps that it prints, gives the first-path power (User Manual, 4.7.1)."""
+    flight = uwbsim.simulate(scenario(radio={"first_path_at_1m_dbm": at_1m_dbm}))
+    found = []
+    for row in flight.cirs:
+        after = np.floor(row.first_path_index).astype(int) + np.arange(1, 4)
+        squares = np.sum(np.array(row.magnitudes, dtype=float)[after] ** 2)
+        found.append(10 * np.log10(squares / ACCUMULATED**2) - 121.74)
+    # Diffuse paths, the firmware's estimate of magnitudes and where the taps lie scatter it.
+    assert np.median(found) == pytest.approx(flight.exchanges.fpp2_dbm[0], abs=1.5)
+
+
+def test_obstacles_weaken_the_response_and_let_its_echoes_stand_out():
+    weak = BOX | {"material": {"loss_db_per_m": 10.0 / 0.6}}
+    free, blocked = (World.of(scenario(room=ROOM, **more)).paths(0, 1, 0) for more in ({}, {"obstacles": [weak]}))
+    assert free.power_dbm - blocked.power_dbm == pytest.approx(10.0, abs=1e-9)
+    assert peak_amplitude(free.power_dbm) / peak_amplitude(blocked.power_dbm) == pytest.approx(10**0.5, rel=1e-9)
+    delays, shares = (np.array([world.echoes for world in (free, blocked)])[:, :, k] for k in (0, 1))
+    np.testing.assert_allclose(delays[0], delays[1])
+    # By the walls behind the two tags the way goes through the obstacle as well.
+    np.testing.assert_allclose(np.sort(shares[1] / shares[0]), [1, 1, *[10**0.5] * 4], rtol=1e-6)
+
+
+def test_a_ranges_own_detour_brings_its_echoes_nearer():
+    """With a detour of the first path, what comes after comes sooner after it."""
+    world = World.of(scenario(room=ROOM))
+    plain, late = world.paths(0, 1, 0), world.paths(0, 1, 0, detour_m=0.3)
+    assert late.echoes[0][0] == pytest.approx(plain.echoes[0][0] - 0.3 / SPEED_OF_LIGHT)
+    always = {"probability": 1.0, "mean_excess_m": 0.2}
+    room = ROOM | {"max_m": [8.0, 4.0, 40.0], "min_m": [-60.0, -60.0, -0.5], "reflection_loss_db": 0.0}
+    flight = uwbsim.simulate(scenario(room=room, radio={"multipath": always}))
+    excess = raw_range(flight.exchanges) - flight.truth_m
+    way = 3.0  # by the floor, 1.5 m below, 5 m instead of 4 m
+    for row, own in zip(flight.cirs, excess.tolist(), strict=True):
+        taps, peak = np.array(row.magnitudes), row.first_path_index + EDGE_TO_PEAK
+        echo = peak + (np.hypot(4, way) - 4.0 - own) / SPEED_OF_LIGHT / TAP_S
+        if echo > peak + 1.2:
+            assert taps[round(echo)] > 0.3 * taps[round(peak)]
+
+
+def test_tags_may_send_stronger_and_read_too_high():
+    world = scenario(tags=({"tx_power_db": 3.0}, {"power_offset_db": -1.5}))
+    plain, flight = uwbsim.simulate(scenario()), uwbsim.simulate(world)
+    # The poll is sent by tag 1 and read by tag 2; the response the other way round.
+    np.testing.assert_allclose(flight.exchanges.fpp1_dbm - plain.exchanges.fpp1_dbm, 3.0 - 1.5, atol=1e-9)
+    np.testing.assert_allclose(flight.exchanges.fpp2_dbm, plain.exchanges.fpp2_dbm, atol=1e-9)
+    report = Board(uwbsim.VirtualPorts(world).port(1)).range(2)
+    assert report.fpp1_dbm == pytest.approx(flight.exchanges.fpp1_dbm[0], abs=2e-4)
+    assert report.fpp2_dbm == pytest.approx(flight.exchanges.fpp2_dbm[0], abs=2e-4)
+
+
+def test_who_sends_weakly_is_not_heard():
+    radio = {"sensitivity_dbm": -85.0, "power_noise_db": 0.0}
+    weak = {"tx_power_db": -10.0}
+    for place, tags in enumerate([(weak, {}), ({}, weak)]):
+        flight = uwbsim.simulate(scenario(tags=tags, radio=radio))
+        assert len(flight.exchanges) == 0
+        assert {fault.detail.split("message ")[1][0] for fault in flight.faults} == {str(place + 1)}
+    assert len(uwbsim.simulate(scenario(radio=radio)).exchanges) == 40
