@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from uwbsim.random_streams import stream
 from uwbsim.scenario.motion import RandomFlight, Static, Waypoints
@@ -46,3 +47,12 @@ def test_a_longer_run_continues_the_same_flight():
     time = np.linspace(0, 20, 101)
     np.testing.assert_array_equal(short.position_m(time), long.position_m(time))
     np.testing.assert_array_equal(short.quaternion(time), long.quaternion(time))
+
+
+def test_attitudes_are_those_of_scipys_angles():
+    flight = sample(
+        RandomFlight(model="random-flight", box_min_m=(-2, -1, 0), box_max_m=(2, 1, 2)), 60.0, partial(stream, 1, "a")
+    )
+    time = np.linspace(0, 60, 500)
+    expected = Rotation.from_euler("ZYX", flight.angles(time)).as_quat()
+    np.testing.assert_allclose(flight.quaternion(time), expected, rtol=0, atol=1e-15)
