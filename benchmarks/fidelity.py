@@ -11,13 +11,20 @@ from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate
 from calib.ranges import concatenate
 from calib.sources import load_ranges
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import TICK_S, elapsed
-from uwblink.twr import intervals, truncate4
+from uwblink.twr import intervals, raw_range, truncate4
 from uwbsim.scenario.loading import load as load_scenario
 from uwbsim.simulation.run import Simulated, simulate, write
 
 ROOT = Path(__file__).parents[1]
 ICRA = ROOT / "scenarios" / "icra2023"
+BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
+TAIL_M = 0.3
+LAG = "autocorrelation of a pair's errors to its next range; simulated: test1, lasting reflections"
+TAIL = "errors more than 30 cm above the median; the same"
+TRACE = "how much weaker their first paths are (dB); the same"
+CLOCKS = "range noise of clocks with white noise of 0.01 ppm sqrt(s): DS, SS (mm)"
 ALOHA = ROOT / "scenarios" / "collisions" / "aloha.toml"
 
 HEAD = """# Fidelity
@@ -25,26 +32,53 @@ HEAD = """# Fidelity
 What a simulated recording looks like beside measured ones. This page is written by `make fidelity`; do not edit it.
 
 Measured figures: the boards' timing and grids from 1833 exchanges of real boards (MILUV), raw and residual errors from Shalaby et al., ICRA 2023,
-sections V and VI. Simulated: `scenarios/icra2023/test1.toml` and `test2.toml`, and the training flight for the calibration.
+sections V and VI, dependence from 317 exchanges of one MILUV flight among obstacles (cirObstacles_3_random_0). Simulated: `scenarios/icra2023/test1.toml` and `test2.toml`, and the training flight for the calibration.
 
-| what | measured | simulated |
-|---|---|---|
+A figure is *built in* where the program follows the boards' arithmetic, *tuned* where a setting was chosen to hit it, and *predicted* where it follows from other settings.
+
+| what | measured | simulated | how |
+|---|---|---|---|
 """
 
 
 def main() -> None:
     train, one, two = (simulate(load_scenario(ICRA / f"{n}.toml")) for n in ("train", "test1", "test2"))
-    rows = [*timing_rows(train), *grid_rows(train), noise_row(), *error_rows(train, one, two), *success_rows()]
-    text = HEAD + "".join(f"| {what} | {measured} | {simulated} |\n" for what, measured, simulated in rows)
+    rows = [
+        *timing_rows(train),
+        *grid_rows(train),
+        noise_row(),
+        *error_rows(train, one, two),
+        *dependence_rows(one),
+        *success_rows(),
+    ]
+    rows += clock_rows()
+    text = HEAD + "".join(f"| {' | '.join((*row, how))} |\n" for row, how in zip(rows, HOW, strict=True))
     text += NOTES
     (ROOT / "docs" / "fidelity.md").write_text(text, encoding="utf-8")
     print(text)
 
 
+BUILT_IN, TUNED, PREDICTED = "built in", "tuned", "predicted"
+HOW = (
+    *(TUNED, BUILT_IN, BUILT_IN),
+    *(BUILT_IN, PREDICTED, BUILT_IN, TUNED, TUNED),
+    TUNED,
+    *(TUNED, PREDICTED, PREDICTED),
+    *(PREDICTED, TUNED, PREDICTED),
+    PREDICTED,
+    PREDICTED,
+)
+"""How each row came about, in their order."""
+
 NOTES = """
 What is not alike, or not known:
 
 - The training scenario's raw errors are made to resemble the paper's by the choice of tail and powers; the curves and delays are the published ones.
+- **The icra2023 scenarios have the tail twice.** Their curve of standard deviation is the published one, fitted to what was left after outliers were rejected (6.3 to 8.7 cm); the paper's samples have a core of 5.6 to 8.0 cm that is skewed itself
+  (skewness 0.2 to 1.3 by power), and a tail of 12 % comes on top of the curve. Their median lifted power is 0.48 where the paper's samples
+  have 0.81, and their powers span a range 6 to 8 dB above that of MILUV's boards.
+- In them reflections are drawn for each exchange alone, leave no trace in power and last for no time. The model "two-state" has all three (`scenarios/lasting_reflections`); its settings were fitted to nothing.
+- The real flight has 317 exchanges of 30 pairs, whose next range comes 0.42 s later: too few to tell shares of pairs apart, and its lives of reflections are shorter than that.
 - Success against the number of initiators was not measured on boards; the simulated figures follow from frame durations, capture and preamble time-out.
 - The boards' receive noise was measured among obstacles; in the icra2023 scenarios all noise is in the published curve of standard deviation.
 - Capture (6 dB) and the first-path detector's dynamic range (15 dB) are typical values, not measured ones; materials are round values from ITU-R P.2040-3.
@@ -118,6 +152,52 @@ def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[tuple[s
             f"{100 * max(abs(a.mean_m) for a in accepted):.1f} and {100 * max(a.std_m for a in accepted):.1f}",
         ),
     ]
+
+
+def dependence_rows(flight: Simulated) -> list[tuple[str, str, str]]:
+    """How errors of a pair hang together: in the flight of icra2023 as it is, and with reflections that last."""
+    lasting = simulate(load_scenario(ROOT / "scenarios" / "lasting_reflections" / "hall.toml"))
+    found = [(raw_range(run.exchanges) - run.truth_m, run.exchanges) for run in (flight, lasting)]
+    told = ", ".join(f"{lag_one(error, e.initiator * 1000 + e.target):.2f}" for error, e in found)
+    tails = ", ".join(f"{100 * np.mean(error - np.median(error) > TAIL_M):.0f} %" for error, _ in found)
+    drops = ", ".join(f"{trace_db(error, e.fpp1_dbm):.1f}" for error, e in found)
+    return [
+        (LAG, "0.16 raw, 0.04 calibrated (0.06 uncertain)", told),
+        (TAIL, "12 %", tails),
+        (TRACE, "not known", drops),
+    ]
+
+
+def lag_one(error: Floats, pair: Ints) -> float:
+    """Return the autocorrelation of errors, cut at a metre, from one range of a pair to its next."""
+    above = below = 0.0
+    for key in np.unique(pair):
+        mine = error[pair == key]
+        mine = np.clip(mine - np.median(mine), -1, 1)
+        above, below = above + float(mine[1:] @ mine[:-1]), below + float(mine[1:] @ mine[1:])
+    return above / below
+
+
+def trace_db(error: Floats, power_dbm: Floats) -> float:
+    """Return by how much ranges of the tail have less first-path power than the others, in the median."""
+    tail = error - np.median(error) > TAIL_M
+    return float(np.median(power_dbm[~tail]) - np.median(power_dbm[tail]))
+
+
+def clock_rows() -> list[tuple[str, str, str]]:
+    """Standard deviation of ranges between clocks of 0.01 ppm sqrt(s), all else noiseless."""
+    noiseless = [
+        "radio.rx_noise_ps=0",
+        "radio.sigma=none",
+        "radio.quantize=false",
+        "ranging.reply={model='fixed',delay_us=305}",
+    ]
+    noisy = [f"tags.{k}.white_ppm_sqrt_s=0.01" for k in range(2)]
+    spreads = []
+    for protocol in ("ds", "ss"):
+        run = simulate(load_scenario(BENCH, [f"ranging.protocol={protocol}", *noiseless, *noisy]))
+        spreads.append(f"{1000 * np.std(raw_range(run.exchanges) - run.truth_m):.0f}")
+    return [(CLOCKS, "40, 83 by closed form", ", ".join(spreads))]
 
 
 def success_rows() -> list[tuple[str, str, str]]:
