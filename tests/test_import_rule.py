@@ -21,7 +21,7 @@ CONFINED = {
     "fpdf": lambda path: path == "calib/report/pdf.py",
     "typer": lambda path: "/cli/" in path,
     "rich": lambda path: "/cli/" in path,
-    "duckdb": lambda path: path.startswith("uwblink/") or path == "uwbsim/sweep/results.py",
+    "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
     "pydantic": lambda path: path.startswith("uwbsim/"),
     "rosbags": lambda path: path == "uwblink/importers/pose_bags.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
@@ -40,7 +40,7 @@ FLOORS = {
     ),
     "uwbsim": (
         ("errors", "random_streams", "units"),
-        ("output", "scenario"),
+        ("output", "scenario", "tables"),
         ("world",),
         ("simulation",),
         ("boards", "protocols"),

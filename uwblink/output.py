@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 from uwblink.errors import OutputError, RecordingError, RecordingExistsError
+
+__all__: Final = ["check_output", "whole", "write_bytes", "write_text"]
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
@@ -14,14 +19,22 @@ def write_text(path: Path, text: str, *, force: bool) -> None:
 
 
 def write_bytes(path: Path, data: bytes, *, force: bool) -> None:
-    """Write a file by way of a hidden neighbour that takes its name when complete.
+    """Write a file; raises what `whole` raises."""
+    with whole(path, force=force) as partial:
+        partial.write_bytes(data)
 
-    Raises what `check_output` raises, and `OutputError` where the disk does not take it; a file that was there stays.
+
+@contextmanager
+def whole(path: Path, *, force: bool) -> Iterator[Path]:
+    """Yield the name of a hidden neighbour to write to, which takes the name of `path` when the block is done.
+
+    Raises what `check_output` raises, and `OutputError` where the disk does not take it. Where the block fails, a file
+    that was there stays, and no part of the new one does.
     """
     check_output(path, force=force)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        partial.write_bytes(data)
+        yield partial
         partial.replace(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error

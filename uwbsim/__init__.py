@@ -13,18 +13,24 @@ if TYPE_CHECKING:
     from uwbsim.boards.server import Server
     from uwbsim.boards.virtual_port import VirtualPorts
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
-    from uwbsim.protocols.comparison import compare
+    from uwbsim.pages.scenario_page import show
+    from uwbsim.pages.scenario_summary import preview
+    from uwbsim.protocols.comparison import Comparison, compare
     from uwbsim.protocols.reply_delay import optimum
-    from uwbsim.protocols.single_state import State, predict_state
+    from uwbsim.protocols.single_state import Prediction, State, predict_state
+    from uwbsim.scenario.faults import load_faults
     from uwbsim.scenario.loading import load
     from uwbsim.scenario.model import Scenario
     from uwbsim.simulation.run import Simulated, simulate
+    from uwbsim.simulation.through_wire import through_wire
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
     from uwbsim.world.channel import register_channel_effect
 
 __all__ = [
+    "Comparison",
     "ParameterError",
+    "Prediction",
     "Scenario",
     "ScenarioError",
     "Server",
@@ -35,15 +41,21 @@ __all__ = [
     "compare",
     "load",
     "load_design",
+    "load_faults",
     "optimum",
     "predict_state",
+    "preview",
     "register_channel_effect",
     "run_sweep",
+    "show",
     "simulate",
+    "through_wire",
 ]
 
 _HOMES: Final = {
+    "Comparison": "uwbsim.protocols.comparison",
     "ParameterError": "uwbsim.errors",
+    "Prediction": "uwbsim.protocols.single_state",
     "Scenario": "uwbsim.scenario.model",
     "ScenarioError": "uwbsim.errors",
     "Server": "uwbsim.boards.server",
@@ -54,11 +66,15 @@ _HOMES: Final = {
     "compare": "uwbsim.protocols.comparison",
     "load": "uwbsim.scenario.loading",
     "load_design": "uwbsim.sweep.design",
+    "load_faults": "uwbsim.scenario.faults",
     "optimum": "uwbsim.protocols.reply_delay",
     "predict_state": "uwbsim.protocols.single_state",
+    "preview": "uwbsim.pages.scenario_summary",
     "register_channel_effect": "uwbsim.world.channel",
     "run_sweep": "uwbsim.sweep.runner",
+    "show": "uwbsim.pages.scenario_page",
     "simulate": "uwbsim.simulation.run",
+    "through_wire": "uwbsim.simulation.through_wire",
 }
 
 if not TYPE_CHECKING:

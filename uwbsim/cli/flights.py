@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from uwblink.cli.shared import interrupts
 from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
-
-if TYPE_CHECKING:
-    from uwblink.recording.schema import FrameRow
 
 
 def add_to(app: typer.Typer) -> None:
@@ -36,19 +33,18 @@ def run(
     force: Force = False,
 ) -> None:
     """Simulate a scenario and write what its boards and motion capture record."""
+    import uwbsim
     from uwblink.output import check_output
-    from uwbsim.scenario.loading import load
-    from uwbsim.simulation.run import simulate, write
-    from uwbsim.simulation.through_wire import through_wire
 
     check_output(output, force=force)
-    loaded = load(scenario, overrides or (), seed)
+    loaded = uwbsim.load(scenario, overrides or (), seed)
     with progress(loaded.run.name) as report:
-        simulated = simulate(loaded, report, contention=contention)
-    frames: list[FrameRow] = []
+        simulated = uwbsim.simulate(loaded, report, contention=contention)
     if wire:
-        simulated, frames = through_wire(simulated)
-    write(simulated, output, frames=frames, force=force)
+        simulated, frames = uwbsim.through_wire(simulated)
+        simulated.save(output, frames=frames, force=force)
+    else:
+        simulated.save(output, force=force)
     typer.echo(
         f"{output}: {len(simulated.exchanges)} exchanges of {len(loaded.tags)} tags in "
         f"{len(loaded.pairs())} pairs, {loaded.run.duration_s:g} s, "
@@ -66,16 +62,15 @@ def serve(
     force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
+    import uwbsim
     from uwblink.output import check_output
-    from uwbsim.boards.server import Server, extended
-    from uwbsim.scenario import faults as fault_files
-    from uwbsim.scenario.loading import load
+    from uwbsim.boards import extended
 
     if poses:
         check_output(poses, force=force)
-    loaded = load(scenario, overrides or ())
-    wrong = fault_files.load(faults, [tag.id for tag in loaded.tags]) if faults else None
-    server = Server(extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True))
+    loaded = uwbsim.load(scenario, overrides or ())
+    wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
+    server = uwbsim.Server(extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True))
     try:
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")
@@ -94,12 +89,11 @@ def show(
     force: Force = False,
 ) -> None:
     """Draw the room, the flights, and one exchange of each protocol."""
+    import uwbsim
     from uwblink.output import check_output
-    from uwbsim.pages.scenario_page import show as draw
-    from uwbsim.scenario.loading import load
 
     check_output(output, force=force)
-    draw(load(scenario, overrides or ()), output, force=force)
+    uwbsim.show(uwbsim.load(scenario, overrides or ()), output, force=force)
     typer.echo(f"{output}")
 
 
@@ -109,22 +103,14 @@ def validate(
     as_json: AsJson = False,
 ) -> None:
     """Say what a scenario will do, without running it."""
-    from dataclasses import asdict
+    import uwbsim
 
-    from uwbsim.pages.scenario_summary import preview, sentences
-    from uwbsim.scenario.loading import load
-
-    loaded = load(scenario, overrides or ())
-    found = preview(loaded)
-    if as_json:
-        typer.echo(json.dumps(asdict(found), indent=1))
-        return
-    for line in sentences(loaded, found):
-        typer.echo(line)
+    found = uwbsim.preview(uwbsim.load(scenario, overrides or ()))
+    typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else str(found))
 
 
 def schema() -> None:
     """Print the JSON Schema of scenario files."""
-    from uwbsim.scenario.model import Scenario
+    import uwbsim
 
-    typer.echo(json.dumps(Scenario.model_json_schema(), indent=2))
+    typer.echo(json.dumps(uwbsim.Scenario.model_json_schema(), indent=2))

@@ -13,7 +13,7 @@ from uwblink.cli.shared import INTERRUPTED, interrupts
 from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
-    from uwbsim.protocols.comparison import ProtocolErrors
+    import uwbsim
 
 Protocols = Annotated[str, typer.Option(help="Names, separated by commas, or all.")]
 
@@ -34,55 +34,42 @@ def compare(
     force: Force = False,
 ) -> None:
     """Range with every protocol in the same random world, and say what each knows and costs."""
-    from uwblink.output import check_output, write_text
+    import uwbsim
     from uwbsim.output import check_folder
-    from uwbsim.pages.comparison_page import page
-    from uwbsim.protocols.comparison import chosen, winners
-    from uwbsim.protocols.comparison import compare as run
-    from uwbsim.scenario.loading import load
-    from uwbsim.sweep.results import write_csv, write_parquet
+    from uwbsim.pages import FILES, write_comparison
+    from uwbsim.protocols import chosen
 
     rows = chosen(_names(protocols))
-    loaded = load(scenario, overrides or ())
-    check_folder(output)
-    files = {kind: output / f"compare.{kind}" for kind in ("html", "csv", "parquet")}
-    for path in files.values() if output.is_dir() else ():
-        check_output(path, force=force)
+    loaded = uwbsim.load(scenario, overrides or ())
+    check_folder(output, FILES, force=force)
     with progress(loaded.run.name) as report:
-        outcomes, samples = run(loaded, rows, count, report)
-    won = winners(loaded, rows)
-    text = page(loaded, outcomes, samples, won)
-    output.mkdir(exist_ok=True)
-    write_text(files["html"], text, force=force)
-    table = [o.to_dict() for o in outcomes]
-    write_csv(files["csv"], table)
-    files["parquet"].unlink(missing_ok=True)
-    write_parquet(files["parquet"], table)
+        found = uwbsim.compare(loaded, rows, count, report)
+    write_comparison(found, output, force=force)
     if as_json:
-        typer.echo(json.dumps({"protocols": table, "winners": won}, indent=1))
+        typer.echo(json.dumps(found.to_dict(), indent=1))
         return
-    _print_outcomes(outcomes)
-    typer.echo(f"{files['html']}, {files['csv'].name}, {files['parquet'].name}")
+    _print_outcomes(found)
+    typer.echo(f"{output / FILES[0]}, {', '.join(FILES[1:])}")
 
 
 def _names(protocols: str) -> list[str]:
-    from uwblink.protocols.table import PROTOCOLS
+    from uwblink import PROTOCOLS
 
     return list(PROTOCOLS) if protocols == "all" else [name.strip() for name in protocols.split(",") if name.strip()]
 
 
-def _print_outcomes(outcomes: list[ProtocolErrors]) -> None:
+def _print_outcomes(found: uwbsim.Comparison) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    from uwbsim.pages.comparison_page import COLUMNS
+    from uwbsim.pages import COLUMNS
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for k, name in enumerate(COLUMNS):
         head = name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors")
         table.add_column(head, justify="left" if k == 0 else "right", no_wrap=True)
-    for outcome in outcomes:
+    for outcome in found.outcomes:
         table.add_row(*(show(outcome) for show in COLUMNS.values()))
     Console(width=None if sys.stdout.isatty() else 140).print(table)
 
@@ -105,10 +92,10 @@ def predict(
     as_json: AsJson = False,
 ) -> None:
     """Say mean and standard deviation of a range without simulating any."""
-    from uwbsim.protocols.single_state import State, predict_state
+    import uwbsim
 
-    found = predict_state(
-        State(
+    found = uwbsim.predict_state(
+        uwbsim.State(
             protocol=protocol,
             skew_ppm=skew_ppm,
             reply_delay_us=reply_delay_us,
@@ -125,14 +112,7 @@ def predict(
             whole_ticks=whole_ticks,
         )
     )
-    if as_json:
-        typer.echo(json.dumps(found, indent=1))
-        return
-    typer.echo(f"{found['title']}")
-    typer.echo(f"  bias                 {100 * found['bias_m']:+10.4f} cm")
-    typer.echo(f"  standard deviation   {100 * found['std_m']:10.4f} cm")
-    for name, part in found["parts_m"].items():
-        typer.echo(f"    of {name:17s} {100 * part:10.4f} cm")
+    typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else str(found))
 
 
 def optimum(
@@ -149,26 +129,18 @@ def optimum(
     """Find the delay of the scheduled message that gives the least variance per second of air time."""
     import math
 
-    from uwblink.output import check_output, write_bytes
+    import uwbsim
     from uwbsim.output import check_folder
-    from uwbsim.protocols.comparison import chosen
-    from uwbsim.protocols.reply_delay import optimum as run
-    from uwbsim.scenario.loading import load
+    from uwbsim.pages import optimum_file, write_optima
+    from uwbsim.protocols import chosen
 
     rows = chosen(_names(protocols))
-    loaded = load(scenario, overrides or ())
+    loaded = uwbsim.load(scenario, overrides or ())
     if output:
-        check_folder(output)
-        for row in rows if output.is_dir() else ():
-            check_output(output / f"optimum-{row.name}.png", force=force)
-    found = [run(loaded, row, overhead_us * 1e-6) for row in rows]
+        check_folder(output, [optimum_file(row.name) for row in rows], force=force)
+    found = [uwbsim.optimum(loaded, row, overhead_us * 1e-6) for row in rows]
     if output:
-        from uwbsim.pages.protocol_figures import optimum_curve
-        from uwbsim.pages.scenario_figures import png
-
-        output.mkdir(exist_ok=True)
-        for one in found:
-            write_bytes(output / f"optimum-{one.protocol}.png", png(optimum_curve(one)), force=force)
+        write_optima(found, output, force=force)
     if as_json:
         typer.echo(json.dumps([one.to_dict() for one in found], indent=1))
         return
@@ -188,10 +160,9 @@ def sweep(
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a killed sweep ended.")] = False,
 ) -> None:
     """Run a scenario many times with other settings and seeds; killed and resumed it repeats nothing."""
-    from uwbsim.sweep.design import load_design
-    from uwbsim.sweep.runner import run_sweep
+    import uwbsim
 
-    loaded = load_design(plan)
+    loaded = uwbsim.load_design(plan)
     with interrupts() as stop, progress(loaded.name, eta=True) as report:
 
         def go_on(share: float) -> None:
@@ -201,7 +172,9 @@ def sweep(
                 raise KeyboardInterrupt
 
         try:
-            summary = run_sweep(loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=go_on)
+            summary = uwbsim.run_sweep(
+                loaded, output, workers=workers, scheduler=scheduler, resume=resume, progress=go_on
+            )
         except KeyboardInterrupt:
             typer.echo(f"{output}: interrupted; what was done is kept, and --resume goes on with it")
             raise typer.Exit(INTERRUPTED) from None

@@ -1,1 +1,28 @@
 """Pages and figures about scenarios and protocols."""
+
+from typing import TYPE_CHECKING, Final
+
+from uwblink.lazy import offer
+
+if TYPE_CHECKING:
+    from uwbsim.pages.comparison_page import COLUMNS, FILES, write_comparison
+    from uwbsim.pages.optimum_pictures import optimum_file, write_optima
+
+__all__ = [
+    "COLUMNS",
+    "FILES",
+    "optimum_file",
+    "write_comparison",
+    "write_optima",
+]
+
+_HOMES: Final = {
+    "COLUMNS": "uwbsim.pages.comparison_page",
+    "FILES": "uwbsim.pages.comparison_page",
+    "optimum_file": "uwbsim.pages.optimum_pictures",
+    "write_comparison": "uwbsim.pages.comparison_page",
+    "write_optima": "uwbsim.pages.optimum_pictures",
+}
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = offer(__name__, _HOMES)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any, Final
 
-from uwblink.arrays import Floats
-from uwblink.protocols.table import PROTOCOLS
+from uwblink.output import write_text
+from uwbsim.output import check_folder
 from uwbsim.pages import protocol_figures as figures
 from uwbsim.pages.scenario_figures import png
 from uwbsim.pages.scenario_page import STYLE, figure_html
-from uwbsim.protocols.comparison import ProtocolErrors, over_reply, over_skew, over_state
+from uwbsim.protocols.comparison import Comparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
-from uwbsim.scenario.model import Scenario
+from uwbsim.tables import write_csv, write_parquet
 
 TABLE_STYLE = """
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .85rem; }
@@ -39,14 +40,28 @@ COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
 """What tables on the page and on the terminal show of an outcome."""
 
 
-def page(
-    scenario: Scenario,
-    outcomes: Sequence[ProtocolErrors],
-    samples: Mapping[str, Floats],
-    winners: Sequence[Mapping[str, Any]],
-) -> str:
+FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
+"""What `write_comparison` writes into its folder."""
+
+
+def write_comparison(found: Comparison, folder: Path, *, force: bool = False) -> None:
+    """Write a comparison as page and tables (`FILES`) into a folder, which is made where it is missing.
+
+    Raises what `check_folder` raises.
+    """
+    check_folder(folder, FILES, force=force)
+    text, rows = page(found), [one.to_dict() for one in found.outcomes]
+    folder.mkdir(exist_ok=True)
+    html, table, packed = (folder / name for name in FILES)
+    write_text(html, text, force=force)
+    write_csv(table, rows, force=force)
+    write_parquet(packed, rows, force=force)
+
+
+def page(found: Comparison) -> str:
     """Return the page; text from the scenario is escaped."""
-    protocols = {o.protocol: PROTOCOLS[o.protocol] for o in outcomes}
+    scenario, outcomes, samples = found.scenario, found.outcomes, found.samples
+    protocols = {row.name: row for row in found.protocols}
     states = conditions_of(scenario)
     skew = {name: over_skew(scenario, row) for name, row in protocols.items()}
     reply = {name: over_reply(scenario, row) for name, row in protocols.items()}
@@ -65,7 +80,7 @@ def page(
         "<h2>Which wins where</h2>",
         "<p>By prediction, once delays and power bias are calibrated, without reflections. One range: the least error "
         "of a single range. Per second: the least error of the mean of what fits into a second.</p>",
-        _winners(list(protocols), winners),
+        _winners(list(protocols), found.winners),
         "<h2>Over what</h2><p>Points are simulated, lines predicted; the first two without delays, power bias and "
         "reflections.</p>",
         _picture(figures.error_over(skew, "relative skew (ppm)"), "Error over the relative skew of the clocks."),

@@ -31,8 +31,13 @@ PAPER_STAMPS: Final = {"tx1": "t1", "rx1": "t2", "tx2": "t3", "rx2": "t4", "tx3"
 
 def png(figure: Figure) -> bytes:
     """Return a picture for a page."""
+    return picture(figure, "png", 130)
+
+
+def picture(figure: Figure, kind: str, dpi: int) -> bytes:
+    """Return a figure as the bytes of a "png", "svg" or "pdf" file."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
+    figure.savefig(buffer, format=kind, dpi=dpi)
     return buffer.getvalue()
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import base64
+import os
 from html import escape
 from pathlib import Path
 from typing import Final
 
-from uwblink.output import check_output, write_text
+from uwblink.output import check_output, write_bytes, write_text
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
-from uwbsim.pages.scenario_figures import png, room, timing
-from uwbsim.pages.scenario_summary import preview, sentences
+from uwbsim.pages.scenario_figures import picture, png, room, timing
+from uwbsim.pages.scenario_summary import preview
+from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 
 PICTURES: Final = (".png", ".svg", ".pdf")
@@ -26,15 +28,33 @@ pre { background: var(--soft); padding: .6rem; overflow-x: auto; font-size: .85r
 """
 
 
-def show(scenario: Scenario, path: Path, *, force: bool = False) -> None:
+def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write the scene: .html has the room, the timing of every protocol and the preview; a picture has the room.
 
-    Raises `ScenarioError` for another suffix, and what `check_output` raises.
+    `scenario` is whatever `load` takes, or a `Scenario`. Raises `ScenarioError` for a suffix other than .html, .png,
+    .svg and .pdf, and what `check_output` raises.
+
+    >>> from pathlib import Path
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> uwbsim.show(
+    ...     {
+    ...         "run": {"duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     },
+    ...     "scene.png",
+    ... )
+    >>> Path("scene.png").read_bytes()[1:4]
+    b'PNG'
     """
+    path = Path(path)
     check_output(path, force=force)
+    scenario = as_scenario(scenario)
     suffix = path.suffix.lower()
     if suffix in PICTURES:
-        room(scenario).savefig(path, dpi=150)
+        write_bytes(path, picture(room(scenario), suffix[1:], 150), force=force)
     elif suffix == ".html":
         write_text(path, page(scenario), force=force)
     else:
@@ -50,7 +70,7 @@ def page(scenario: Scenario) -> str:
         f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
         figure_html(png(room(scenario)), "Bodies' paths (two minutes at most), tags where they start, obstacles"),
         "<h2>What will happen</h2>",
-        f"<pre>{escape(chr(10).join(sentences(scenario, preview(scenario))))}</pre>",
+        f"<pre>{escape(str(preview(scenario)))}</pre>",
         "<h2>One exchange</h2>",
         *(
             figure_html(png(timing(scenario, name)), f"{row.title}: every stamp, and what the paper calls it")

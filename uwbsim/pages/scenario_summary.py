@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
 import numpy as np
 
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
+from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import UUS_S, Scenario
 from uwbsim.simulation.schedule import schedule
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
@@ -17,7 +18,7 @@ from uwbsim.world.world import World
 SAMPLES: Final = 200
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PairPreview:
     """What to expect of a pair: rate, distances and first-path powers over the run, and its bias by skew in SS-TWR."""
 
@@ -31,9 +32,11 @@ class PairPreview:
     ss_bias_m: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Preview:
-    """What to expect of a run; `air_share` is the share of time in which some frame is on the air."""
+    """What to expect of a run of `scenario`; `air_share` is the share of time in which some frame is on the air."""
+
+    scenario: Scenario
 
     pairs: tuple[PairPreview, ...]
     exchanges: int
@@ -42,9 +45,40 @@ class Preview:
     air_share: float
     duration_s: float
 
+    def __repr__(self) -> str:
+        """Return it in words, a line a thing to know; warnings begin with "warning:"."""
+        return "\n".join(sentences(self))
 
-def preview(scenario: Scenario) -> Preview:
-    """Work out what a scenario will do; raises what building its world raises."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `uwbsim validate --json` prints: the figures, without the scenario."""
+        pairs = [asdict(pair) for pair in self.pairs]
+        return {"pairs": pairs} | {name: getattr(self, name) for name in FIGURES}
+
+
+FIGURES: Final = ("exchanges", "rate_hz", "fastest_hz", "air_share", "duration_s")
+
+
+def preview(scenario: Scenario | Source) -> Preview:
+    """Work out what a scenario will do, without running it; raises `ScenarioError`.
+
+    `scenario` is whatever `load` takes, or a `Scenario`.
+
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> found = uwbsim.preview(
+    ...     {
+    ...         "run": {"name": "two", "duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     }
+    ... )
+    >>> found.exchanges, found.pairs[0].distance_m
+    (100, (5.0, 5.0))
+    >>> print(str(found).splitlines()[0])
+    two: DS-TWR, third message from the target, plan round-robin, 2 s
+    """
+    scenario = as_scenario(scenario)
     plan, world = schedule(scenario), World.of(scenario)
     duration, radio = scenario.run.duration_s, scenario.radio
     time = (np.linspace(0, duration, SAMPLES) * SUBTICKS_PER_SECOND).astype(np.int64)
@@ -56,28 +90,30 @@ def preview(scenario: Scenario) -> Preview:
         reply_s = scenario.ranging.response_delay_uus * UUS_S
         pairs.append(
             PairPreview(
-                one.id,
-                two.id,
-                count,
-                count / duration,
-                (float(link.distance_m.min()), float(link.distance_m.max())),
-                (float(link.power_dbm.min()), float(link.power_dbm.max())),
-                float(np.mean(link.power_dbm >= radio.sensitivity_dbm)),
-                SPEED_OF_LIGHT / 2 * (one.skew_ppm - two.skew_ppm) * 1e-6 * reply_s,
+                initiator=one.id,
+                target=two.id,
+                exchanges=count,
+                rate_hz=count / duration,
+                distance_m=(float(link.distance_m.min()), float(link.distance_m.max())),
+                power_dbm=(float(link.power_dbm.min()), float(link.power_dbm.max())),
+                audible=float(np.mean(link.power_dbm >= radio.sensitivity_dbm)),
+                ss_bias_m=SPEED_OF_LIGHT / 2 * (one.skew_ppm - two.skew_ppm) * 1e-6 * reply_s,
             )
         )
     return Preview(
-        tuple(pairs),
-        len(plan.start),
-        len(plan.start) / duration,
-        scenario.ranging.fastest_hz(),
-        scenario.ranging.air_share(radio.preamble_symbols),
-        duration,
+        scenario=scenario,
+        pairs=tuple(pairs),
+        exchanges=len(plan.start),
+        rate_hz=len(plan.start) / duration,
+        fastest_hz=scenario.ranging.fastest_hz(),
+        air_share=scenario.ranging.air_share(radio.preamble_symbols),
+        duration_s=duration,
     )
 
 
-def sentences(scenario: Scenario, found: Preview) -> list[str]:
+def sentences(found: Preview) -> list[str]:
     """Return the preview in words, a line each; warnings begin with "warning:"."""
+    scenario = found.scenario
     protocol = PROTOCOLS[scenario.ranging.protocol]
     plan = scenario.ranging.plan if isinstance(scenario.ranging.plan, str) else scenario.ranging.plan.file
     lines = [

@@ -1,1 +1,19 @@
 """The protocol workbench: Monte Carlo, prediction, comparison."""
+
+from typing import TYPE_CHECKING, Final
+
+from uwblink.lazy import offer
+
+if TYPE_CHECKING:
+    from uwbsim.protocols.comparison import chosen
+
+__all__ = [
+    "chosen",
+]
+
+_HOMES: Final = {
+    "chosen": "uwbsim.protocols.comparison",
+}
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = offer(__name__, _HOMES)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, NamedTuple
+from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
 
@@ -64,11 +65,40 @@ class ProtocolErrors:
         return asdict(self)
 
 
-class Comparison(NamedTuple):
-    """Protocols beside each other: what came out, and a sample of each one's errors in metres, by name."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Comparison:
+    """Protocols beside each other in a scenario: what came out, and a sample of each one's errors in metres, by name.
 
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> scenario = uwbsim.load(
+    ...     {
+    ...         "run": {"duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     }
+    ... )
+    >>> found = uwbsim.compare(scenario, ["ss-cfo", "ds"], count=1000)
+    >>> found.winners[0]["scheduled_us"], found.winners[0]["rmse"]
+    (300, 'ss-cfo')
+    >>> sorted(found.to_dict())
+    ['protocols', 'winners']
+    """
+
+    scenario: Scenario
+    protocols: tuple[RangingProtocol, ...]
     outcomes: list[ProtocolErrors]
     samples: dict[str, Floats]
+
+    @cached_property
+    def winners(self) -> list[dict[str, Any]]:
+        """Say for some delays of the scheduled reply which protocol errs least, as a calibration leaves it."""
+        return winners(self.scenario, self.protocols)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `uwbsim compare --json` prints."""
+        return {"protocols": [one.to_dict() for one in self.outcomes], "winners": self.winners}
 
     def __repr__(self) -> str:
         """Return a line a protocol."""
@@ -146,7 +176,7 @@ def compare(
         errors = range_errors_m(protocol, conditions, scenario.run.seed, count, report)
         outcomes.append(_outcome(scenario, protocol, conditions, errors))
         samples[protocol.name] = errors[:SAMPLE].copy()
-    return Comparison(outcomes, samples)
+    return Comparison(scenario=scenario, protocols=tuple(rows), outcomes=outcomes, samples=samples)
 
 
 def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditions, errors: Floats) -> ProtocolErrors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
 from uwblink.protocols.rows import RangingProtocol
@@ -64,16 +64,55 @@ def _check(q: State) -> None:
         raise ParameterError("final_delay_us", f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}")
 
 
-def predict_state(q: State) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Prediction:
+    """What a raw range in one state errs by: `bias_m`, `std_m`, `variance_m2`, and in ps of the time of flight.
+
+    `parts_m` is the standard deviation in metres that each cause alone leaves.
+
+    >>> import uwbsim
+    >>> print(uwbsim.predict_state(uwbsim.State(protocol="ss", skew_ppm=2.0)))
+    SS-TWR
+      bias                    +8.9916 cm
+      standard deviation       3.1788 cm
+        of transmit noise        0.0000 cm
+        of receive noise         3.1788 cm
+        of whole ticks           0.0000 cm
+        of carrier integrator     0.0000 cm
+    """
+
+    protocol: str
+    title: str
+    bias_m: float
+    std_m: float
+    variance_m2: float
+    bias_ps: float
+    std_ps: float
+    parts_m: dict[str, float]
+
+    def __repr__(self) -> str:
+        """Return a line a figure, in cm."""
+        lines = [
+            self.title,
+            f"  bias                 {100 * self.bias_m:+10.4f} cm",
+            f"  standard deviation   {100 * self.std_m:10.4f} cm",
+            *(f"    of {name:17s} {100 * part:10.4f} cm" for name, part in self.parts_m.items()),
+        ]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `uwbsim predict --json` prints."""
+        return asdict(self)
+
+
+def predict_state(q: State) -> Prediction:
     """Return bias and standard deviation of a raw range without simulating any, and the parts of the latter.
 
-    Keys are `protocol`, `title`; `bias_m`, `std_m`, `variance_m2` of the range, `bias_ps`, `std_ps` of the time of
-    flight; `parts_m`, the standard deviation in metres that each cause alone leaves. Raises `ParameterError` for a
-    number that cannot be, and for an unknown protocol.
+    Raises `ParameterError` for a number that cannot be, and for an unknown protocol.
 
     >>> import uwbsim
     >>> found = uwbsim.predict_state(uwbsim.State(protocol="ss", skew_ppm=2.0, reply_delay_us=1000.0, rx_noise_ps=0.0))
-    >>> round(found["bias_m"], 3)  # half of skew times reply times the speed of light
+    >>> round(found.bias_m, 3)  # half of skew times reply times the speed of light
     0.3
     """
     (protocol,) = chosen([q.protocol], "protocol")
@@ -110,13 +149,13 @@ def predict_state(q: State) -> dict[str, Any]:
         "whole ticks": found.quantization_m2,
         "carrier integrator": found.carrier_m2,
     }
-    return {
-        "protocol": protocol.name,
-        "title": protocol.title,
-        "bias_m": bias,
-        "std_m": variance**0.5,
-        "variance_m2": variance,
-        "bias_ps": bias / SPEED_OF_LIGHT * PS_PER_S,
-        "std_ps": variance**0.5 / SPEED_OF_LIGHT * PS_PER_S,
-        "parts_m": {name: float(part[0]) ** 0.5 for name, part in parts.items()},
-    }
+    return Prediction(
+        protocol=protocol.name,
+        title=protocol.title,
+        bias_m=bias,
+        std_m=variance**0.5,
+        variance_m2=variance,
+        bias_ps=bias / SPEED_OF_LIGHT * PS_PER_S,
+        std_ps=variance**0.5 / SPEED_OF_LIGHT * PS_PER_S,
+        parts_m={name: float(part[0]) ** 0.5 for name, part in parts.items()},
+    )

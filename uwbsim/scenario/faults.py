@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -80,8 +81,16 @@ class Faults(Section):
         return 1 - kept
 
 
-def load(path: str | os.PathLike[str], tags: list[int]) -> Faults:
-    """Read a file of faults; raises `ScenarioError` that says where it is wrong."""
+def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
+    """Read a file of faults of boards with these tags; raises `ScenarioError` that says where it is wrong.
+
+    >>> from pathlib import Path
+    >>> import uwbsim
+    >>> _ = Path("faults.toml").write_text("faults = [{ kind = 'unplug', tag = 10, at_s = 0.5, for_s = 0.1 }]\\n")
+    >>> uwbsim.load_faults("faults.toml", [10, 20]).faults[0].at_s
+    0.5
+    """
+    tags = list(tags)
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         faults = Faults.model_validate(table)

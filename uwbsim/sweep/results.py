@@ -1,58 +1,19 @@
-"""Tables of results beside recordings: CSV and Parquet files, and a store that survives being killed."""
+"""The results of a sweep: a store that survives being killed, and the tables made from it."""
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from uwblink.errors import UwblinkError
-
-TYPES: Final = {bool: "BOOLEAN", int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
-"""Of columns, by the type of their first value that is not None."""
+from uwblink.output import whole
+from uwbsim.tables import fill_csv
 
 
 class TableError(UwblinkError, ValueError):
     """A table or store that cannot be read or written: what, where, what to do."""
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as CSV; the columns are those of the first row."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as Parquet."""
-    import duckdb
-
-    with duckdb.connect() as db:
-        _create(db, "rows", rows)
-        db.table("rows").write_parquet(str(path))
-
-
-def _create(db: Any, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    columns = {key: _type(key, rows) for key in rows[0]}
-    declared = ", ".join(f"{_quoted(key)} {kind}" for key, kind in columns.items())
-    db.execute(f"CREATE TABLE {name} ({declared})")
-    places = ", ".join("?" * len(columns))
-    db.executemany(f"INSERT INTO {name} VALUES ({places})", [[row.get(key) for key in columns] for row in rows])  # noqa: S608 - a name of ours
-
-
-def _type(key: str, rows: Sequence[Mapping[str, Any]]) -> str:
-    known = {type(row[key]) for row in rows if row.get(key) is not None}
-    # Whole numbers among others are numbers; anything else mixed is text.
-    if known == {int, float}:
-        return "DOUBLE"
-    return TYPES.get(next(iter(known)), "VARCHAR") if len(known) == 1 else "VARCHAR"
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'
 
 
 class Store:
@@ -125,17 +86,14 @@ class Store:
 
 
 def export(store: Store, table: Path, parquet: Path) -> None:
-    """Write the rows of a store as CSV and Parquet, row by row, with the columns of all of them."""
+    """Write the rows of a store as CSV and Parquet, row by row, with the columns of all of them; replaces both."""
     import duckdb
 
-    keys = list(dict.fromkeys(key for row in store.rows() for key in row))
-    with table.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, keys, restval="")
-        writer.writeheader()
-        writer.writerows(store.rows())
-    parquet.unlink(missing_ok=True)
-    with duckdb.connect() as db:
-        db.read_csv(str(table), header=True, sample_size=-1).write_parquet(str(parquet))
+    columns = list(dict.fromkeys(key for row in store.rows() for key in row))
+    with whole(table, force=True) as rows, whole(parquet, force=True) as packed:
+        fill_csv(rows, columns, store.rows())
+        with duckdb.connect() as db:
+            db.read_csv(str(rows), header=True, sample_size=-1).write_parquet(str(packed))
 
 
 def _connect(path: Path) -> Any:

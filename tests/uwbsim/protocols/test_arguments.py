@@ -23,7 +23,7 @@ def test_protocols_are_names_rows_or_all():
     assert [one.protocol for one in compare(SHORT, count=10).outcomes] == list(PROTOCOLS)
     assert optimum(SHORT, row).delay_s == optimum(SHORT, "ds").delay_s
     said = uwbsim.predict_state(uwbsim.State(protocol=row))
-    assert said["std_m"] == uwbsim.predict_state(uwbsim.State(protocol="ds"))["std_m"]
+    assert said.std_m == uwbsim.predict_state(uwbsim.State(protocol="ds")).std_m
 
 
 def test_a_scenario_may_be_a_file():

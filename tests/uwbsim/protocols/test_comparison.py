@@ -31,7 +31,8 @@ def scenario():
 
 
 def test_predicted_stands_beside_simulated(scenario):
-    outcomes, samples = compare(scenario, ROWS, 300_000)
+    found = compare(scenario, ROWS, 300_000)
+    outcomes, samples = found.outcomes, found.samples
     assert [o.protocol for o in outcomes] == list(PROTOCOLS)
     for o in outcomes:
         # Reflections: a heavy tail knows its mean to std/550 and its spread to 1 %.

@@ -1,0 +1,81 @@
+"""The commands call nothing but what everybody may call: names of the front doors and of the doors of rooms."""
+
+import ast
+import importlib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("uwblink", "uwbsim", "calib")
+
+# What commands use beside doors, each with its reason.
+BESIDE = {
+    "uwblink.cli.shared": "options, errors and interrupts that the three commands have in common",
+}
+
+
+def offered(module):
+    """What a front door or the door of a room (a module of the first level with `__all__`) offers."""
+    return set(getattr(importlib.import_module(module), "__all__", ()))
+
+
+def used(source):
+    """Yield module and name of everything that a module takes from the three packages; "" for a module itself."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, "") for alias in node.names if alias.name.split(".")[0] in PACKAGES)
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+            yield from ((node.module, alias.name) for alias in node.names)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in PACKAGES:
+            yield node.value.id, node.attr
+
+
+def allowed(package, module, name):
+    whole = f"{module}.{name}"
+    if module in BESIDE or whole in BESIDE:
+        return True
+    if whole.startswith(f"{package}.cli.") or module == f"{package}.errors":
+        return True
+    if module.count(".") > 1:
+        return False
+    return module in PACKAGES if not name else name in offered(module)
+
+
+def strangers(package, source):
+    found = {f"{module}.{name}".rstrip(".") for module, name in used(source) if not allowed(package, module, name)}
+    return sorted(found)
+
+
+@pytest.mark.parametrize("package", ["uwbsim"])
+def test_commands_go_through_doors(package):
+    files = sorted((ROOT / package / "cli").rglob("*.py"))
+    assert files
+    found = {file.name: strangers(package, file.read_text(encoding="utf-8")) for file in files}
+    assert {name: names for name, names in found.items() if names} == {}
+
+
+@pytest.mark.parametrize(
+    ("package", "source", "found"),
+    [
+        ("calib", "def f():\n    from calib.estimation.fitting import fit", ["calib.estimation.fitting.fit"]),
+        ("calib", "from calib.report import layout", ["calib.report.layout"]),
+        ("calib", "import calib.estimation.fitting", ["calib.estimation.fitting"]),
+        ("calib", "import calib\ncalib.estimation.x", ["calib.estimation"]),
+        ("uwbsim", "from uwblink.errors import UwblinkError", ["uwblink.errors.UwblinkError"]),
+        ("calib", "import calib\nfrom uwblink.cli import shared\nfrom calib.errors import CalibError\ncalib.fit", []),
+    ],
+)
+def test_the_walk_sees_a_back_door(package, source, found):
+    assert strangers(package, source) == found
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_what_the_door_of_a_room_offers_is_there(package):
+    rooms = {path.relative_to(ROOT / package).parts[0].removesuffix(".py") for path in (ROOT / package).rglob("*.py")}
+    for room in sorted(rooms - {"__init__", "__main__", "cli"}):
+        module = importlib.import_module(f"{package}.{room}")
+        names = list(getattr(module, "__all__", ()))
+        assert names == sorted(names)
+        for name in names:
+            assert getattr(module, name) is not None

@@ -1,0 +1,29 @@
+"""Pictures of the best delays, as files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from uwblink.output import write_bytes
+from uwbsim.output import check_folder
+from uwbsim.pages.protocol_figures import optimum_curve
+from uwbsim.pages.scenario_figures import png
+from uwbsim.protocols.reply_delay import Optimum
+
+
+def optimum_file(protocol: str) -> str:
+    """Return what `write_optima` calls the picture of a protocol."""
+    return f"optimum-{protocol}.png"
+
+
+def write_optima(found: Iterable[Optimum], folder: Path, *, force: bool = False) -> None:
+    """Write the curve of each optimum as a picture (.png) into a folder, which is made where it is missing.
+
+    Raises what `check_folder` raises.
+    """
+    pictures = {optimum_file(one.protocol): png(optimum_curve(one)) for one in found}
+    check_folder(folder, pictures, force=force)
+    folder.mkdir(exist_ok=True)
+    for name, picture in pictures.items():
+        write_bytes(folder / name, picture, force=force)

@@ -1,0 +1,58 @@
+"""Tables beside recordings, as CSV and Parquet files that are whole or not there at all."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from uwblink.output import whole
+
+TYPES: Final = {bool: "BOOLEAN", int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
+"""Of columns, by the type of their first value that is not None."""
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def write_csv(path: Path, rows: Rows, *, force: bool) -> None:
+    """Write rows as CSV; the columns are those of the first row. Raises what `whole` raises."""
+    with whole(path, force=force) as partial:
+        fill_csv(partial, list(rows[0]), rows)
+
+
+def fill_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write rows one by one, with a line of the columns' names before."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_parquet(path: Path, rows: Rows, *, force: bool) -> None:
+    """Write rows as Parquet; raises what `whole` raises."""
+    import duckdb
+
+    with whole(path, force=force) as partial, duckdb.connect() as db:
+        _create(db, "rows", rows)
+        db.table("rows").write_parquet(str(partial))
+
+
+def _create(db: Any, name: str, rows: Rows) -> None:
+    columns = {key: _type(key, rows) for key in rows[0]}
+    declared = ", ".join(f"{_quoted(key)} {kind}" for key, kind in columns.items())
+    db.execute(f"CREATE TABLE {name} ({declared})")
+    places = ", ".join("?" * len(columns))
+    db.executemany(f"INSERT INTO {name} VALUES ({places})", [[row.get(key) for key in columns] for row in rows])  # noqa: S608 - a name of ours
+
+
+def _type(key: str, rows: Rows) -> str:
+    known = {type(row[key]) for row in rows if row.get(key) is not None}
+    # Whole numbers among others are numbers; anything else mixed is text.
+    if known == {int, float}:
+        return "DOUBLE"
+    return TYPES.get(next(iter(known)), "VARCHAR") if len(known) == 1 else "VARCHAR"
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
