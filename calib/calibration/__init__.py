@@ -1,1 +1,19 @@
 """Calibrations: the model, its file, other formats, corrections, comparison."""
+
+from typing import TYPE_CHECKING, Final
+
+from uwblink.lazy import offer
+
+if TYPE_CHECKING:
+    from calib.calibration.formats import read_miluv
+
+__all__ = [
+    "read_miluv",
+]
+
+_HOMES: Final = {
+    "read_miluv": "calib.calibration.formats",
+}
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = offer(__name__, _HOMES)

@@ -15,7 +15,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 SIGNIFICANT: Final = 0.05
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Comparison:
     """Differences second minus first, after a shift common to all delays has been taken out.
 
@@ -36,6 +36,29 @@ class Comparison:
     def same(self) -> bool:
         """Whether differences as large as these come by chance more than once in twenty."""
         return self.probability >= SIGNIFICANT
+
+    def __repr__(self) -> str:
+        """Return the table: a line a tag, and what it comes to."""
+        return self.table()
+
+    def table(self, first: str = "the first", second: str = "the second") -> str:
+        """Return a line a tag in ps, the common shift in cm, and the verdict; `first` and `second` name the two."""
+        lines = [
+            f"  tag {tag:3d}  {1e3 * difference:+8.1f} ps  ± {1e3 * self.std_ns[tag]:.1f}"
+            for tag, difference in self.difference_ns.items()
+        ]
+        lines.append(
+            f"offset of all ranges {100 * self.offset_m:+.1f} cm, "
+            f"shape of the bias curves {100 * self.curve_rms_m:.1f} cm rms"
+        )
+        for name, tags in ((first, self.only_first), (second, self.only_second)):
+            if tags:
+                lines.append(f"only in {name}: tags {', '.join(map(str, tags))}")
+        lines.append(
+            f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
+            f"{len(self.difference_ns) - 1} degrees of freedom, probability {self.probability:.3f}"
+        )
+        return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib compare --json` prints."""
@@ -84,14 +107,14 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     grid = np.linspace(low, max(high, low + 1e-9), 400)
     curves = second.bias_curve(grid) - first.bias_curve(grid)
     return Comparison(
-        dict(zip(common, (delta - shift).tolist(), strict=True)),
-        dict(zip(common, std.tolist(), strict=True)),
-        shift * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),
-        float(curves.std()),
-        score,
-        float(chi2.sf(score, len(common) - 1)),
-        tuple(sorted(set(first.delays_ns) - set(common))),
-        tuple(sorted(set(second.delays_ns) - set(common))),
+        difference_ns=dict(zip(common, (delta - shift).tolist(), strict=True)),
+        std_ns=dict(zip(common, std.tolist(), strict=True)),
+        offset_m=shift * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),
+        curve_rms_m=float(curves.std()),
+        chi_square=score,
+        probability=float(chi2.sf(score, len(common) - 1)),
+        only_first=tuple(sorted(set(first.delays_ns) - set(common))),
+        only_second=tuple(sorted(set(second.delays_ns) - set(common))),
     )
 
 

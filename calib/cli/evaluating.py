@@ -65,7 +65,7 @@ def localize(
     from dataclasses import asdict
 
     import calib
-    from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, as_tum, summarize
+    from calib.evaluation import FILTERS, PAPER_RMSE_M, as_tum, summarize
     from uwblink.output import write_text
 
     known = calib.load_calibration(calibration)
@@ -138,16 +138,4 @@ def compare(
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
         return
-    for tag, difference in found.difference_ns.items():
-        typer.echo(f"  tag {tag:3d}  {1e3 * difference:+8.1f} ps  ± {1e3 * found.std_ns[tag]:.1f}")
-    typer.echo(
-        f"offset of all ranges {100 * found.offset_m:+.1f} cm, "
-        f"shape of the bias curves {100 * found.curve_rms_m:.1f} cm rms"
-    )
-    for name, tags in ((first, found.only_first), (second, found.only_second)):
-        if tags:
-            typer.echo(f"only in {name}: tags {', '.join(map(str, tags))}")
-    typer.echo(
-        f"the delays are {'the same' if found.same else 'different'}: chi-square {found.chi_square:.1f} with "
-        f"{len(found.difference_ns) - 1} degrees of freedom, probability {found.probability:.3f}"
-    )
+    typer.echo(found.table(str(first), str(second)))

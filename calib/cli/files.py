@@ -65,7 +65,7 @@ def import_miluv(
     force: Force = False,
 ) -> None:
     """Turn the calibration published with the MILUV dataset into one that apply and evaluate take."""
-    from calib.calibration.formats import read_miluv
+    from calib.calibration import read_miluv
 
     found = read_miluv(source)
     found.save(output, force=force)

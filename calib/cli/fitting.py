@@ -29,7 +29,7 @@ from calib.cli.arguments import (
 from calib.cli.flags import with_flags
 
 if TYPE_CHECKING:
-    from calib.calibration.model import Calibration
+    import calib
 
 
 def add_to(app: typer.Typer) -> None:
@@ -90,7 +90,7 @@ def fit(
         typer.echo(f"warning: {with_flags(warning)}", err=True)
 
 
-def delay_lines(found: Calibration) -> Iterator[str]:
+def delay_lines(found: calib.Calibration) -> Iterator[str]:
     """Yield a line a tag: the delay and its 95 % interval."""
     for tag, delay in sorted(found.delays_ns.items()):
         half = 1.96 * found.delays_std_ns[tag]

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from calib.errors import BadInputError
-from calib.estimation.arguments import FitSettings
+from calib.estimation import FitSettings
 
 
 def fit_options(

@@ -74,7 +74,7 @@ def report(
 
     import calib
     from calib.cli.options import fit_options
-    from calib.report.writing import check_places
+    from calib.report import check_places
 
     options = fit_options(
         loss,

@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation
+from calib.evaluation import CORRECTION_STAGES, ErrorStatistics, Evaluation
 
 WIDE = 110
 """Columns that the table never needs more than: where nobody looks, no figure must lose its last digits."""

@@ -25,7 +25,7 @@ class Finding:
     confidence: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingView:
     """A recording as the examinations see it; `truth_m` (n,) is NaN where nothing says it.
 

@@ -65,7 +65,17 @@ def _admitted(name: str, both: Exchanges, poses: Poses, tags: list[Tag], faults:
     if not np.isfinite(truth).any() and len(poses):
         truth = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
     told = tuple(", ".join(differences(both, a, b)) for a, b in reports.differing.tolist())
-    return RecordingView(name, e, poses, tags, faults, raw, truth, reports.repeated, told)
+    return RecordingView(
+        name=name,
+        exchanges=e,
+        poses=poses,
+        tags=tags,
+        faults=faults,
+        raw_m=raw,
+        truth_m=truth,
+        repeated=reports.repeated,
+        differing=told,
+    )
 
 
 Examination = Callable[[RecordingView], Iterator[Finding]]

@@ -23,7 +23,7 @@ PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 """Mean over six scenarios (ICRA 2023, Table II)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """How the filter is set up.
 
@@ -42,7 +42,7 @@ class Settings:
     seed: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """How one filter did: times (n,), estimates and truth (n, 3), normalised errors, and what was refused.
 
@@ -176,7 +176,15 @@ def _filter(problem: _Problem, measured_m: Floats, std_m: Floats, settings: Sett
         opinion[k] = p[0, 0] + p[1, 1] + p[2, 2]
         wrong = x - problem.place[k]
         nees[k] = wrong @ np.linalg.solve(p, wrong)
-    return Track(problem.time_ns, estimate, problem.place, np.sqrt(opinion), nis, nees, accepted)
+    return Track(
+        time_ns=problem.time_ns,
+        estimate_m=estimate,
+        truth_m=problem.place,
+        std_m=np.sqrt(opinion),
+        nis=nis,
+        nees=nees,
+        accepted=accepted,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +31,7 @@ NOMINAL: Final = {
 """Bounds of a standard normal distribution that hold so many per cent."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Stats:
     """Statistics of range errors in metres; `robust_std_m` is 1.4826 median absolute deviations.
 
@@ -48,7 +48,7 @@ class Stats:
     abs95_m: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorStatistics:
     """A pair, or all pairs: statistics in the three stages, and the chi-square test.
 
@@ -182,17 +182,18 @@ def pair_rows(ranges: Ranges) -> dict[str, Bools]:
 def statistics(error_m: Floats) -> Stats:
     """Return the statistics of range errors (n,); NaN where there are none."""
     if not len(error_m):
-        return Stats(0, *[float("nan")] * 7)
+        nothing: dict[str, Any] = dict.fromkeys((field.name for field in fields(Stats)), float("nan"))
+        return Stats(**nothing | {"n": 0})
     low, high = np.quantile(error_m, (0.025, 0.975))
     return Stats(
-        len(error_m),
-        float(np.mean(error_m)),
-        float(np.median(error_m)),
-        float(np.std(error_m)),
-        robust_spread(error_m),
-        float(low),
-        float(high),
-        float(np.quantile(np.abs(error_m), 0.95)),
+        n=len(error_m),
+        mean_m=float(np.mean(error_m)),
+        median_m=float(np.median(error_m)),
+        std_m=float(np.std(error_m)),
+        robust_std_m=robust_spread(error_m),
+        low_m=float(low),
+        high_m=float(high),
+        abs95_m=float(np.quantile(np.abs(error_m), 0.95)),
     )
 
 

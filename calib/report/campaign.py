@@ -30,7 +30,7 @@ SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Campaign:
     """Everything that a report tells of: what was fitted from which recordings, and how it does on which tests.
 
@@ -152,13 +152,13 @@ def run_campaign(
     findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
     progress("localizing")
     return Campaign(
-        fitted,
-        testing,
-        found,
-        refits,
-        _heard(recordings, found.calibration),
-        findings,
-        _tracks(judged or recordings, found.calibration),
+        training=fitted,
+        tests=testing,
+        fit=found,
+        refits=refits,
+        heard=_heard(recordings, found.calibration),
+        findings=findings,
+        tracks=_tracks(judged or recordings, found.calibration),
     )
 
 

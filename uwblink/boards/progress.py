@@ -29,7 +29,7 @@ class PairState:
         return recent / min(RATE_WINDOW_S, max(time_s, 0.1))
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Progress(Listener):
     """Counts for whoever watches. Times in seconds since `start_ns` (host time).
 

@@ -132,7 +132,7 @@ class Recorder:
         self._turn, self._next_s = 0, self._start_s
         self._active: tuple[Station, Pair] | None = None
         self._check = ReportCheck()
-        self.progress = Progress(self._ports.host_ns(), pairs={pair: PairState() for pair in self._turns})
+        self.progress = Progress(start_ns=self._ports.host_ns(), pairs={pair: PairState() for pair in self._turns})
         self._listeners = [self.progress, *listeners]
         self._stations: dict[int, Station] = {}
         try:

@@ -31,6 +31,10 @@ def test_a_delay_that_moved_is_seen():
     found = compare(a, moved)
     assert not found.same
     assert max(found.difference_ns, key=lambda t: abs(found.difference_ns[t])) == 3
+    lines = str(found).splitlines()
+    assert f"{1e3 * found.difference_ns[3]:+.1f} ps" in lines[2]
+    assert lines[-1].startswith("the delays are different: chi-square ")
+    assert len(lines) == 6
 
 
 def test_a_shift_of_delays_against_the_curve_is_no_difference():
