@@ -2,7 +2,7 @@
 
 >>> import uwbsim
 >>> uwbsim.__all__[-3:]
-['register_channel_effect', 'run_sweep', 'simulate']
+['show', 'simulate', 'through_wire']
 """
 
 from typing import TYPE_CHECKING, Final

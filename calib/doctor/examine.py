@@ -73,8 +73,8 @@ def _admitted(name: str, both: Exchanges, poses: Poses, tags: list[Tag], faults:
         faults=faults,
         raw_m=raw,
         truth_m=truth,
-        repeated=reports.repeated,
-        differing=told,
+        reported_twice=reports.repeated,
+        contradictions=told,
     )
 
 

@@ -48,7 +48,29 @@ Reply = TypeVar("Reply", bound=Message)
 
 
 class Board:
-    """One board. Not for use from several threads at once; one board a thread is fine."""
+    """One board. Not for use from several threads at once; one board a thread is fine.
+
+    `Board.open("/dev/ttyACM0")` opens a board on a serial port; here are two that are simulated:
+
+    >>> import uwblink, uwbsim
+    >>> ports = uwbsim.VirtualPorts(
+    ...     uwbsim.load(
+    ...         '''
+    ...         run = { duration_s = 10.0 }
+    ...         ranging = { rate_hz = 50 }
+    ...         bodies = [
+    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
+    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
+    ...         ]
+    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
+    ...         '''
+    ...     )
+    ... )
+    >>> with uwblink.Board(ports.port(10)) as board:
+    ...     report = board.range(20)
+    >>> board.id, report.neighbour, abs(report.range_m - 3.0) < 0.2
+    (10, 20, True)
+    """
 
     def __init__(
         self, transport: Transport, *, answer_s: float = ANSWER_S, connection: Connection | None = None

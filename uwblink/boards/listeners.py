@@ -30,7 +30,32 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A message or a line of text that a board sent, the id of the board, and when it came (host time, Unix epoch)."""
+    """A message or a line of text that a board sent, the id of the board, and when it came (host time, Unix epoch).
+
+    Every function among the listeners of `uwblink.record` is called with these:
+
+    >>> import uwblink, uwbsim
+    >>> ports = uwbsim.VirtualPorts(
+    ...     uwbsim.load(
+    ...         '''
+    ...         run = { duration_s = 10.0 }
+    ...         ranging = { rate_hz = 50 }
+    ...         bodies = [
+    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
+    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
+    ...         ]
+    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
+    ...         '''
+    ...     )
+    ... )
+    >>> heard = []
+    >>> plan = uwblink.RangingPlan(rate_hz=20.0)
+    >>> _ = uwblink.record(
+    ...     ports.names.values(), "heard.uwb", plan, duration_s=1.0, using=ports, listeners=[heard.append]
+    ... )
+    >>> {one.board for one in heard if type(one.message).__name__ == "RangeReport"}
+    {10}
+    """
 
     time_ns: int
     board: int
@@ -47,7 +72,35 @@ class Turn:
 
 
 class Listener:
-    """What a recorder tells. Override what you want to know; as they are, the methods do nothing."""
+    """What a recorder tells. Override what you want to know; as they are, the methods do nothing.
+
+    >>> import uwblink, uwbsim
+    >>> ports = uwbsim.VirtualPorts(
+    ...     uwbsim.load(
+    ...         '''
+    ...         run = { duration_s = 10.0 }
+    ...         ranging = { rate_hz = 50 }
+    ...         bodies = [
+    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
+    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
+    ...         ]
+    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
+    ...         '''
+    ...     )
+    ... )
+    >>> class Farthest(uwblink.Listener):
+    ...     range_m = 0.0
+    ...
+    ...     def on_turn(self, turn):
+    ...         if turn.report:
+    ...             self.range_m = max(self.range_m, turn.report.range_m)
+    >>> farthest, plan = Farthest(), uwblink.RangingPlan(rate_hz=20.0)
+    >>> _ = uwblink.record(
+    ...     ports.names.values(), "far.uwb", plan, duration_s=1.0, using=ports, listeners=[farthest]
+    ... )
+    >>> abs(farthest.range_m - 3.0) < 0.5
+    True
+    """
 
     def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
         """Note bytes that came "in" from a port or went "out" to it."""

@@ -37,6 +37,12 @@ class RangingPlan:
 
     `rate_hz` exchanges a second in total, as fast as boards answer without it. `tags` say where boards sit. Raises
     `PlanError` for what cannot be played.
+
+    >>> import uwblink
+    >>> uwblink.RangingPlan().turns([10, 20, 30])
+    ((10, 20), (10, 30), (20, 30))
+    >>> uwblink.RangingPlan(pairs=((20, 10),), rate_hz=50.0).turns([10, 20, 30])
+    ((20, 10),)
     """
 
     pairs: tuple[tuple[int, int], ...] | Literal["all"] = "all"
