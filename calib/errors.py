@@ -1,20 +1,10 @@
-"""Everything `calib` raises, in the two kinds that differ in exit status.
+"""Everything `calib` raises, in the two kinds that differ in exit status."""
 
-Texts are for those who call functions: they name parameters, in backticks. The command line puts its flags in their
-place (`calib.cli.flags`).
-"""
+from uwblink.errors import OfParameter
 
 
-class CalibError(Exception):
-    """Base of the errors of this package; the text says what, where and what to do.
-
-    `parameter` is the name of the parameter that is at fault, where it is one.
-    """
-
-    def __init__(self, text: str, *, parameter: str | None = None) -> None:
-        """Say what, where and what to do; a parameter's name goes before the text."""
-        super().__init__(f"`{parameter}`: {text}" if parameter else text)
-        self.parameter = parameter
+class CalibError(OfParameter):
+    """Base of the errors of this package; the text says what, where and what to do."""
 
 
 class BadInputError(CalibError, ValueError):

@@ -1,7 +1,20 @@
 """Everything `uwblink` raises on bad input, each also the standard type a caller would expect."""
 
 
-class UwblinkError(Exception):
+class OfParameter(Exception):  # noqa: N818 - the base of the bases
+    """Base of the errors of all three packages: `parameter` names the parameter that is at fault, where it is one.
+
+    Texts are for those who call functions: a parameter stands in backticks, its own before the text. The command line
+    puts flags in their place (`uwblink.cli.shared.with_flags`).
+    """
+
+    def __init__(self, text: str, *, parameter: str | None = None) -> None:
+        """Say what, where and what to do; a parameter's name goes before the text."""
+        super().__init__(f"`{parameter}`: {text}" if parameter else text)
+        self.parameter = parameter
+
+
+class UwblinkError(OfParameter):
     """Base of the errors of this package; the text says what, where and what to do."""
 
 

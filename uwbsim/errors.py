@@ -1,7 +1,9 @@
 """Everything `uwbsim` raises on bad input."""
 
+from uwblink.errors import OfParameter
 
-class UwbsimError(Exception):
+
+class UwbsimError(OfParameter):
     """Base of the errors of this package; the text says what, where and what to do."""
 
 
@@ -10,16 +12,7 @@ class ScenarioError(UwbsimError, ValueError):
 
 
 class ParameterError(ScenarioError):
-    """An argument that cannot be; `parameter` names it, and `reason` says what was found and what is allowed."""
-
-    def __init__(self, parameter: str, reason: str) -> None:
-        """Keep both, so that a command line can name its option instead."""
-        super().__init__(parameter, reason)
-        self.parameter, self.reason = parameter, reason
-
-    def __str__(self) -> str:
-        """Return one line."""
-        return f"{self.parameter}: {self.reason}"
+    """An argument that cannot be; `parameter` names it, and the text says what was found and what is allowed."""
 
 
 class UnknownKeyError(ScenarioError):

@@ -6,7 +6,7 @@ import sys
 from typing import NoReturn
 
 from calib.cli import evaluating, files, fitting, reporting
-from calib.cli.flags import with_flags
+from calib.cli.flags import FLAGS
 from calib.errors import CalibError, UnanswerableError
 from uwblink.cli import shared
 
@@ -20,4 +20,4 @@ for room in (fitting, evaluating, reporting, files):
 def main() -> NoReturn:
     """Run the command; a mistake is one line on standard error, status 2, or 1 (see docs)."""
     words = reporting.spread(sys.argv[1:])
-    shared.run(app, CalibError, statuses={UnanswerableError: 1}, arguments=words, wording=with_flags)
+    shared.run(app, CalibError, statuses={UnanswerableError: 1}, arguments=words, flags=FLAGS)

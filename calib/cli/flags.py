@@ -1,9 +1,10 @@
-"""The flags that stand for parameters: errors and remedies speak of parameters, and the command line of flags."""
+"""The flags that stand for parameters of calib, where they are spelt otherwise."""
 
 from __future__ import annotations
 
-import re
 from typing import Final
+
+from uwblink.cli import shared
 
 FLAGS: Final = {
     "fixed_ns": "--fix",
@@ -11,14 +12,8 @@ FLAGS: Final = {
     "scale_ns": "--scale",
     "reference_power_dbm": "--reference-power",
 }
-"""Parameters whose flag is called otherwise; all others are spelt alike, with dashes."""
 
 
 def with_flags(text: str) -> str:
     """Return a text with flags for the parameters in backticks: `minimum_norm` becomes --minimum-norm."""
-    return re.sub(r"`([a-z_]+)`", lambda found: flag(found[1]), text)
-
-
-def flag(parameter: str) -> str:
-    """Return the flag of a parameter."""
-    return FLAGS.get(parameter, f"--{parameter.replace('_', '-')}")
+    return shared.with_flags(text, FLAGS)

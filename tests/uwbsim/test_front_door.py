@@ -63,7 +63,7 @@ def test_mistakes_say_where():
         uwbsim.simulate({"ranging": {"rate_hz": 1.0}})
     with pytest.raises(uwbsim.ScenarioError, match=r"nowhere\.toml: no such scenario file"):
         uwbsim.simulate("nowhere.toml")
-    with pytest.raises(uwbsim.ParameterError, match=r"^overrides: found 'run' *, expected key"):
+    with pytest.raises(uwbsim.ParameterError, match=r"^`overrides`: found 'run' *, expected key"):
         uwbsim.load(NOISELESS, ["run"])
     with pytest.raises(uwbsim.ScenarioError, match=r"^run\.seed\.x: seed is not a table"):
         uwbsim.load(NOISELESS, {"run.seed.x": 1})

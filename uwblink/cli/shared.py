@@ -22,6 +22,9 @@ Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags"}
 """Parameters of uwblink whose flag is called otherwise; all others are spelt alike, with dashes."""
 
+Flags = Mapping[str, str]
+"""What stands for a parameter on a command line, by its name, where it is spelt otherwise."""
+
 _PARAMETER: Final = re.compile(r"`([a-z_]+)`")
 
 MISTAKE: Final = 2
@@ -49,12 +52,12 @@ def run(
     *errors: type[Exception],
     statuses: Mapping[type[Exception], int] | None = None,
     arguments: Sequence[str] | None = None,
-    wording: Callable[[str], str] = str,
+    flags: Flags = FLAGS,
 ) -> NoReturn:
     """Run a command and end the process: an error of `errors`, or of uwblink, is one line and status 2, Ctrl-C 130.
 
-    `statuses` gives kinds of errors another status; `arguments` replaces those of the process; `wording` turns what
-    the packages say, which know parameters only, into what people of the command line know, before `with_flags` does.
+    `statuses` gives kinds of errors another status; `arguments` replaces those of the process; `flags` are
+    those of parameters that are spelt otherwise, as `with_flags` takes them.
     """
     mistakes: tuple[type[Exception], ...] = (UwblinkError, *errors)
     status = 0
@@ -65,7 +68,7 @@ def run(
             if not interrupted():
                 if not isinstance(error, mistakes):
                     raise
-                typer.echo(f"error: {with_flags(wording(str(error)))}", err=True)
+                typer.echo(f"error: {with_flags(str(error), FLAGS | dict(flags))}", err=True)
                 found = (number for kind, number in (statuses or {}).items() if isinstance(error, kind))
                 status = next(found, MISTAKE)
     if interrupted():
@@ -91,9 +94,9 @@ def _noted_interrupts() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def with_flags(text: str) -> str:
+def with_flags(text: str, flags: Flags = FLAGS) -> str:
     """Return a text with flags in place of the parameters in backticks: `force` becomes --force."""
-    return _PARAMETER.sub(lambda found: FLAGS.get(found[1], f"--{found[1].replace('_', '-')}"), text)
+    return _PARAMETER.sub(lambda found: flags.get(found[1], f"--{found[1].replace('_', '-')}"), text)
 
 
 def print_json(document: Any) -> None:

@@ -125,11 +125,11 @@ def chosen(protocols: Protocols | None, parameter: str = "protocols") -> list[Ra
     rows: dict[str, RangingProtocol] = {}
     for one in wanted:
         if not isinstance(one, RangingProtocol) and one not in PROTOCOLS:
-            raise ParameterError(parameter, f"found {one!r}, allowed: {', '.join(PROTOCOLS)}")
+            raise ParameterError(f"found {one!r}, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
         row = one if isinstance(one, RangingProtocol) else PROTOCOLS[one]
         rows.setdefault(row.name, row)
     if not rows:
-        raise ParameterError(parameter, f"found none, allowed: {', '.join(PROTOCOLS)}")
+        raise ParameterError(f"found none, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
     return list(rows.values())
 
 
@@ -164,7 +164,7 @@ def compare(
     """
     scenario, rows = as_scenario(scenario), chosen(protocols)
     if not 1 <= count <= MOST:
-        raise ParameterError("count", f"found {count}, expected 1 to {MOST}")
+        raise ParameterError(f"found {count}, expected 1 to {MOST}", parameter="count")
     conditions = conditions_of(scenario)
     outcomes, samples = [], {}
     for number, protocol in enumerate(rows):

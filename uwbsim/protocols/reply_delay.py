@@ -80,7 +80,7 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
 
     scenario, (protocol,) = as_scenario(scenario), chosen([protocol], "protocol")
     if not (math.isfinite(overhead_s) and overhead_s >= 0):
-        raise ParameterError("overhead_s", f"found {overhead_s}, expected seconds, 0 or more")
+        raise ParameterError(f"found {overhead_s}, expected seconds, 0 or more", parameter="overhead_s")
     world = calibrated(conditions_of(scenario, 2048))
     # The grid of delayed transmissions would show as teeth of 8 ns on the curve.
     world = replace(world, quantize=False)

@@ -57,11 +57,13 @@ def _check(q: State) -> None:
         if field.name in ("protocol", "whole_ticks"):
             continue
         if not isinstance(value, int | float) or not (math.isfinite(value) and abs(value) < LARGEST):
-            raise ParameterError(field.name, f"found {value}, expected a number below {LARGEST:g}")
+            raise ParameterError(f"found {value}, expected a number below {LARGEST:g}", parameter=field.name)
         if field.name in NOT_NEGATIVE and value < 0:
-            raise ParameterError(field.name, f"found {value:g}, expected 0 or more")
+            raise ParameterError(f"found {value:g}, expected 0 or more", parameter=field.name)
     if q.final_delay_us < SHORTEST_US:
-        raise ParameterError("final_delay_us", f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}")
+        raise ParameterError(
+            f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}", parameter="final_delay_us"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

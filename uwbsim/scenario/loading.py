@@ -102,7 +102,9 @@ def _split(text: str) -> tuple[str, Any]:
     """Return key path and value of `key.path=value`."""
     key, equals, value = text.partition("=")
     if not equals:
-        raise ParameterError("overrides", f"found {text!r}, expected key.path=value, as in ranging.rate_hz=50")
+        raise ParameterError(
+            f"found {text!r}, expected key.path=value, as in ranging.rate_hz=50", parameter="overrides"
+        )
     try:
         return key, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
@@ -112,7 +114,9 @@ def _split(text: str) -> tuple[str, Any]:
 def _override(table: dict[str, Any], key: str, value: Any) -> None:
     keys = [k.strip() for k in key.split(".")]
     if not all(keys):
-        raise ParameterError("overrides", f"found key {key!r}, expected key.path=value, as in ranging.rate_hz=50")
+        raise ParameterError(
+            f"found key {key!r}, expected key.path=value, as in ranging.rate_hz=50", parameter="overrides"
+        )
     node: Any = table
     for step in keys[:-1]:
         node = _step(node, step, key)

@@ -125,12 +125,14 @@ class Cluster:
         try:
             self._dask: Any = import_module("distributed")
         except ImportError as error:
-            raise ParameterError("scheduler", "needs the extra 'cluster': pip install 'uwbcal[cluster]'") from error
+            raise ParameterError(
+                "needs the extra 'cluster': pip install 'uwbcal[cluster]'", parameter="scheduler"
+            ) from error
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         try:
             self._client = self._dask.Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
-            raise ParameterError("scheduler", f"{address} does not answer within {CONNECT_S} s") from error
+            raise ParameterError(f"{address} does not answer within {CONNECT_S} s", parameter="scheduler") from error
         self.size = max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
         self._running: dict[Any, Chunk] = {}
 

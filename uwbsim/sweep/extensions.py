@@ -58,9 +58,9 @@ class Extensions:
         for what, function in named.items():
             if not _found_by_name(function):
                 raise ParameterError(
-                    what,
                     f"found {function!r}, which other processes cannot import; "
                     "give a function at the top of a module, or work in this process (workers = 1)",
+                    parameter=what,
                 )
 
 
@@ -76,11 +76,11 @@ def evaluator(kind: str) -> Evaluate:
             found: Evaluate = entry.load()
         except (ImportError, AttributeError) as error:
             raise ParameterError(
-                "evaluate", f"{entry.value}, which {GROUP} names, cannot be imported: {error}"
+                f"{entry.value}, which {GROUP} names, cannot be imported: {error}", parameter="evaluate"
             ) from error
         return found
     raise ParameterError(
-        "evaluate",
         f"a sweep of kind {kind!r} needs a function that evaluates a flight, and no installed distribution offers one "
         f"(entry point {kind!r} of the group {GROUP})",
+        parameter="evaluate",
     )

@@ -84,9 +84,11 @@ def run_sweep(
     if plan.kind == "calibrate":
         evaluate = evaluate or evaluator(plan.kind)
     elif evaluate is not None:
-        raise ParameterError("evaluate", f"goes with a sweep of kind 'calibrate', and this one's is {plan.kind!r}")
+        raise ParameterError(
+            f"goes with a sweep of kind 'calibrate', and this one's is {plan.kind!r}", parameter="evaluate"
+        )
     if workers is not None and workers < 1:
-        raise ParameterError("workers", f"found {workers}, expected 1 or more")
+        raise ParameterError(f"found {workers}, expected 1 or more", parameter="workers")
     team = workers_for(workers, scheduler, Extensions.of_here(evaluate, plan.protocols))
     try:
         folder.mkdir(exist_ok=True)
@@ -108,7 +110,7 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
     path = folder / STORE
     if not Store.begun(path):
         if resume and not path.exists():
-            raise ParameterError("resume", f"{folder} holds no sweep to go on with")
+            raise ParameterError(f"{folder} holds no sweep to go on with", parameter="resume")
         if folder.is_dir() and any(item.name != STORE for item in folder.iterdir()):
             raise ScenarioError(f"{folder}: holds other files; give an empty folder or a new one")
         return
@@ -126,7 +128,9 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
             "give another folder"
         )
     if not resume:
-        raise ParameterError("resume", f"{folder} holds results of this sweep; go on with it, or give another folder")
+        raise ParameterError(
+            f"{folder} holds results of this sweep; go on with it, or give another folder", parameter="resume"
+        )
 
 
 def _work(

@@ -190,7 +190,9 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     >>> del CHANNEL_EFFECTS["rain"]
     """
     if name in CHANNEL_EFFECTS:
-        raise ParameterError("name", f"found {name!r}, which is taken; the effects are {', '.join(CHANNEL_EFFECTS)}")
+        raise ParameterError(
+            f"found {name!r}, which is taken; the effects are {', '.join(CHANNEL_EFFECTS)}", parameter="name"
+        )
     if not callable(effect):
-        raise ParameterError("effect", f"found {effect!r}, expected a function of link and ends")
+        raise ParameterError(f"found {effect!r}, expected a function of link and ends", parameter="effect")
     CHANNEL_EFFECTS[name] = effect

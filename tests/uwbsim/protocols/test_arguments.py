@@ -40,18 +40,18 @@ def test_results_print_themselves():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: compare(SHORT, ["tdoa"]), "protocols: found 'tdoa', allowed: ss, ss-cfo, ds"),
-        (lambda: compare(SHORT, []), "protocols: found none, allowed"),
-        (lambda: compare(SHORT, ["ss"], count=0), "count: found 0, expected 1 to 50000000"),
-        (lambda: optimum(SHORT, "tdoa"), "protocol: found 'tdoa'"),
-        (lambda: optimum(SHORT, "ds", -1e-3), "overhead_s: found -0.001, expected seconds, 0 or more"),
-        (lambda: optimum(SHORT, "ds", float("nan")), "overhead_s: found nan"),
-        (lambda: uwbsim.predict_state(uwbsim.State(protocol="x")), "protocol: found 'x'"),
-        (lambda: uwbsim.predict_state(uwbsim.State(skew_ppm=float("inf"))), "skew_ppm: found inf, expected a number"),
-        (lambda: uwbsim.predict_state(uwbsim.State(distance_m=-1)), "distance_m: found -1, expected 0 or more"),
+        (lambda: compare(SHORT, ["tdoa"]), "`protocols`: found 'tdoa', allowed: ss, ss-cfo, ds"),
+        (lambda: compare(SHORT, []), "`protocols`: found none, allowed"),
+        (lambda: compare(SHORT, ["ss"], count=0), "`count`: found 0, expected 1 to 50000000"),
+        (lambda: optimum(SHORT, "tdoa"), "`protocol`: found 'tdoa'"),
+        (lambda: optimum(SHORT, "ds", -1e-3), "`overhead_s`: found -0.001, expected seconds, 0 or more"),
+        (lambda: optimum(SHORT, "ds", float("nan")), "`overhead_s`: found nan"),
+        (lambda: uwbsim.predict_state(uwbsim.State(protocol="x")), "`protocol`: found 'x'"),
+        (lambda: uwbsim.predict_state(uwbsim.State(skew_ppm=float("inf"))), "`skew_ppm`: found inf, expected a number"),
+        (lambda: uwbsim.predict_state(uwbsim.State(distance_m=-1)), "`distance_m`: found -1, expected 0 or more"),
         (
             lambda: uwbsim.predict_state(uwbsim.State(final_delay_us=0.5)),
-            "final_delay_us: found 0.5, expected",
+            "`final_delay_us`: found 0.5, expected",
         ),
     ],
 )

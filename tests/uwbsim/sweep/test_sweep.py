@@ -280,11 +280,11 @@ def test_registered_protocols_reach_other_processes(tmp_path, stranger):
 
 def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stranger):
     p = plan(tmp_path, CALIBRATE)
-    with pytest.raises(ParameterError, match=r"^evaluate: found <function .*lambda.* cannot import"):
+    with pytest.raises(ParameterError, match=r"^`evaluate`: found <function .*lambda.* cannot import"):
         run_sweep(p, tmp_path / "out", workers=2, evaluate=lambda flight: {})
-    with pytest.raises(ParameterError, match=r"^workers: found 0"):
+    with pytest.raises(ParameterError, match=r"^`workers`: found 0"):
         run_sweep(p, tmp_path / "out", workers=0, evaluate=stranger.figures)
-    with pytest.raises(ParameterError, match=r"^evaluate: goes with a sweep of kind 'calibrate'"):
+    with pytest.raises(ParameterError, match=r"^`evaluate`: goes with a sweep of kind 'calibrate'"):
         run_sweep(plan(tmp_path), tmp_path / "out", evaluate=stranger.figures)
     assert not (tmp_path / "out").exists()
 

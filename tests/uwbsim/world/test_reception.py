@@ -147,7 +147,10 @@ def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
 
 @pytest.mark.parametrize(
     ("name", "effect", "fragment"),
-    [("shadows", lambda link, _: link, "name: found 'shadows', which is taken"), ("x", 3, "effect: found 3, expected")],
+    [
+        ("shadows", lambda link, _: link, "`name`: found 'shadows', which is taken"),
+        ("x", 3, "`effect`: found 3, expected"),
+    ],
 )
 def test_effects_that_cannot_be_are_refused(name, effect, fragment):
     with pytest.raises(uwbsim.ParameterError, match=fragment):
