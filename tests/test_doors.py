@@ -11,6 +11,7 @@ PACKAGES = ("uwblink", "uwbsim", "calib")
 
 # What commands use beside doors, each with its reason.
 BESIDE = {
+    "uwblink.__version__": "what --version prints",
     "uwblink.cli.shared": "options, errors and interrupts that the three commands have in common",
 }
 
@@ -47,7 +48,7 @@ def strangers(package, source):
     return sorted(found)
 
 
-@pytest.mark.parametrize("package", ["uwbsim", "calib"])
+@pytest.mark.parametrize("package", PACKAGES)
 def test_commands_go_through_doors(package):
     files = sorted((ROOT / package / "cli").rglob("*.py"))
     assert files

@@ -9,6 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+__all__: Final = ["as_html", "as_text", "cut", "excerpt", "first_few", "printable"]
+
 SHOWN_ROWS: Final = 6
 WIDTH: Final = 79
 LONGEST_CELL: Final = 20

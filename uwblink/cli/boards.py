@@ -13,7 +13,7 @@ import typer
 from uwblink.cli.shared import INTERRUPTED, AsJson, interrupts, print_json
 
 if TYPE_CHECKING:
-    from uwblink.wire.messages import RangeReport
+    from uwblink.wire import RangeReport
 
 Port = Annotated[str, typer.Argument(help="Serial port, link to one, or pyserial URL.")]
 Target = Annotated[int, typer.Argument(min=0, max=254, help="Id of the other board.")]
@@ -38,8 +38,8 @@ def ports(
     as_json: AsJson = False,
 ) -> None:
     """List the serial devices with the boards' USB identity (0483:5740); nothing is written to any, unless probed."""
-    from uwblink.boards.board import Board
-    from uwblink.boards.ports import boards_ports
+    from uwblink import Board
+    from uwblink.boards import boards_ports
     from uwblink.errors import UwblinkError
 
     found = boards_ports()
@@ -66,9 +66,9 @@ def ports(
 
 def info(port: Port, as_json: AsJson = False) -> None:
     """Print a board's id and longest frame."""
-    from uwblink.boards.board import Board
-    from uwblink.boards.ports import serial_number
-    from uwblink.wire.messages import GetMaxFrame, MaxFrameReport
+    from uwblink import Board
+    from uwblink.boards import serial_number
+    from uwblink.wire import GetMaxFrame, MaxFrameReport
 
     with Board.open(port) as board:
         longest = board.request(GetMaxFrame())
@@ -96,7 +96,7 @@ def twr(
     as_json: AsJson = False,
 ) -> None:
     """Range with another board; a line each as it comes, and a summary at the end, also of what Ctrl-C cut short."""
-    from uwblink.boards.board import Board
+    from uwblink import Board
     from uwblink.errors import RangingFailedError
 
     ranges: list[float] = []
@@ -156,7 +156,7 @@ def _fields(report: RangeReport) -> dict[str, float]:
 
 def test(port: Port) -> None:
     """Have a board echo one field of each kind."""
-    from uwblink.boards.board import Board
+    from uwblink import Board
 
     with Board.open(port) as board:
         board.test()
@@ -168,7 +168,7 @@ def set_delay(
     delay_uus: Annotated[int, typer.Argument(metavar="N", help="280 to 6500, in units of 512/499.2 us.")],
 ) -> None:
     """Set the response delay of double-sided exchanges for which this board is the target (C08)."""
-    from uwblink.boards.board import Board
+    from uwblink import Board
 
     with Board.open(port) as board:
         board.set_response_delay(delay_uus)
@@ -177,7 +177,7 @@ def set_delay(
 
 def passive(port: Port, state: Annotated[str, typer.Argument(metavar="on|off")]) -> None:
     """Have a board listen to the exchanges of others, or stop to."""
-    from uwblink.boards.board import Board
+    from uwblink import Board
     from uwblink.errors import RefusedError
 
     if state not in ("on", "off"):
@@ -189,7 +189,7 @@ def passive(port: Port, state: Annotated[str, typer.Argument(metavar="on|off")])
 
 def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 57 bytes in UTF-8.")]) -> None:
     """Broadcast a text to every board in range."""
-    from uwblink.boards.board import Board
+    from uwblink import Board
 
     data = text.encode()
     with Board.open(port) as board:
@@ -206,7 +206,7 @@ def cir(
     as_json: AsJson = False,
 ) -> None:
     """Range with another board and print the channel impulse response."""
-    from uwblink.boards.board import Board
+    from uwblink import Board
     from uwblink.errors import RecordingError
     from uwblink.output import check_output
 
@@ -218,7 +218,7 @@ def cir(
         report, response = board.cir(target, protocol=protocol)
         initiator = board.id
     if plot:
-        from uwblink.boards.figures import plot_cir
+        from uwblink.boards import plot_cir
 
         plot_cir(response, plot)
     index = response.first_path_milli / 1000

@@ -39,7 +39,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Print what a recording holds."""
-    from uwblink.recording.file import Recording
+    from uwblink import Recording
 
     with Recording.open(recording) as opened:
         summary = opened.show()
@@ -82,7 +82,7 @@ def poses(
     ] = None,
 ) -> None:
     """Add motion-capture truth to a recording of boards."""
-    from uwblink.importers.motion_capture import add_poses
+    from uwblink.importers import add_poses
 
     files = _files(source)
     topics = _pairs("topic", topic) if topic else None
@@ -124,9 +124,9 @@ def replay(
     force: Force = False,
 ) -> None:
     """Decode the stored bytes again, or play them back as boards would have sent them."""
-    from uwblink.boards.replay import decode_again, play, rewrite, summarize
+    from uwblink import Recording
+    from uwblink.boards import decode_again, play, rewrite, summarize
     from uwblink.output import check_output
-    from uwblink.recording.file import Recording
 
     if output:
         check_output(output, force=force)

@@ -13,8 +13,7 @@ import typer
 from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
-    from uwblink.boards.live_page import LivePage
-    from uwblink.boards.progress import Progress
+    from uwblink.boards import LivePage, Progress
 
 LINE_EVERY_S = 2.0
 
@@ -41,8 +40,9 @@ def record(
     """Play a ranging plan on boards and record everything they say."""
     from dataclasses import replace
 
-    from uwblink.boards.ranging_plan import RangingPlan, load_plan
-    from uwblink.boards.recorder import record as run
+    from uwblink import RangingPlan
+    from uwblink import record as run
+    from uwblink.boards import load_plan
     from uwblink.errors import PlanError
     from uwblink.output import check_output
 
@@ -85,8 +85,7 @@ def _page(output: Path, calibration: Path | None, port: int, live: bool) -> Iter
     if not live:
         yield None
         return
-    from uwblink.boards.corrections import load_correction
-    from uwblink.boards.live_page import LivePage
+    from uwblink.boards import LivePage, load_correction
 
     correct = load_correction(calibration) if calibration else None
     with LivePage(output, correct=correct, port=port) as page:

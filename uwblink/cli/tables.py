@@ -8,12 +8,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from uwblink.display import printable
-from uwblink.recording.summary import Summary, counted
+from uwblink.recording import Summary, counted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from uwblink.boards.progress import Progress
+    from uwblink.boards import Progress
 
 
 def print_summary(summary: Summary, console: Console) -> None:

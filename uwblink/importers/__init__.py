@@ -15,9 +15,19 @@ from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.exchange_tables import SUFFIXES, read_table
 from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
+from uwblink.importers.motion_capture import add_poses
 from uwblink.output import check_output
 from uwblink.plugins import NAME, Registry
 from uwblink.recording.contents import Contents
+
+__all__ = [
+    "IMPORTERS",
+    "Importer",
+    "add_poses",
+    "import_recording",
+    "read_source",
+    "register_importer",
+]
 
 
 @dataclass(frozen=True, slots=True)
