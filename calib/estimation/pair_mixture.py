@@ -17,6 +17,7 @@ import numpy as np
 
 from calib.estimation.reflections import Shape, expected
 from calib.estimation.scores import Scores, Sort, inverse_of
+from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
 CELLS: Final = 8
@@ -216,7 +217,7 @@ def _parts(values: Floats, place: Ints, count: int) -> list[Floats]:
 def _spread(values: Floats, otherwise: float = 1e-3) -> float:
     if len(values) < 5:
         return otherwise
-    return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-3)
+    return max(robust_spread(values), 1e-3)
 
 
 def _set(matrix: Floats, where: slice, value: float) -> None:
