@@ -11,6 +11,8 @@ PACKAGES = ("uwblink", "uwbsim", "calib")
 
 # What commands use beside doors, each with its reason.
 BESIDE = {
+    "uwblink.exporters.export_recording": "the front door offers no export yet",
+    "uwblink.importers.guess.guess_map": "what import suggests where no map is given; read_source takes the map",
     "uwblink.__version__": "what --version prints",
     "uwblink.cli.shared": "options, errors and interrupts that the three commands have in common",
 }

@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from calib.calibration.formats import read_miluv
+    from calib.calibration.formats import programmed, read_miluv
 
 __all__ = [
+    "programmed",
     "read_miluv",
 ]
 
 _HOMES: Final = {
+    "programmed": "calib.calibration.formats",
     "read_miluv": "calib.calibration.formats",
 }
 

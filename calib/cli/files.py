@@ -48,7 +48,7 @@ def export(
 ) -> None:
     """Write a calibration as register values, CSV, MILUV's JSON, YAML for ROS or a C header."""
     import calib
-    from calib.calibration.formats import programmed
+    from calib.calibration import programmed
 
     registers = programmed(base) if base else None
     text = calib.export(calib.load_calibration(calibration), to, output, base=registers, force=force)

@@ -34,7 +34,7 @@ class Bad:
     expected: str
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Rows:
     """Rows of all files, columns by the names of `column_map` (n,): NaN or `NEVER` where a cell holds none.
 
