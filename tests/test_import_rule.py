@@ -23,6 +23,7 @@ CONFINED = {
     "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
     "pydantic": lambda path: path.startswith("uwbsim/"),
+    "threadpoolctl": lambda path: path == "calib/estimation/fitting.py",
     "rosbags": lambda path: path == "uwblink/importers/pose_bags.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }

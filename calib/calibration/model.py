@@ -6,7 +6,7 @@ import json
 import math
 import os
 import re
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final, Literal, Self, overload
 
@@ -20,6 +20,8 @@ from calib.calibration.runtime import CorrectedColumns, CorrectedRange, RangeCor
 from calib.errors import BadInputError
 from calib.ranges import HALVES, Ranges
 from uwblink.arrays import Bools, Floats
+from uwblink.display import as_text as table_text
+from uwblink.display import excerpt
 from uwblink.output import write_text
 
 SCHEMA_VERSION: Final = 1
@@ -53,6 +55,11 @@ class CorrectedRanges:
     sigma_m: Floats
     lifted: Floats
     clamped: Bools
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        columns = {column.name: getattr(self, column.name) for column in fields(self)}
+        return table_text(f"{len(self.raw_m)} corrected ranges", excerpt(columns))
 
 
 @dataclass(frozen=True, slots=True)

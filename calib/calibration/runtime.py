@@ -17,6 +17,7 @@ from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from calib.ranges import FAINTEST_DBM, LOUDEST_DBM
 from uwblink.arrays import Bools, Floats
+from uwblink.display import as_text, excerpt
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration
@@ -41,6 +42,10 @@ class CorrectedColumns(NamedTuple):
     range_m: Floats
     sigma_m: Floats
     clamped: Bools
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        return as_text(f"{len(self.range_m)} corrected ranges", excerpt(self._asdict()))
 
 
 class PiecewiseCurve:

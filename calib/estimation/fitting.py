@@ -11,9 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import uwblink
 from calib.calibration.json_format import Matrix
@@ -91,46 +93,50 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
     ranges = load_ranges(data)
     refuse_impossible(ranges)
-    problem = build_problem(
-        ranges,
-        lift=lift,
-        alpha_dbm=alpha_dbm,
-        fixed=fixed,
-        groups=groups,
-        minimum_norm=minimum_norm,
-        sequential=sequential,
-    )
-    reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
-    found = solve(
-        problem,
-        loss,
-        None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT,
-        sequential=sequential,
-        reference=None if reference is None else _lifted(reference, alpha_dbm),
-    )
-    doubted = doubts(problem, found)
-    calibration = _calibration(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
-    applied = calibration.apply(ranges)
-    residuals = applied.corrected_m - ranges.truth_m
-    inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
-    warnings = [
-        *_stopped(found),
-        *doubted.sentences,
-        *one_way(ranges),
-        *implausible(calibration.delays_ns, residuals),
-        *_beyond(reference, alpha_dbm, problem),
-        *warnings_of(ranges, applied, float(np.mean(inliers)), problem.free),
-    ]
-    provenance = _provenance(ranges, inliers, fixed, sequential, problem, found, warnings, reference)
-    return FitResult(
-        calibration=replace(calibration, provenance=provenance),
-        ranges=ranges,
-        residuals_m=residuals,
-        inliers=inliers,
-        success=found.success,
-        message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
-        warnings=warnings,
-    )
+    # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
+    # SciPy brings a linear algebra of its own, which is held to one thread only if it is there by now.
+    import_module("scipy.linalg")
+    with threadpool_limits(limits=1, user_api="blas"):
+        problem = build_problem(
+            ranges,
+            lift=lift,
+            alpha_dbm=alpha_dbm,
+            fixed=fixed,
+            groups=groups,
+            minimum_norm=minimum_norm,
+            sequential=sequential,
+        )
+        reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
+        found = solve(
+            problem,
+            loss,
+            None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT,
+            sequential=sequential,
+            reference=None if reference is None else _lifted(reference, alpha_dbm),
+        )
+        doubted = doubts(problem, found)
+        calibration = _calibration(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
+        applied = calibration.apply(ranges)
+        residuals = applied.corrected_m - ranges.truth_m
+        inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
+        warnings = [
+            *_stopped(found),
+            *doubted.sentences,
+            *one_way(ranges),
+            *implausible(calibration.delays_ns, residuals),
+            *_beyond(reference, alpha_dbm, problem),
+            *warnings_of(ranges, applied, float(np.mean(inliers)), problem.free),
+        ]
+        provenance = _provenance(ranges, inliers, fixed, sequential, problem, found, warnings, reference)
+        return FitResult(
+            calibration=replace(calibration, provenance=provenance),
+            ranges=ranges,
+            residuals_m=residuals,
+            inliers=inliers,
+            success=found.success,
+            message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
+            warnings=warnings,
+        )
 
 
 def _reference(power_dbm: float | None, alpha_dbm: float, *, sequential: bool) -> float | None:

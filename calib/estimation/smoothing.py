@@ -44,7 +44,8 @@ def reml_penalty(near: QuadraticModel, x: Floats, penalties: list[Floats]) -> tu
         for k, (penalty, rank) in enumerate(zip(penalties, ranks, strict=True)):
             used = max(rank - weights[k] * float(np.sum(inverse * penalty)), 1e-6)
             bend = max(float(best @ penalty @ best), 1e-300)
-            weights[k] = near.dispersion * min(max(used / bend, RANGE[0]), RANGE[1])
+            # Ranges without any error have no dispersion; a weight stays positive, so that its change can be told.
+            weights[k] = max(near.dispersion * min(max(used / bend, RANGE[0]), RANGE[1]), 1e-300)
         if all(abs(np.log(w / b)) < SETTLED for w, b in zip(weights, before, strict=True)):
             break
     ridge = _sum(weights, penalties) + np.diag(hold)

@@ -66,7 +66,8 @@ def solve(
     near = quadratic_model(problem.design, residual, robust, width)
     ridge, start = reml_penalty(near, start, problem.penalties())
     mixture = None
-    if loss == MIXTURE:
+    # Ranges without any error have no distribution to be likely under; the robust loss is exact there.
+    if loss == MIXTURE and near.dispersion > 0:
         mixture = fit_pair_mixture(_errors(problem), start, ridge / near.dispersion)
         parameters, success, steps = mixture.of("design"), mixture.success, steps + mixture.steps
         scores, inverse, prior = mixture.scores, mixture.covariance, mixture.precision

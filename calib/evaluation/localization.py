@@ -57,6 +57,10 @@ class Track:
     nees: Floats
     accepted: Bools
 
+    def __repr__(self) -> str:
+        """Return its length and how far off it is, on one line."""
+        return f"track of {len(self.time_ns)} ranges, rms error {self.rmse_m:.3f} m"
+
     @property
     def rmse_m(self) -> float:
         """Root of the mean squared distance between estimate and truth."""
@@ -70,6 +74,11 @@ class Localization:
     source: str
     body: str
     tracks: dict[str, Track]
+
+    def __repr__(self) -> str:
+        """Return how far off each track is, on one line."""
+        found = ", ".join(f"{name} {track.rmse_m:.3f} m" for name, track in self.tracks.items())
+        return f"{self.body} of {self.source}: rms error {found}"
 
 
 def localize(data: Data | Flight, calibration: Calibration, settings: Settings | None = None) -> list[Localization]:

@@ -52,7 +52,17 @@ def register_report_section(name: str, section: Section, *, before: str = PROVEN
 
 def document(campaign: Campaign) -> Document:
     """Return the report of a campaign."""
-    return Document(TITLE, [block for section in SECTIONS.values() for block in section(campaign)])
+    return Document(TITLE, [block for name, section in SECTIONS.items() for block in _checked(name, section(campaign))])
+
+
+def _checked(name: str, blocks: object) -> list[Block]:
+    """Return the blocks of a section; raises `BadInputError` where a function returned something else."""
+    if not isinstance(blocks, list) or not all(isinstance(block, Block) for block in blocks):
+        raise BadInputError(
+            f"report section {name!r}: returned {blocks!r:.60}, expected a list of blocks "
+            "(Heading, Text, Table, Picture or Listing)"
+        )
+    return blocks
 
 
 def warnings(sentences: list[str]) -> list[Block]:

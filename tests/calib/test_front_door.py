@@ -42,3 +42,14 @@ def test_the_examples_run(name):
     assert runner.summarize(verbose=False).failed == 0
     # An example that adds something takes it out again: other tests must not find it.
     assert (set(LOSSES), dict(SECTIONS)) == (losses, sections)
+
+
+def test_what_is_handed_out_prints_on_a_screen():
+    flight = calib.sample_flight()
+    known = calib.fit(flight).calibration
+    ranges = calib.load_ranges(flight)
+    columns = known.correct(ranges.raw_m, ranges.fpp1_dbm, ranges.fpp2_dbm, ranges.initiator, ranges.target)
+    for thing in (ranges, known.apply(ranges), columns, known, *calib.localize(flight, known)):
+        text = repr(thing)
+        assert len(text) < 2000, type(thing)
+        assert max(map(len, text.splitlines())) <= 120, type(thing)

@@ -283,6 +283,13 @@ class Cir(Message):
     first_path_milli: int
     magnitudes: tuple[int, ...]
 
+    def __repr__(self) -> str:
+        """Return it without its taps."""
+        place, most = self.first_path_milli / 1000, max(self.magnitudes, default=0)
+        return (
+            f"Cir({self.initiator} -> {self.target}, first path at {place}, {len(self.magnitudes)} taps up to {most})"
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class TextLine:

@@ -14,7 +14,7 @@ import numpy as np
 
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.errors import ParameterError
+from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Shadow, TwoStateMultipath
 from uwbsim.world.propagation import SURFACES, Link, ellipsoid_chord_m, first_path, reflections, through, with_path
@@ -95,9 +95,24 @@ def link_between(ends: Ends) -> Link:
     """Return the links of tags at known places, (n,), with every effect of `CHANNEL_EFFECTS` in its order."""
     power = path_gain_db(ends.scenario.radio, ends.distance_m) + ends.gain_db
     link = Link(ends.distance_m, np.zeros_like(ends.distance_m), power, power)
-    for effect in CHANNEL_EFFECTS.values():
+    for name, effect in CHANNEL_EFFECTS.items():
         link = effect(link, ends)
+        if name not in OWN_EFFECTS:
+            _check(name, link, ends)
     return link
+
+
+def _check(name: str, link: Link, ends: Ends) -> None:
+    """Raise `ScenarioError` where a stranger's effect returned something else than n finite links."""
+    if not isinstance(link, Link):
+        raise ScenarioError(f"channel effect {name!r}: returned {link!r:.60}, expected a Link")
+    for column in ("distance_m", "excess_m", "power_dbm", "total_dbm"):
+        values = np.asarray(getattr(link, column))
+        if values.shape != ends.distance_m.shape or not np.all(np.isfinite(values)):
+            raise ScenarioError(
+                f"channel effect {name!r}: {column}: returned {values!r:.60}, expected {len(ends.distance_m)} finite "
+                "numbers"
+            )
 
 
 def _obstacles(link: Link, ends: Ends) -> Link:
@@ -189,6 +204,8 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     ['obstacles', 'shadows', 'reflections', 'lasting reflections', 'rain']
     >>> del CHANNEL_EFFECTS["rain"]
     """
+    if not isinstance(name, str) or not name:
+        raise ParameterError(f"found {name!r:.40}, expected a word", parameter="name")
     if name in CHANNEL_EFFECTS:
         raise ParameterError(
             f"found {name!r}, which is taken; the effects are {', '.join(CHANNEL_EFFECTS)}", parameter="name"

@@ -1,5 +1,7 @@
 """Delays and curves together: planted truth, the gauge, and what cannot be answered."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -141,3 +143,22 @@ def test_pinning_all_tags_or_unknown_ones_is_refused():
         fit(r, fixed_ns={99: 0.0})
     with pytest.raises(BadInputError, match="every tag"):
         fit(r, fixed_ns=DELAYS_NS)
+
+
+@pytest.mark.parametrize("loss", ["mixture", "cauchy", "l2"])
+def test_ranges_without_any_error_have_no_delays_and_no_curve(loss):
+    r = ranges(600)
+    found = fit(replace(r, raw_m=r.truth_m), loss=loss).calibration
+    assert max(abs(d) for d in found.delays_ns.values()) < 1e-6
+    low, high = found.bias_curve.range
+    np.testing.assert_allclose(found.bias_curve(np.linspace(low, high, 20)), 0, atol=1e-6)
+
+
+def test_a_fit_is_the_same_to_the_last_digit_whatever_was_imported_before():
+    # Sums of several threads end in other digits than those of one.
+    script = "import calib; print(calib.fit(calib.sample_flight(seed=1), loss='huber').calibration.to_json())"
+    found = {
+        subprocess.run([sys.executable, "-c", before + script], capture_output=True, text=True, check=True).stdout
+        for before in ("", "import scipy.linalg; ", "import os; os.environ['OPENBLAS_NUM_THREADS'] = '1'; ")
+    }
+    assert len(found) == 1

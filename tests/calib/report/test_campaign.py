@@ -98,3 +98,17 @@ def test_a_section_that_cannot_be_one_is_refused(name, section, before, paramete
         calib.register_report_section(name, section, before=before)
     assert caught.value.parameter == parameter
     assert "weather" not in SECTIONS
+
+
+@pytest.mark.parametrize("blocks", [None, ["text"], "text"])
+def test_a_section_that_returns_no_blocks_is_named(recordings, tmp_path, blocks):
+    before = dict(SECTIONS)
+    calib.register_report_section("weather", lambda campaign: blocks)
+    try:
+        campaign = calib.run_campaign(calib.load_ranges(recordings / "train.uwb"), loss="l2")
+        with pytest.raises(calib.BadInputError, match="report section 'weather'"):
+            campaign.write(tmp_path / "r.html")
+    finally:
+        SECTIONS.clear()
+        SECTIONS.update(before)
+    assert list(tmp_path.iterdir()) == []

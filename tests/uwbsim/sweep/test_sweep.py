@@ -298,7 +298,7 @@ def test_without_a_function_and_without_a_distribution_that_offers_one(tmp_path,
 
 def test_folders_and_files_that_do_not_fit_are_refused(alone, tmp_path):
     p, out = alone
-    with pytest.raises(ScenarioError, match=r"^resume: .* holds results of this sweep"):
+    with pytest.raises(ScenarioError, match=r"^`resume`: .* holds results of this sweep"):
         run_sweep(p, out, workers=1)
     with pytest.raises(ScenarioError, match=r"another sweep, plan\.toml"):
         run_sweep(plan(tmp_path, name="other.toml"), out, workers=1, resume=True)

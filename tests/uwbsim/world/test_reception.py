@@ -150,9 +150,28 @@ def test_a_body_in_the_way_weakens_served_boards_by_its_chord():
     [
         ("shadows", lambda link, _: link, "`name`: found 'shadows', which is taken"),
         ("x", 3, "`effect`: found 3, expected"),
+        ("", lambda link, _: link, "`name`: found '', expected a word"),
     ],
 )
 def test_effects_that_cannot_be_are_refused(name, effect, fragment):
     with pytest.raises(uwbsim.ParameterError, match=fragment):
         uwbsim.register_channel_effect(name, effect)
     assert "x" not in CHANNEL_EFFECTS
+
+
+@pytest.mark.parametrize(
+    ("effect", "fragment"),
+    [
+        (lambda link, _: None, "returned None, expected a Link"),
+        (lambda link, _: replace(link, power_dbm=-80.0), "power_dbm"),
+        (lambda link, _: replace(link, total_dbm=link.total_dbm * np.nan), "total_dbm"),
+        (lambda link, _: replace(link, excess_m=link.excess_m[:0]), "excess_m"),
+    ],
+)
+def test_an_effect_that_returns_no_links_is_named(effect, fragment):
+    uwbsim.register_channel_effect("strange", effect)
+    try:
+        with pytest.raises(uwbsim.UwbsimError, match=f"channel effect 'strange'.*{fragment}"):
+            uwbsim.simulate(scenario())
+    finally:
+        del CHANNEL_EFFECTS["strange"]
