@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import BadInputError, UnanswerableError
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import TICK_S
@@ -114,6 +115,10 @@ class Ranges:
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
         2
         """
+        if protocol not in PROTOCOLS:
+            raise BadInputError(f"found {protocol!r:.40}, allowed: {', '.join(PROTOCOLS)}", parameter="protocol")
+        if len(weights) != 2:
+            raise BadInputError(f"found {len(weights)}, expected those of initiator and target", parameter="weights")
         columns = {
             "raw_m": range_m,
             "truth_m": truth_m,
@@ -132,6 +137,9 @@ class Ranges:
         if rows[0].ndim != 1:
             raise BadInputError(f"has shape {np.shape(range_m)}, expected one dimension", parameter="range_m")
         filled = dict(zip([*columns, *ids], rows, strict=True))
+        if np.any(filled["initiator"] == filled["target"]):
+            row = int(np.argmax(filled["initiator"] == filled["target"]))
+            raise BadInputError(f"row {row} is of tag {filled['target'][row]} with itself", parameter="target")
         filled |= {name: measured_powers(filled[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
         kind = np.full(len(rows[0]), protocol)
         return cls(source=source, protocol=kind, excluded={}, planted=None, **filled)

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, require_calibration
 from calib.errors import UnanswerableError
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -86,6 +86,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     >>> calib.compare(first, second).same
     True
     """
+    require_calibration(first, "first")
+    require_calibration(second, "second")
     from scipy.stats import chi2
 
     known = [{t for t in c.delays_ns if np.isfinite(c.delays_std_ns.get(t, 0.0))} for c in (first, second)]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, require_calibration
 from calib.errors import BadInputError
 from calib.ranges import Ranges
 from uwblink.output import check_output
@@ -41,6 +41,7 @@ def apply(
     ...     calib.apply(f"{folder}/flight.uwb", known, f"{folder}/corrected.uwb").count
     900
     """
+    require_calibration(calibration)
     check_output(Path(output), force=force)
     with Recording.open(source) as recording:
         if "calibration" in recording.meta():

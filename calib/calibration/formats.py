@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from calib.calibration.c_header import c_header
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.errors import BadInputError
 from uwblink.output import write_text
@@ -174,6 +174,7 @@ def export(
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[0])
     tag,tx_antenna_delay,rx_antenna_delay
     """
+    require_calibration(calibration)
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     text = FORMATS[to](calibration, base)

@@ -320,6 +320,15 @@ class Calibration:
         )
 
 
+def require_calibration(value: object, parameter: str = "calibration") -> None:
+    """Raise `BadInputError` where an argument is no `Calibration`."""
+    if not isinstance(value, Calibration):
+        raise BadInputError(
+            f"found {value!r:.60}, expected a Calibration; `load_calibration` reads one from a file",
+            parameter=parameter,
+        )
+
+
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Return the calibration in a JSON file; raises `BadInputError` that names the file, and the key that is wrong.
 

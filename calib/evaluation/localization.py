@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, require_calibration
 from calib.errors import UnanswerableError
 from calib.sources import Data, Flight, load_flight
 from uwblink.arrays import Bools, Floats, Ints
@@ -95,6 +95,7 @@ def localize(data: Data | Flight, calibration: Calibration, settings: Settings |
     >>> found[0].tracks["calibrated"].rmse_m < 0.1
     True
     """
+    require_calibration(calibration)
     chosen = settings or Settings()
     flight = data if isinstance(data, Flight) else load_flight(data)
     ranges = flight.ranges

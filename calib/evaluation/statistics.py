@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.calibration.model import Calibration, CorrectedRanges
+from calib.calibration.model import Calibration, CorrectedRanges, require_calibration
 from calib.evaluation.display import as_html, as_text
 from calib.ranges import Ranges
 from calib.sources import Data, load_ranges
@@ -127,6 +127,7 @@ def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluatio
     >>> f"{100 * found.raw.std_m:.1f} cm raw, {100 * found.full.std_m:.1f} cm corrected"
     '4.0 cm raw, 3.0 cm corrected'
     """
+    require_calibration(calibration)
     ranges = load_ranges(data)
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, require_calibration
 from calib.evaluation.statistics import evaluate
 from calib.ranges import Ranges, concatenate
 from calib.report import sections
@@ -38,6 +38,7 @@ def write_report(
     ...     "Before and after" in page.read_text()
     True
     """
+    require_calibration(calibration)
     check_output(Path(path), force=force)
     write_text(Path(path), render(data, calibration), force=force)
 

@@ -53,3 +53,33 @@ def test_what_is_handed_out_prints_on_a_screen():
         text = repr(thing)
         assert len(text) < 2000, type(thing)
         assert max(map(len, text.splitlines())) <= 120, type(thing)
+
+
+@pytest.mark.parametrize("wrong", [None, "calibration.json", {}])
+def test_what_is_no_calibration_is_refused_by_its_parameter(wrong, tmp_path):
+    flight = calib.sample_flight()
+    known = calib.fit(flight).calibration
+    calls = {
+        "evaluate": lambda: calib.evaluate(flight, wrong),
+        "localize": lambda: calib.localize(flight, wrong),
+        "export": lambda: calib.export(wrong, "csv"),
+        "compare": lambda: calib.compare(known, wrong),
+        "apply": lambda: calib.apply(tmp_path / "f.uwb", wrong, tmp_path / "g.uwb"),
+        "write_report": lambda: calib.write_report(tmp_path / "r.html", flight, wrong),
+    }
+    for name, call in calls.items():
+        with pytest.raises(calib.BadInputError, match="expected a Calibration") as caught:
+            call()
+        assert caught.value.parameter in ("calibration", "second"), name
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("parameter", "change"),
+    [("protocol", {"protocol": "zz"}), ("target", {"target": [2, 1]}), ("weights", {"weights": (0.5,)})],
+)
+def test_arrays_that_cannot_be_ranges_are_refused(parameter, change):
+    columns = {"initiator": 1, "target": [2, 3], "fpp1_dbm": -85.0} | change
+    with pytest.raises(calib.BadInputError) as caught:
+        calib.Ranges.from_arrays([3.1, 4.2], **columns)
+    assert caught.value.parameter == parameter

@@ -20,6 +20,8 @@ from uwblink.boards.ports import Transport
 from uwblink.errors import PortLostError, PortMissingError
 from uwbsim.boards.board_air import NS_PER_S
 from uwbsim.boards.virtual_board import Bench
+from uwbsim.errors import ParameterError
+from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 
 
@@ -46,8 +48,15 @@ class VirtualPorts:
     (20, True)
     """
 
-    def __init__(self, scenario: Scenario, lost_share: float = 0.0, *, epoch_ns: int = 0) -> None:
-        """Power all boards at virtual time zero, which is `epoch_ns` in the host times of a recording."""
+    def __init__(self, scenario: Scenario | Source, lost_share: float = 0.0, *, epoch_ns: int = 0) -> None:
+        """Power all boards at virtual time zero, which is `epoch_ns` in the host times of a recording.
+
+        `scenario` is what `uwbsim.load` takes or gives; of all frames `lost_share` (0 to 1) are lost besides the weak
+        ones. Raises `ScenarioError` and `ParameterError`.
+        """
+        if not 0 <= lost_share <= 1:
+            raise ParameterError(f"found {lost_share}, expected a share from 0 to 1", parameter="lost_share")
+        scenario = as_scenario(scenario)
         self.bench = Bench(scenario, self._arrived, lost_share)
         self._epoch_ns = epoch_ns
         self._ports: dict[int, VirtualPort] = {}
