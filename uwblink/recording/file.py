@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.display import printable
 from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError
 from uwblink.output import check_output
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.recording.intake import decode_json
 from uwblink.recording.schema import (
     FORMAT_VERSION,
     SUFFIX,
@@ -35,7 +37,7 @@ from uwblink.recording.schema import (
 from uwblink.recording.snapshots import open_snapshot
 from uwblink.recording.store import Store
 from uwblink.ticks import REPORT_BITS
-from uwblink.twr import COLUMNS, Exchanges
+from uwblink.twr import BITS, COLUMNS, Exchanges
 
 if TYPE_CHECKING:
     from uwblink.recording.summary import Summary
@@ -262,16 +264,15 @@ class Recording:
 
     def meta(self) -> dict[str, Any]:
         """Return all entries of `meta`, decoded."""
-        rows = self._store.read("SELECT key, value FROM meta ORDER BY key")
-        try:
-            return {key: json.loads(value) for key, value in zip(rows["key"], rows["value"], strict=True)}
-        except ValueError as error:
-            raise RecordingError(f"{self.path}: table meta holds a value that is not JSON") from error
+        rows = self._store.rows("SELECT key, value FROM meta ORDER BY key")
+        return {str(key): decode_json(value, self.path, str(key)) for key, value in rows}
 
     def tags(self) -> list[Tag]:
         """Return the tags in order of id."""
-        r = self._store.read("SELECT * FROM tags ORDER BY tag")
-        rows = zip(r["tag"], r["body"], r["x"], r["y"], r["z"], strict=True)
+        rows = self._store.rows("SELECT tag, body, x, y, z FROM tags ORDER BY tag")
+        for row in rows:
+            if None in row:
+                raise RecordingError(f"{self.path}: table tags: a tag with nothing in one of its columns, {row}")
         return [Tag(int(t), str(b), (float(x), float(y), float(z))) for t, b, x, y, z in rows]
 
     def count(self, table: str) -> int:
@@ -297,8 +298,14 @@ class Recording:
             raise RecordingError(f"{self.path}: exchanges of an unknown protocol; known are {', '.join(names)}")
         columns = {name: _filled(rows[name]) for name in rows}
         protocol = np.array(names)[np.asarray(code, dtype=np.int64) - 1]
+        return Exchanges(protocol=protocol, bits=self._bits(), **columns)
+
+    def _bits(self) -> int:
         bits = self.meta().get("timestamp_bits", REPORT_BITS)
-        return Exchanges(protocol=protocol, bits=int(bits), **columns)
+        if isinstance(bits, bool) or bits not in BITS:
+            listed = " or ".join(map(str, BITS))
+            raise RecordingError(f"{self.path}: meta timestamp_bits is {printable(bits):.40}, expected {listed}")
+        return int(bits)
 
     def columns(self, table: str) -> dict[str, NDArray[Any]]:
         """Return one of `TABLES` as columns in the order of its rows, masked where a value is missing.

@@ -1,6 +1,7 @@
 """Tables of a recording in a DuckDB file: columns in, columns out, and every error with the file's name.
 
-Files from strangers are data: they are opened read-only and with every access to other files switched off.
+Files from strangers are data: they are opened read-only, with every access to other files switched off and the settings
+locked, and are looked over (`uwblink.recording.intake`) before anything in them is read.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.errors import RecordingError, RecordingInUseError
+from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 
 if TYPE_CHECKING:
@@ -27,13 +29,24 @@ ROWS_AT_A_TIME: Final = 100_000
 """Rows that a copy holds in memory at once; of impulse responses, which are the largest, 0.2 GB."""
 
 
+_LOCKED: Final = (
+    "autoinstall_known_extensions = false",
+    "autoload_known_extensions = false",
+    "allow_community_extensions = false",
+    "enable_external_access = false",
+    "lock_configuration = true",
+)
+"""Settings of every connection, in this order: the last one makes them last."""
+
+
 class Store:
     """An open file with the tables of `TABLES`; `path` is what messages call it."""
 
-    def __init__(self, connection: duckdb.DuckDBPyConnection, path: Path) -> None:
-        """Wrap an open connection."""
+    def __init__(self, connection: duckdb.DuckDBPyConnection, path: Path, size: int = 0) -> None:
+        """Wrap an open connection to a file of `size` bytes, which bounds how long reading may take."""
         self._db, self._second = connection, connection.cursor()
         self.path = path
+        self._longest_read_s = longest_read_s(size)
 
     @classmethod
     def create(cls, place: Path, path: Path) -> Self:
@@ -42,6 +55,10 @@ class Store:
 
         try:
             store = cls(duckdb.connect(str(place)), path)
+            # Snapshots are written beside the recording, and nothing ever elsewhere.
+            store.execute("SET allowed_directories = ?", [[str(place.absolute().parent)]])
+            for setting in _LOCKED:
+                store.execute(f"SET {setting}")
         except duckdb.Error as error:
             raise RecordingError(f"{path}: cannot be written ({_first_line(error)})") from error
         store._create_missing()
@@ -53,9 +70,10 @@ class Store:
         import duckdb
 
         _check_length(path)
-        config: dict[str, Any] = {"enable_external_access": "false", "lock_configuration": "true"}
+        config: dict[str, Any] = dict(setting.split(" = ") for setting in _LOCKED)
+        size = path.stat().st_size
         try:
-            store = cls(duckdb.connect(str(path), read_only=not update, config=config), path)
+            store = cls(duckdb.connect(str(path), read_only=not update, config=config), path, size)
         except duckdb.ConnectionException as error:
             raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error
         except duckdb.IOException as error:
@@ -66,6 +84,7 @@ class Store:
         except duckdb.Error as error:
             raise _damaged(path, error) from error
         try:
+            check_intake(store.rows, path, size)
             store.check_columns()
             if update:
                 store._create_missing()
@@ -146,12 +165,24 @@ class Store:
 
     def read(self, query: str) -> dict[str, NDArray[Any]]:
         """Return what a query finds, as columns; masked where it is missing. Raises `RecordingError`."""
+        with self._reading():
+            return dict(self._db.execute(query).fetchnumpy())
+
+    def rows(self, query: str) -> list[tuple[Any, ...]]:
+        """Return what a query finds, as rows; raises `RecordingError`."""
+        with self._reading():
+            return self._db.execute(query).fetchall()
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
         import duckdb
 
-        try:
-            return dict(self._db.execute(query).fetchnumpy())
-        except duckdb.Error as error:
-            raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({_first_line(error)})") from error
+        with interrupted_after(self._longest_read_s, self._db.interrupt) as late:
+            try:
+                yield
+            except duckdb.Error as error:
+                why = f"took longer than {self._longest_read_s:.0f} s" if late.is_set() else _first_line(error)
+                raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({why})") from error
 
     def take(self, source: Store, table: str) -> None:
         """Add all rows of another file's table in their order, missing values included, some at a time."""

@@ -110,7 +110,7 @@ def test_a_hostile_view_cannot_read_other_files(recording, tmp_path):
             "CREATE VIEW faults AS SELECT 1::BIGINT AS time_ns, key AS board, value AS kind, '' AS detail "
             f"FROM read_csv('{tmp_path}/secret.csv')"
         )
-    with pytest.raises(RecordingError, match="cannot be read"), Recording.open(recording) as r:
+    with pytest.raises(RecordingError, match="holds a view, faults"), Recording.open(recording) as r:
         r.faults()
 
 

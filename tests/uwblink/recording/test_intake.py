@@ -1,0 +1,160 @@
+"""Files from strangers: what is a program in them is refused before it runs, what is too much before it is read."""
+
+import json
+import threading
+import time
+
+import duckdb
+import pytest
+
+from uwblink.errors import RecordingError
+from uwblink.exporters import export_recording
+from uwblink.recording import intake
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Tag
+from uwblink.recording.store import Store
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "stranger.uwb"
+    with Recording.create(path) as recording:
+        recording.append_tags([Tag(1, "drone", (0.0, 0.0, 0.0))])
+    return path
+
+
+def change(path, *statements):
+    with duckdb.connect(str(path)) as db:
+        for statement in statements:
+            db.execute(statement)
+
+
+HUGE = "SELECT 'k' AS key, 'v' AS value FROM range(10000000000)"
+ENDLESS = (
+    "WITH RECURSIVE turns(key, value) AS (SELECT 'k', '1' UNION ALL SELECT key, value FROM turns) SELECT * FROM turns"
+)
+
+
+@pytest.mark.parametrize(
+    ("statements", "named"),
+    [
+        (["DROP TABLE meta", f"CREATE VIEW meta AS {HUGE}"], "a view, meta"),
+        (["DROP TABLE meta", f"CREATE VIEW meta AS {ENDLESS}"], "a view, meta"),
+        (["DROP TABLE poses", "CREATE VIEW poses AS SELECT * FROM exchanges, range(1000000)"], "a view, poses"),
+        # What would stand for the database's own functions, and lie about the rest.
+        (["CREATE MACRO duckdb_views() AS TABLE SELECT 1 WHERE false", "CREATE VIEW a AS SELECT 1"], "a view, a"),
+        (["CREATE MACRO duckdb_functions() AS TABLE SELECT 1 WHERE false"], "a macro, duckdb_functions"),
+        (["CREATE MACRO count(a) AS 17"], "a macro, count"),
+        (["CREATE MACRO list_position(a, b) AS 1"], "a macro, list_position"),
+        (["CREATE SCHEMA system"], "a schema, system"),
+        (["CREATE SCHEMA other", "CREATE TABLE other.meta(key TEXT)"], "a schema, other"),
+        (["CREATE TYPE mood AS ENUM ('good')"], "a type, mood"),
+        (["CREATE SEQUENCE s"], "a sequence, s"),
+        (["ALTER TABLE tags ADD COLUMN w BIGINT DEFAULT 5"], "a computed column or a default, tags.w"),
+        (
+            [
+                "DROP TABLE height",
+                "CREATE TABLE height(time_ns BIGINT, body TEXT, height_m DOUBLE AS (random()) VIRTUAL)",
+            ],
+            "a computed column or a default, height.height_m",
+        ),
+        (["ALTER TABLE tags ALTER tag TYPE VARCHAR"], "column tag is VARCHAR, expected USMALLINT"),
+        (["ALTER TABLE meta ALTER value TYPE STRUCT(a VARCHAR) USING {'a': value}"], "column value is STRUCT"),
+        (['CREATE VIEW "a\nb" AS SELECT 1'], "a view, a\N{REPLACEMENT CHARACTER}b"),
+    ],
+)
+def test_programs_in_a_file_are_refused_in_one_line(file, statements, named):
+    change(file, *statements)
+    begun = time.process_time()
+    for update in (False, True):
+        with pytest.raises(RecordingError, match=r"stranger\.uwb") as caught:
+            Recording.open(file, update=update)
+        assert named in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert time.process_time() - begun < 5.0  # the endless ones never return where they are read
+
+
+def test_an_export_looks_the_file_over_too(file, tmp_path):
+    change(file, "DROP TABLE poses", "CREATE VIEW poses AS SELECT 1 AS time_ns")
+    with pytest.raises(RecordingError, match="a view, poses"):
+        export_recording(file, tmp_path / "out", to="csv")
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_cannot_be_changed_on_any_connection(file, tmp_path):
+    with Recording.create(tmp_path / "new.uwb") as written, Recording.open(file) as opened:
+        for recording in (written, opened):
+            for setting in ("enable_external_access = true", "memory_limit = '1MB'"):
+                with pytest.raises(duckdb.InvalidInputException, match="locked"):
+                    recording._store.execute(f"SET {setting}")
+
+
+def test_a_writer_writes_nowhere_but_beside_the_recording(tmp_path):
+    (tmp_path / "here").mkdir()
+    with Recording.create(tmp_path / "here" / "new.uwb", live=True) as recording:
+        recording.snapshot(tmp_path / "here" / "copy.uwb")
+        with pytest.raises(RecordingError, match=r"elsewhere.uwb: cannot be written"):
+            recording.snapshot(tmp_path / "elsewhere.uwb")
+    assert (tmp_path / "here" / "copy.uwb").exists()
+    assert not (tmp_path / "elsewhere.uwb").exists()
+
+
+def test_more_rows_than_a_file_can_hold_are_not_read(file, monkeypatch):
+    change(file, "INSERT INTO height SELECT 0, 'drone', 1.0 FROM range(3000000)")
+    size = file.stat().st_size
+    assert size < 2_000_000  # three million rows that are all alike take no place
+    with Recording.open(file) as recording:
+        assert recording.count("height") == 3_000_000
+    monkeypatch.setattr(intake, "ROWS_OF_ANY_FILE", 2_000_000)
+    with pytest.raises(RecordingError, match="table height holds 3000000 rows"):
+        Recording.open(file)
+
+
+def test_meta_is_bounded_in_bytes(file):
+    change(file, f"INSERT INTO meta SELECT 'big', repeat('9', {intake.MOST_META_BYTES})")
+    with pytest.raises(RecordingError, match=r"table meta holds 64\d+ bytes, at most 64000000"):
+        Recording.open(file)
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("NULL", "table meta: x has no value"),
+        ("'NaN'", "that of x"),
+        ("'[1, -Infinity]'", "that of x"),
+        (f"'{'[' * 100_000}'", "that of x"),
+        ("'{'", "that of x"),
+    ],
+)
+def test_meta_that_is_no_json(file, value, expected):
+    change(file, f"INSERT INTO meta VALUES ('x', {value})")
+    with pytest.raises(RecordingError, match=expected) as caught:
+        Recording.open(file)
+    assert len(str(caught.value)) < 300
+
+
+def test_tags_with_nothing_in_them(file):
+    change(file, "INSERT INTO tags VALUES (2, NULL, 0, 0, 0)")
+    with Recording.open(file) as recording, pytest.raises(RecordingError, match="table tags: a tag with nothing"):
+        recording.tags()
+
+
+@pytest.mark.parametrize("bits", [0, -1, 33, 64, 10**30, True, None, "32", [32], 32.5])
+def test_counters_that_no_chip_has(file, bits):
+    change(file, f"UPDATE meta SET value = '{json.dumps(bits)}' WHERE key = 'timestamp_bits'")
+    with (
+        Recording.open(file) as recording,
+        pytest.raises(RecordingError, match=r"timestamp_bits is .*expected 32 or 40"),
+    ):
+        recording.exchanges()
+
+
+def test_a_read_that_does_not_end_is_interrupted(file):
+    store = Store.open(file, update=False)
+    store._longest_read_s = 0.3
+    with pytest.raises(RecordingError, match="took longer than 0 s"):
+        store.read("SELECT sum(a.range * b.range) FROM range(10000000) a, range(10000000) b")
+    store._longest_read_s = 60.0
+    assert store.read("SELECT 1 AS one")["one"].tolist() == [1]
+    store.close()
+    assert not [t for t in threading.enumerate() if isinstance(t, threading.Timer) and not t.finished.is_set()]
