@@ -19,7 +19,7 @@ from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s, exchange_air_s, frame_s, message_bytes
 from uwbsim.scenario.loading import Source, as_scenario
-from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.model import BoardReply, FixedReply, QuantileReply, Scenario
 from uwbsim.simulation.air import RECEIVER_ON_S, TURNAROUND_S
 
 MOST: Final = 50_000_000
@@ -29,6 +29,7 @@ SAMPLE: Final = 200_000
 """Errors of each protocol that are kept."""
 
 MEDIAN_REPLY_S: Final = 305e-6
+"""Of the measured boards."""
 """Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
 
 WINNER_DELAYS_US: Final = (300, 600, 1000, 1500, 2000, 3000, 5000)
@@ -203,6 +204,12 @@ def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditio
     )
 
 
+def _at_once_s(reply: BoardReply | FixedReply | QuantileReply) -> float:
+    if reply.model == "boards":
+        return MEDIAN_REPLY_S
+    return reply.delay_s if reply.model == "fixed" else float(reply.at_s(np.array([0.5]))[0])
+
+
 def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | None = None) -> dict[str, float]:
     """Return what an exchange takes: `air_s`, `duration_s`, `radio_on_s`.
 
@@ -210,8 +217,7 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
     """
     symbols = scenario.radio.preamble_symbols
     scheduled = scheduled_s or scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S
-    reply = scenario.ranging.reply
-    at_once = reply.delay_s if reply.model == "fixed" else MEDIAN_REPLY_S
+    at_once = _at_once_s(scenario.ranging.reply)
     lengths = message_bytes(protocol)
     marker, end = 0.0, after_marker_s(lengths[0])
     radio = 2 * frame_s(lengths[0], symbols)

@@ -97,6 +97,8 @@ COLUMNS: Final = tuple(f.name for f in fields(Conditions) if f.type == "Floats")
 
 def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     """Sample the exchanges of a scenario's plan, evenly over its duration; fewer than `count` if it plans fewer."""
+    # Exchanges that an outage prevents have no range.
+    scenario = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"outages": None})})
     plan = schedule(scenario)
     rows = np.unique(np.linspace(0, len(plan.start) - 1, min(count, len(plan.start))).astype(np.int64))
     marker = round(before_marker_s(scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)

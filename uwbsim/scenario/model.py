@@ -9,8 +9,10 @@ from __future__ import annotations
 from itertools import combinations
 from typing import Annotated, Any, Final, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
+from uwblink.arrays import Floats
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.airtime import exchange_air_s
@@ -25,6 +27,9 @@ PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
 OVERHEAD_S: Final = 0.0015
 """From the last stamp of an exchange until the board answers the next command: start-up of the poll, three frames, and
 the transfer over USB (firmware wire format, 1.5)."""
+
+PATTERN_SIZES: Final = (0, 3, 8, 15, 24)
+"""How many spherical harmonics there are up to a degree, without the one that is the same everywhere."""
 
 UUS_S: Final = 512 / 499.2e6
 WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
@@ -56,6 +61,24 @@ class FixedReply(Section):
         return self.delay_us * US
 
 
+class QuantileReply(Section):
+    """Reply latencies by their quantiles, from 0 to 1 in equal steps, with all values in between equally likely."""
+
+    model: Literal["quantiles"]
+    delays_us: Annotated[tuple[Annotated[float, Field(ge=180, le=6000)], ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if list(self.delays_us) != sorted(self.delays_us):
+            raise ValueError("delays_us: must not decrease")
+        return self
+
+    def at_s(self, share: Floats) -> Floats:
+        """Return the latencies in seconds that shares (n,) of all replies stay below."""
+        levels = np.linspace(0, 1, len(self.delays_us))
+        return np.asarray(np.interp(share, levels, self.delays_us) * US)
+
+
 class PlanFile(Section):
     """A plan from a CSV file with the columns time_s, initiator, target; `slots` is filled in on reading."""
 
@@ -77,7 +100,7 @@ class Ranging(Section):
     sync_error_ms: NotNegative = 0.1
     list_timeout_ms: NotNegative = 10.0
     response_delay_uus: Annotated[int, Field(ge=280, le=6500)] = 1500
-    reply: Annotated[BoardReply | FixedReply, Field(discriminator="model")] = BoardReply()
+    reply: Annotated[BoardReply | FixedReply | QuantileReply, Field(discriminator="model")] = BoardReply()
     get_cir: bool = False
 
     @model_validator(mode="after")
@@ -151,7 +174,9 @@ class Tag(Section):
     `white_ppm_sqrt_s` white noise of its rate (Allan deviation h/sqrt(tau)), `flicker_ppm` flicker noise of its rate
     (the same Allan deviation at every tau), `ramp_ppm_per_s` what a change of temperature adds. A `passive` tag records
     the exchanges that it overhears. `tx_power_db` is how much stronger than others it sends, `power_offset_db` how much
-    too high it reads powers.
+    too high it reads powers. `pattern_db` is what its own antenna adds to `radio.antenna` by direction in its body's
+    frame: coefficients of real spherical harmonics of degree 1, 2 and so on, whose root mean square over all directions
+    is one (m from -l to l; 3, 8, 15 or 24 of them).
     """
 
     id: TagId
@@ -168,6 +193,7 @@ class Tag(Section):
     passive: bool = False
     tx_power_db: float = 0.0
     power_offset_db: float = 0.0
+    pattern_db: tuple[float, ...] = ()
     clock_offset_s: NotNegative | None = None
 
     @model_validator(mode="after")
@@ -175,6 +201,9 @@ class Tag(Section):
         parts = (self.tx_delay_ns is not None, self.rx_delay_ns is not None)
         if parts[0] != parts[1] or (parts[0] and self.delay_ns is not None):
             raise ValueError("delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
+        if len(self.pattern_db) not in PATTERN_SIZES:
+            allowed = ", ".join(map(str, PATTERN_SIZES[1:]))
+            raise ValueError(f"pattern_db: found {len(self.pattern_db)} coefficients, expected {allowed} or none")
         return self
 
     @property

@@ -96,6 +96,7 @@ class PairMultipath(Section):
     tags: tuple[TagId, TagId]
     share: Share | None = None
     life_s: Positive | None = None
+    mean_excess_m: Positive | None = None
 
 
 class TwoStateMultipath(Section):
@@ -108,6 +109,7 @@ class TwoStateMultipath(Section):
     standard deviation of the logarithm; `pairs` has those that are known. A reflection leaves its trace: its first path
     is weaker than the direct one by `first_path_loss_db` on average (`loss_std_db` about it) and all paths together by
     `total_loss_db`, with most of the power in a path that comes `rise_ns` later on average.
+    A direct path seems longer or shorter by `direct_std_m`, as long as it lasts.
     """
 
     model: Literal["two-state"]
@@ -121,6 +123,7 @@ class TwoStateMultipath(Section):
     loss_std_db: NotNegative = 2.0
     total_loss_db: NotNegative = 2.0
     rise_ns: Positive = 6.0
+    direct_std_m: NotNegative = 0.0
     pairs: tuple[PairMultipath, ...] = ()
 
     @model_validator(mode="after")
@@ -146,6 +149,27 @@ class TwoStateMultipath(Section):
     def rise_s(self) -> float:
         """Return in seconds how much later the strongest path comes on average."""
         return self.rise_ns * NS
+
+
+class Fading(Section):
+    """Power that comes and goes with the place, alike in both directions of a pair of tags.
+
+    At random instants, `life_s` apart on average, it is drawn anew, with the standard deviation `std_db`; so its
+    autocorrelation is exp(-dt/life).
+    """
+
+    std_db: NotNegative
+    life_s: Annotated[float, Field(ge=0.01)] = 0.5
+
+
+class Outages(Section):
+    """Whiles in which two tags do not hear each other, for no reason that the scenario has: `share` of the time.
+
+    At random instants, `life_s` apart on average, it is drawn anew whether a pair is out.
+    """
+
+    share: Share
+    life_s: Annotated[float, Field(ge=0.01)] = 0.5
 
 
 def _independent_unless_named(value: Any) -> Any:
@@ -206,6 +230,8 @@ class Radio(Section):
     bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = None
     sigma: Annotated[SigmaSpline | None, _named(SIGMA)] = None
     multipath: Multipath | None = None
+    fading: Fading | None = None
+    outages: Outages | None = None
 
     @property
     def independent_multipath(self) -> tuple[float, float]:

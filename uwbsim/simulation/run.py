@@ -144,7 +144,7 @@ def simulate(
         hosts, powers = _hosts(run, plan, draws), _powers(run.world)
         outcomes = air.run(protocol, hosts, len(scenario.tags), powers, _rules(scenario), progress)
     else:
-        outcomes = _undisturbed(run, plan)
+        outcomes = _undisturbed(run, plan, draws)
     lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)
     kept = np.flatnonzero(lost < 0)
     kept = kept[np.argsort(begun[kept], kind="stable")]
@@ -202,7 +202,7 @@ def _described(flight: Simulated) -> str:
 def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
     """Give the event loop what it needs, as plain integers, a list a host: it does no arithmetic of its own."""
     scenario, messages = run.scenario, run.protocol.messages
-    heard = _heard(run, plan)
+    heard = _heard(run, plan, draws)
     scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
     at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
     delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in messages]
@@ -222,9 +222,9 @@ def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
     return list(hosts.values())
 
 
-def _undisturbed(run: _Run, plan: Schedule) -> air.Outcomes:
+def _undisturbed(run: _Run, plan: Schedule, draws: Draws) -> air.Outcomes:
     """What becomes of exchanges that do not meet: only a message too weak to be heard is lost."""
-    heard = _heard(run, plan)
+    heard = _heard(run, plan, draws)
     lost = np.where(heard.all(axis=0), -1, np.argmin(heard, axis=0))
     marker = round(before_marker_s(run.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND)
     reasons = [air.WEAK if k >= 0 else "" for k in lost.tolist()]
@@ -255,14 +255,29 @@ def _rules(scenario: Scenario) -> air.Rules:
     return air.Rules(radio.sensitivity_dbm, radio.capture_db, radio.preamble_symbols)
 
 
-def _heard(run: _Run, plan: Schedule) -> Bools:
+def _heard(run: _Run, plan: Schedule, draws: Draws) -> Bools:
     """Whether each message (messages, n) is received; a little fading makes the edge soft."""
     forth = back = run.world.link(plan.initiator, plan.target, plan.start).power_dbm
     if any(tag.tx_power_db for tag in run.scenario.tags):
         back = run.world.link(plan.target, plan.initiator, plan.start).power_dbm
     power_dbm = np.array([forth if m.sender == "initiator" else back for m in run.protocol.messages])
+    if run.world.levels is not None:
+        power_dbm = _at_their_instants(run, plan, draws)
     fading = stream(run.scenario.run.seed, "fading").normal(size=power_dbm.shape)
     return run.medium.heard(power_dbm, fading)
+
+
+def _at_their_instants(run: _Run, plan: Schedule, draws: Draws) -> Floats:
+    """Return the powers of messages (messages, n) when they leave: an outage may begin within an exchange."""
+    at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
+    scheduled = run.scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
+    delay = {"at once": at_once, "scheduled": np.full_like(at_once, scheduled)}
+    time, powers = plan.start + round(before_marker_s(run.scenario.radio.preamble_symbols) * SUBTICKS_PER_SECOND), []
+    for message in run.protocol.messages:
+        time = time + delay[message.timing] if message.after else time
+        ends = (plan.initiator, plan.target) if message.sender == "initiator" else (plan.target, plan.initiator)
+        powers.append(run.world.link(*ends, time).power_dbm)
+    return np.array(powers)
 
 
 def _exchanges(run: _Run, kept: Ints, planned: int, rows: Begun, stamped: Stamped) -> Exchanges:

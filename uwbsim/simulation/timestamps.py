@@ -96,6 +96,8 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
     reply = scenario.ranging.reply
     if reply.model == "fixed":
         return np.full(count, reply.delay_s)
+    if reply.model == "quantiles":
+        return reply.at_s(rng.random(count))
     kind = rng.random(count)
     microseconds = np.select(
         [kind < 0.41, kind < 0.86, kind < 0.91],

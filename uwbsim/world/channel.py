@@ -17,6 +17,8 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Shadow, TwoStateMultipath
+from uwbsim.world.pair_levels import PairLevels
+from uwbsim.world.patterns import pattern_gain_db
 from uwbsim.world.propagation import SURFACES, Link, ellipsoid_chord_m, first_path, reflections, through, with_path
 from uwbsim.world.radio import gain_db, path_gain_db
 from uwbsim.world.reflected_states import ReflectedStates
@@ -43,7 +45,7 @@ class Ends:
     `time_s` (n,) is true time; `places` are the tags at the two ends as places in the scenario's list, (n,) each;
     `antennas_m` where their antennas are, (n, 3) each, and `rotations` how they are turned, body to world, (n, 3, 3)
     each. `shadows` are the bodies that may stand in between; `phases` (tags, harmonics) those of the tags' shadowing;
-    `states` the reflections that last by pair, where the scenario has such.
+    `states` the reflections that last by pair, `levels` fading and outages of pairs, where the scenario has such.
     `distance_m` and `gain_db`, (n,) each, follow from these: the lengths of the straight lines, and what the sender's
     power and the two antennas together add along them. The first end sends.
     """
@@ -56,6 +58,7 @@ class Ends:
     rotations: tuple[Floats, Floats]
     shadows: Sequence[PlacedShadow]
     states: ReflectedStates | None = None
+    levels: PairLevels | None = None
     distance_m: Floats = field(init=False)
     gain_db: Floats = field(init=False)
 
@@ -76,7 +79,12 @@ class Ends:
         radio, gain = self.scenario.radio, np.zeros(len(leaving))
         for tags, rotation, way in zip(self.places, self.rotations, (leaving, arriving), strict=True):
             phases = self.phases[tags] if radio.shadowing_db else self.phases
-            gain = gain + gain_db(radio, phases, np.einsum("ni,nij->nj", way, rotation))
+            there = np.einsum("ni,nij->nj", way, rotation)
+            gain = gain + gain_db(radio, phases, there)
+            for place, tag in enumerate(self.scenario.tags):
+                if tag.pattern_db:
+                    mine = np.flatnonzero(tags == place)
+                    gain[mine] += pattern_gain_db(tag.pattern_db, there[mine])
         if any(tag.tx_power_db for tag in self.scenario.tags):
             gain = gain + np.array([tag.tx_power_db for tag in self.scenario.tags])[self.places[0]]
         return gain
@@ -173,11 +181,21 @@ def _states(link: Link, ends: Ends) -> Link:
     return replace(later, excess_m=excess, power_dbm=power, total_dbm=total)
 
 
+def _levels(link: Link, ends: Ends) -> Link:
+    """Fading and outages of pairs, of all paths alike."""
+    if ends.levels is None:
+        return link
+    level = ends.levels.at_db(ends.places, ends.time_s)
+    dbm = None if link.paths_dbm is None else link.paths_dbm + level[:, None]
+    return replace(link, power_dbm=link.power_dbm + level, total_dbm=link.total_dbm + level, paths_dbm=dbm)
+
+
 CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
     "obstacles": _obstacles,
     "shadows": _shadows,
     "reflections": _reflections,
     "lasting reflections": _states,
+    "fading and outages": _levels,
 }
 """What happens to waves on their way, in this order, for every link of every scenario; strangers' effects come last."""
 
@@ -201,7 +219,7 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     ...     return replace(link, power_dbm=link.power_dbm - loss_db, total_dbm=link.total_dbm - loss_db)
     >>> uwbsim.register_channel_effect("rain", rain)
     >>> list(CHANNEL_EFFECTS)
-    ['obstacles', 'shadows', 'reflections', 'lasting reflections', 'rain']
+    ['obstacles', 'shadows', 'reflections', 'lasting reflections', 'fading and outages', 'rain']
     >>> del CHANNEL_EFFECTS["rain"]
     """
     if not isinstance(name, str) or not name:

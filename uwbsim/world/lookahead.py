@@ -69,6 +69,7 @@ class SampledWorld:
                 rotations=(turns[origin], turns),
                 shadows=self._shadows(index, into, count),
                 states=self._world.states,
+                levels=self._world.levels,
             )
         )
 

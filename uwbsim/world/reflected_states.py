@@ -23,8 +23,8 @@ MARGIN_S: Final = 60.0
 class Paths:
     """The paths that n links have: whether reflections, and what tells them from direct ones, (n,) each.
 
-    `excess_m` is the excess length of the first path, `first_loss_db` how much weaker it is than the direct one would
-    be, `rise_s` how much later the strongest path comes. Zero for direct paths.
+    `excess_m` is the excess length of the first path; `first_loss_db` how much weaker it is than the direct one would
+    be, and `rise_s` how much later the strongest path comes, zero for direct paths.
     """
 
     reflected: Bools
@@ -60,9 +60,10 @@ class ReflectedStates:
             ids = sorted((scenario.tags[a].id, scenario.tags[b].id))
             draw = partial(stream, scenario.run.seed, "reflected states", *ids)
             share, life_s = share_and_life(model, ids, draw("pair"))
+            mean_m = next((p.mean_excess_m for p in model.pairs if set(p.tags) == set(ids) and p.mean_excess_m), None)
             begin = _instants(draw("instants"), life_s, span)
             begins.append(begin + number * span)
-            parts.append(_paths(model, draw, share, len(begin)))
+            parts.append(_paths(model, draw, share, mean_m or model.mean_excess_m, len(begin)))
         paths = Paths(
             reflected=np.concatenate([part.reflected for part in parts]),
             excess_m=np.concatenate([part.excess_m for part in parts]),
@@ -80,7 +81,7 @@ class ReflectedStates:
         reflected = p.reflected[k] & (places[0] != places[1])
         return Paths(
             reflected=reflected,
-            excess_m=np.where(reflected, p.excess_m[k], 0.0),
+            excess_m=np.where(places[0] != places[1], p.excess_m[k], 0.0),
             first_loss_db=np.where(reflected, p.first_loss_db[k], 0.0),
             rise_s=np.where(reflected, p.rise_s[k], 0.0),
         )
@@ -112,12 +113,17 @@ def _instants(rng: np.random.Generator, life_s: float, span_s: float) -> Floats:
     return np.asarray(begin[begin < span_s])
 
 
-def _paths(model: TwoStateMultipath, draw: Callable[[str], np.random.Generator], share: float, count: int) -> Paths:
+def _paths(
+    model: TwoStateMultipath, draw: Callable[[str], np.random.Generator], share: float, mean_m: float, count: int
+) -> Paths:
     """Draw paths (count,), each property from a stream of its own, so that a longer run continues a shorter one."""
+    reflected = draw("state").random(count) < share
+    excess = draw("excess").gamma(model.excess_shape, mean_m / model.excess_shape, count)
+    about = draw("direct").normal(0, 1, count) * model.direct_std_m
     loss_db = draw("loss").normal(model.first_path_loss_db, model.loss_std_db, count)
     return Paths(
-        reflected=draw("state").random(count) < share,
-        excess_m=draw("excess").gamma(model.excess_shape, model.mean_excess_m / model.excess_shape, count),
+        reflected=reflected,
+        excess_m=np.where(reflected, excess, about),
         first_loss_db=np.maximum(loss_db, model.total_loss_db),
         rise_s=draw("rise").exponential(model.rise_s, count),
     )

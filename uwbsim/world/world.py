@@ -17,6 +17,7 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.units import NS, NS_PER_S
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
 from uwbsim.world.impulse_response import PathsHeard, paths_heard
+from uwbsim.world.pair_levels import PairLevels
 from uwbsim.world.propagation import Link
 from uwbsim.world.radio import shadowing_phases
 from uwbsim.world.reflected_states import ReflectedStates
@@ -31,19 +32,22 @@ TRIES: Final = 60
 class World:
     """Bodies on their trajectories, with tags on lever arms.
 
-    `phases` are those of the tags' shadowing, `states` the reflections that last by pair.
+    `phases` are those of the tags' shadowing, `states` the reflections that last by pair, `levels` the fading and the
+    outages of pairs.
     """
 
     scenario: Scenario
     trajectories: dict[str, Trajectory]
     phases: Floats
     states: ReflectedStates | None
+    levels: PairLevels | None = None
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         """Sample every body's trajectory from the seed; raises `ScenarioError` where they cannot keep apart."""
         phases = [shadowing_phases(scenario.run.seed, tag.id) for tag in scenario.tags]
-        return cls(scenario, _trajectories(scenario), np.array(phases), ReflectedStates.of(scenario))
+        states, levels = ReflectedStates.of(scenario), PairLevels.of(scenario)
+        return cls(scenario, _trajectories(scenario), np.array(phases), states, levels)
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
         """Return what reaches the second tag from the first, shape (n,); reciprocal but for the sender's power.
@@ -81,6 +85,7 @@ class World:
                 rotations=turns,
                 shadows=self._shadows(bodies),
                 states=self.states,
+                levels=self.levels,
             )
         )
 
