@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup demo test lint format bench bench-large bench-workbench bench-boards accuracy fidelity endurance rooms coverage lock clean
+.PHONY: help setup demo test lint format bench bench-large bench-workbench bench-boards bench-stream accuracy fidelity endurance rooms coverage lock clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -53,6 +53,9 @@ bench-large: setup ## measure a calibration of 3.8 million exchanges (a minute, 
 
 bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 	$(BIN)/python -m benchmarks.workbench
+
+bench-stream: setup ## measure how late streamed ranges are (15 s)
+	$(BIN)/python -m benchmarks.streaming
 
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy

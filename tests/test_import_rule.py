@@ -25,6 +25,7 @@ CONFINED = {
     "pydantic": lambda path: path.startswith("uwbsim/"),
     "threadpoolctl": lambda path: path == "calib/estimation/fitting.py",
     "rosbags": lambda path: path == "uwblink/importers/pose_bags.py",
+    "foxglove": lambda path: path == "uwblink/streaming/foxglove_server.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }
 # The rooms by floor, the ground first: a room imports only rooms of lower floors, so two on one floor never meet.
@@ -37,6 +38,7 @@ FLOORS = {
         ("wire",),
         ("recording",),
         ("boards", "exporters", "importers"),
+        ("streaming",),
         ("cli",),
     ),
     "uwbsim": (

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from uwblink.recording.contents import Contents, load
     from uwblink.recording.file import Recording
     from uwblink.recording.schema import Poses, Tag
+    from uwblink.streaming.ranges import StreamedRange
+    from uwblink.streaming.sources import stream
     from uwblink.ticks import SPEED_OF_LIGHT
     from uwblink.twr import Exchanges, raw_range
     from uwblink.wire.messages import register_message
@@ -41,6 +43,7 @@ __all__ = [
     "RangingPlan",
     "RangingProtocol",
     "Recording",
+    "StreamedRange",
     "Tag",
     "UwblinkError",
     "import_recording",
@@ -50,6 +53,7 @@ __all__ = [
     "register_importer",
     "register_message",
     "register_protocol",
+    "stream",
 ]
 
 _HOMES: Final = {
@@ -65,6 +69,7 @@ _HOMES: Final = {
     "RangingPlan": "uwblink.boards.ranging_plan",
     "RangingProtocol": "uwblink.protocols.rows",
     "Recording": "uwblink.recording.file",
+    "StreamedRange": "uwblink.streaming.ranges",
     "Tag": "uwblink.recording.schema",
     "UwblinkError": "uwblink.errors",
     "import_recording": "uwblink.importers",
@@ -74,6 +79,7 @@ _HOMES: Final = {
     "register_importer": "uwblink.importers",
     "register_message": "uwblink.wire.messages",
     "register_protocol": "uwblink.protocols.table",
+    "stream": "uwblink.streaming.sources",
 }
 
 if not TYPE_CHECKING:

@@ -1,8 +1,7 @@
-"""Correct the reports of boards as they come: what a recorder's live page asks for."""
+"""Correct the reports of boards as they come: what a recorder's live page and a stream of ranges ask for."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,19 +10,19 @@ from calib.errors import CalibError
 from uwblink.wire.messages import RangeReport
 
 
-def live_correction(path: Path) -> Callable[[int, RangeReport], float]:
-    """Return a function that corrects a report of an initiator, in metres; NaN for a tag that is not calibrated.
+def live_correction(path: Path) -> Callable[[int, RangeReport], dict[str, float]]:
+    """Return a function that corrects a report of an initiator: `corrected_m`, and what else `CorrectedRange` has.
 
-    Raises what `load_calibration` raises.
+    It returns nothing for a tag that is not calibrated. Raises what `load_calibration` raises.
     """
     calibration = load_calibration(path)
 
-    def correct(initiator: int, report: RangeReport) -> float:
+    def correct(initiator: int, report: RangeReport) -> dict[str, float]:
         try:
-            return calibration.correct(
-                report.range_m, report.fpp1_dbm, report.fpp2_dbm, initiator, report.neighbour
-            ).range_m
+            found = calibration.correct(report.range_m, report.fpp1_dbm, report.fpp2_dbm, initiator, report.neighbour)
         except CalibError:
-            return math.nan
+            return {}
+        known = found._asdict()
+        return {"corrected_m": known.pop("range_m"), **known}
 
     return correct

@@ -6,7 +6,7 @@ function that takes the path of a calibration and returns the function which cor
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Final
@@ -15,8 +15,11 @@ from uwblink.errors import PlanError
 from uwblink.wire.messages import RangeReport
 
 GROUP: Final = "uwbcal.corrections"
-Correction = Callable[[int, RangeReport], float]
-"""Returns the corrected range in metres from the initiator's id and the report; NaN where it cannot be corrected."""
+Correction = Callable[[int, RangeReport], Mapping[str, float]]
+"""Returns what is known of a range by name, from the initiator's id and the report.
+
+`corrected_m` and `sigma_m` in metres, and whatever else whoever corrects can say; nothing where it cannot be corrected.
+"""
 
 
 def load_correction(path: Path) -> Correction:

@@ -91,7 +91,8 @@ class LivePage(Listener):
         if turn.report is None:
             return
         time_s = (turn.time_ns - self._progress.start_ns) * 1e-9 if self._progress.start_ns else turn.time_ns * 1e-9
-        corrected = self._correct(turn.pair[0], turn.report) if self._correct else math.nan
+        known = self._correct(turn.pair[0], turn.report) if self._correct else {}
+        corrected = known.get("corrected_m", math.nan)
         with self._lock:
             self._series.setdefault(turn.pair, _Series()).points.append((time_s, turn.report.range_m, corrected))
 

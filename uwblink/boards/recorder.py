@@ -7,7 +7,7 @@ would collide on the air. A board that is unplugged leaves the others running an
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -169,17 +169,24 @@ class Recorder:
         watch: Callable[[Progress], None] | None = None,
     ) -> None:
         """Play the plan until it is time to stop, then let the last exchange end."""
-        end_s = self._start_s + duration_s
         watched_s = self._start_s
-        try:
-            while (now_s := self._ports.now_s()) < end_s and not stop():
-                self._step(end_s)
+        with suppress(KeyboardInterrupt):
+            for now_s in self.steps(duration_s, stop):
                 if watch and now_s - watched_s > WATCH_EVERY_S:
                     watched_s = now_s
                     self.progress.time_s = now_s - self._start_s
                     watch(self.progress)
-        except KeyboardInterrupt:
-            pass
+        self.finish()
+
+    def steps(self, duration_s: float = float("inf"), stop: Callable[[], bool] = lambda: False) -> Iterator[float]:
+        """Play the plan until it is time to stop; yields the ports' time, in seconds, whenever something was done."""
+        end_s = self._start_s + duration_s
+        while (now_s := self._ports.now_s()) < end_s and not stop():
+            self._step(end_s)
+            yield now_s
+
+    def finish(self) -> None:
+        """Let the last exchange end, and begin no other."""
         self._turns = ()
         while self._active:
             self._step(self._ports.now_s() + LONGEST_WAIT_S)

@@ -19,7 +19,7 @@ from uwblink.errors import PluginWarning, UwblinkError
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
 
-FLAGS: Final = {"map_file": "--map", "tags_from": "--tags"}
+FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
 """Parameters of uwblink whose flag is called otherwise; all others are spelt alike, with dashes."""
 
 Flags = Mapping[str, str]

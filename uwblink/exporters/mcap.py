@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 
 from uwblink.errors import RecordingError
+from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
 from uwblink.recording.contents import Contents, load
 
 MAGIC: Final = b"\x89MCAP0\r\n"
@@ -24,36 +25,10 @@ WORLD: Final = "world"
 WARNING: Final = 3
 """The level of a foxglove.Log that faults have."""
 
+NUMBERS: Final = ("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
+
 Message = tuple[int, str, str, dict[str, Any]]
 """Time in nanoseconds, topic, schema, content."""
-
-_NUMBER: Final = {"type": "number"}
-_INTEGER: Final = {"type": "integer"}
-_TEXT: Final = {"type": "string"}
-
-
-def _object(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-_TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-SCHEMAS: Final[dict[str, dict[str, Any]]] = {
-    "foxglove.PoseInFrame": _object(
-        timestamp=_TIME, frame_id=_TEXT, pose=_object(position=_VECTOR, orientation=_QUATERNION)
-    ),
-    "foxglove.FrameTransform": _object(
-        timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_QUATERNION
-    ),
-    "foxglove.Log": _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER),
-    "uwb.Range": _object(
-        timestamp=_TIME, initiator=_INTEGER, target=_INTEGER, protocol=_TEXT,
-        **dict.fromkeys(("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm"), _NUMBER),
-    ),
-    "uwb.Imu": _object(timestamp=_TIME, angular_velocity=_VECTOR, linear_acceleration=_VECTOR),
-    "uwb.Height": _object(timestamp=_TIME, height_m=_NUMBER),
-}  # fmt: skip
 
 
 def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
@@ -81,8 +56,7 @@ def _write(recording: Path, file: BinaryIO, messages: Iterator[Message]) -> int:
             channels[topic] = len(channels) + 1
             ids = struct.pack("<HH", channels[topic], list(SCHEMAS).index(schema) + 1)
             _record(file, CHANNEL, ids + _text(topic) + _text("json") + struct.pack("<I", 0))
-        sec, nsec = divmod(time_ns, 1_000_000_000)
-        data = json.dumps({"timestamp": {"sec": sec, "nsec": nsec}} | content, allow_nan=False).encode()
+        data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
         _record(file, MESSAGE, struct.pack("<HIQQ", channels[topic], count & 0xFFFFFFFF, time_ns, time_ns) + data)
         count += 1
     _record(file, DATA_END, struct.pack("<I", 0))
@@ -120,14 +94,11 @@ def _poses(held: Contents) -> Iterator[Message]:
 
 def _ranges(held: Contents) -> Iterator[Message]:
     e = held.exchanges
-    names = ("initiator", "target", "protocol", *(n for n in SCHEMAS["uwb.Range"]["properties"] if n.endswith(_UNITS)))
+    names = ("initiator", "target", "protocol", *NUMBERS)
     columns = {name: getattr(e, name).tolist() for name in names}
     for k in np.argsort(e.time_ns, kind="stable").tolist():
         row = {name: column[k] for name, column in columns.items()}
-        yield int(e.time_ns[k]), f"/ranges/{row['initiator']}_{row['target']}", "uwb.Range", _known(row)
-
-
-_UNITS: Final = ("_m", "_dbm", "_ppm")
+        yield int(e.time_ns[k]), f"/ranges/{row['initiator']}_{row['target']}", RANGE, _known(row)
 
 
 def _known(row: dict[str, Any]) -> dict[str, Any]:

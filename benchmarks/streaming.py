@@ -1,0 +1,56 @@
+"""How late streamed ranges are: from the report's bytes at the port to a datagram in another process, in ms.
+
+Served boards on this machine, so printing and USB are not in it: `python -m benchmarks.streaming`.
+"""
+
+import socket
+import sys
+import threading
+import time
+
+import numpy as np
+
+import uwblink
+from tests.boards import served
+from uwblink.streaming import UdpSender
+from uwblink.wire import RangeReport
+
+COUNT = 1000
+
+
+def main() -> int:
+    """Print the median and the 99th percentile of the delays."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear, served() as server:
+        ear.bind(("127.0.0.1", 0))
+        arrived: list[int] = []
+
+        def listen() -> None:
+            while len(arrived) < COUNT:
+                ear.recv(65536)
+                arrived.append(time.time_ns())
+
+        listener = threading.Thread(target=listen, daemon=True)
+        listener.start()
+        came: list[int] = []
+        sent = 0
+
+        def note(heard: uwblink.Heard) -> None:
+            if isinstance(heard.message, RangeReport):
+                came.append(heard.time_ns)
+
+        names = [str(name) for name in server.names.values()]
+        plan = uwblink.RangingPlan(rate_hz=100.0)
+        with UdpSender(str(ear.getsockname()[1])) as sender:
+            for found in uwblink.stream(names, plan=plan, listeners=[note]):
+                sender.send(found)
+                sent += 1
+                if sent >= COUNT:
+                    break
+        listener.join(10)
+    late = (np.array(arrived) - np.array(came[: len(arrived)])) * 1e-6
+    print(f"{len(late)} ranges: median {np.median(late):.2f} ms, 99 % within {np.percentile(late, 99):.2f} ms")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,118 @@
+"""The ROS 2 node of docs/streaming.md, against a stand-in for rclpy that takes what the real one takes and no more."""
+
+import re
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import uwblink
+from tests.boards import bench_scenario
+from uwbsim.boards.virtual_port import VirtualPorts
+
+PAGE = Path(__file__).parents[3] / "docs" / "streaming.md"
+
+
+class Stamp:
+    __slots__ = ("nanosec", "sec")
+    sec: int
+    nanosec: int
+
+
+class Header:
+    __slots__ = ("frame_id", "stamp")
+
+
+class Range:
+    """Fields of sensor_msgs/Range of ROS 2 Jazzy; messages take no others."""
+
+    NAMES = ("radiation_type", "field_of_view", "min_range", "max_range", "range", "variance")
+    __slots__ = ("header", *NAMES)
+
+    def __init__(self, **values):
+        self.header = Header()
+        for name in self.NAMES:
+            setattr(self, name, 0.0)
+        for name, value in values.items():
+            assert name in self.NAMES
+            assert type(value) is float
+            setattr(self, name, value)
+
+
+class Time:
+    def __init__(self, *, nanoseconds):
+        assert type(nanoseconds) is int
+        self.nanoseconds = nanoseconds
+
+    def to_msg(self):
+        stamp = Stamp()
+        stamp.sec, stamp.nanosec = divmod(self.nanoseconds, 1_000_000_000)
+        return stamp
+
+
+def stand_in(published, values):
+    class Node:
+        def __init__(self, name):
+            assert re.fullmatch(r"[A-Za-z_]\w*", name)
+
+        def declare_parameter(self, name, default):
+            return types.SimpleNamespace(value=values.get(name, default))
+
+        def create_publisher(self, kind, topic, depth):
+            assert kind is Range
+            assert re.fullmatch(r"[A-Za-z_/][\w/]*", topic)
+            assert depth > 0
+            return types.SimpleNamespace(publish=lambda message: published.append((topic, message)))
+
+        def destroy_node(self):
+            published.append("destroyed")
+
+    modules = {name: types.ModuleType(name) for name in ("rclpy", "rclpy.node", "rclpy.time", "sensor_msgs.msg")}
+    modules["sensor_msgs"] = types.ModuleType("sensor_msgs")
+    for module, name, thing in (
+        ("rclpy", "init", lambda: published.append("begun")),
+        ("rclpy", "ok", lambda: len(published) < 40),
+        ("rclpy.node", "Node", Node),
+        ("rclpy.time", "Time", Time),
+        ("sensor_msgs.msg", "Range", Range),
+    ):
+        setattr(modules[module], name, thing)
+    return modules
+
+
+@pytest.fixture
+def node():
+    (text,) = (found for found in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S) if "rclpy" in found)
+    body = text.split("class RangeNode")[1].split("if __name__")[0]
+    assert body.count("\n") <= 40
+    return compile(text, "docs/streaming.md", "exec")
+
+
+def test_the_node_publishes_corrected_ranges_until_ros_ends(node, monkeypatch):
+    published: list[Any] = []
+    ports = VirtualPorts(bench_scenario())
+    names = list(ports.names.values())
+    for name, module in stand_in(published, {"ports": names, "calibration": "mine.json"}).items():
+        monkeypatch.setitem(__import__("sys").modules, name, module)
+    real = uwblink.stream
+
+    def stream(given, *, calibration, stop):
+        assert (given, calibration) == (names, "mine.json")
+
+        def correct(initiator, report):
+            return {} if report.neighbour == 3 else {"corrected_m": report.range_m - 0.5, "sigma_m": 0.25}
+
+        return real(given, calibration=correct, stop=stop, using=ports)
+
+    monkeypatch.setattr(uwblink, "stream", stream)
+    exec(node, {"__name__": "__main__"})  # noqa: S102 - the code of our own page is what is tested
+    assert (published[0], published[-1]) == ("begun", "destroyed")
+    messages = published[1:-1]
+    assert len(messages) >= 39
+    assert {topic for topic, _ in messages} == {"uwb/range_1_2"}, "of tag 3 nothing is known"
+    assert all(m.range == pytest.approx(2.5, abs=0.3) and m.variance == 0.0625 for _, m in messages)
+    assert messages[0][1].header.frame_id == "uwb_1"
+    times = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in messages]
+    assert times == sorted(times)
+    assert times[0] > 0

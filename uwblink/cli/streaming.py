@@ -1,0 +1,124 @@
+"""The command that hands ranges on as they come."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from uwblink.cli.shared import interrupts
+
+if TYPE_CHECKING:
+    from uwblink import RangingPlan, StreamedRange
+
+SUFFIX: Final = ".uwb"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command."""
+    app.command()(stream)
+
+
+def stream(
+    source: Annotated[list[str], typer.Argument(metavar="SOURCE...", help="Ports of boards, or one recording (.uwb).")],
+    calibration: Annotated[Path | None, typer.Option("-c", "--calibration", help="Correct by it (.json).")] = None,
+    plan: Annotated[Path | None, typer.Option(help="Who ranges with whom (.toml); else every two boards.")] = None,
+    rate: Annotated[float | None, typer.Option(min=0.001, help="Exchanges a second in total (Hz), of boards.")] = None,
+    duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until the end.")] = None,
+    speed: Annotated[float, typer.Option(min=0.001, help="How much faster a recording plays; inf: at once.")] = 1.0,
+    udp: Annotated[str | None, typer.Option(help="HOST:PORT to send JSON datagrams to (PlotJuggler: 9870).")] = None,
+    foxglove: Annotated[
+        str | None, typer.Option(help="\\[HOST:]PORT to serve a WebSocket for Foxglove at (its own: 8765).")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print no ranges.")] = False,
+) -> None:
+    """Print ranges as they come, a line of JSON each, corrected where a calibration is given, and send them on."""
+    from uwblink.boards import Progress
+
+    seen = Progress()
+    senders: list[Callable[[StreamedRange], object]] = [] if quiet else [_print]
+    with ExitStack() as stack:
+        stop = stack.enter_context(interrupts())
+        senders += _senders(stack, udp, foxglove)
+        ranges = _begin(source, calibration, _plan(source, plan, rate), duration, speed, stop, seen)
+        stack.callback(ranges.close)
+        count = _hand_on(ranges, senders)
+    faults = ", ".join(f"{kind} {number}" for kind, number in sorted(seen.faults.items()))
+    typer.echo(f"{count} ranges" + (f"; faults: {faults}" if faults else ""), err=True)
+
+
+def _plan(source: list[str], path: Path | None, rate: float | None) -> RangingPlan | None:
+    from dataclasses import replace
+
+    from uwblink import RangingPlan
+    from uwblink.boards import load_plan
+    from uwblink.errors import PlanError
+
+    if _is_recording(source):
+        if path or rate:
+            raise PlanError(f"{source[0]}: a recording is streamed as it is; --plan and --rate are for boards")
+        return None
+    chosen = load_plan(path) if path else RangingPlan()
+    return replace(chosen, rate_hz=rate) if rate else chosen
+
+
+def _is_recording(source: list[str]) -> bool:
+    return len(source) == 1 and source[0].endswith(SUFFIX)
+
+
+def _begin(
+    source: list[str],
+    calibration: Path | None,
+    plan: RangingPlan | None,
+    duration: float | None,
+    speed: float,
+    stop: Callable[[], bool],
+    seen: Any,
+) -> Any:
+    import uwblink
+
+    return uwblink.stream(
+        source[0] if _is_recording(source) else source,
+        calibration=calibration,
+        plan=plan,
+        duration_s=duration or math.inf,
+        speed=speed,
+        stop=stop,
+        listeners=[seen],
+    )
+
+
+def _senders(stack: ExitStack, udp: str | None, foxglove: str | None) -> Iterator[Callable[[StreamedRange], object]]:
+    """Yield what sends ranges on, open until the stack ends."""
+    from uwblink.streaming import FoxgloveServer, UdpSender
+
+    if udp is not None:
+        yield stack.enter_context(UdpSender(udp)).send
+    if foxglove is not None:
+        server = stack.enter_context(FoxgloveServer(foxglove))
+        typer.echo(f"foxglove: {server.url}", err=True)
+        yield server.send
+
+
+def _hand_on(ranges: Iterator[StreamedRange], senders: list[Callable[[StreamedRange], object]]) -> int:
+    """Send all ranges on; returns how many. Whoever reads the lines may go away: that ends the stream."""
+    count = 0
+    try:
+        for count, found in enumerate(ranges, start=1):  # noqa: B007 - how many there were is what is wanted
+            for send in senders:
+                send(found)
+    except BrokenPipeError:
+        # So that Python does not try to write what is left when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return count
+
+
+def _print(found: StreamedRange) -> None:
+    sys.stdout.write(found.to_json() + "\n")
+    sys.stdout.flush()

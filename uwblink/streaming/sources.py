@@ -1,0 +1,163 @@
+"""Where streams come from: boards that range now, or a recording played in its own time."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from uwblink.boards.corrections import Correction, load_correction
+from uwblink.boards.listeners import Heard, Listener, Turn, as_listeners
+from uwblink.boards.ports import Ports, SerialPorts
+from uwblink.boards.ranging_plan import RangingPlan
+from uwblink.boards.recorder import Recorder, identify
+from uwblink.errors import ArgumentError
+from uwblink.recording.file import Recording
+from uwblink.streaming.ranges import LEVELS, StreamedRange, streamed
+from uwblink.twr import STAMPS, Exchanges
+from uwblink.wire.bulk import exchanges_of
+from uwblink.wire.messages import RangeReport
+
+Stream = Generator[StreamedRange, None, None]
+LONGEST_SLEEP_S: Final = 0.1
+AT_A_TIME: Final = 10_000
+"""Rows of a recording that are made into Python's numbers at once."""
+
+
+def stream(
+    source: str | os.PathLike[str] | Iterable[str],
+    *,
+    calibration: str | os.PathLike[str] | Correction | None = None,
+    plan: RangingPlan | None = None,
+    duration_s: float = math.inf,
+    speed: float = 1.0,
+    stop: Callable[[], bool] = lambda: False,
+    listeners: Iterable[Listener | Callable[[Heard], object]] = (),
+    using: Ports | None = None,
+) -> Stream:
+    """Yield ranges as they come: of boards at ports, or of a recording in its own time.
+
+    `source` is the path of a recording, or names of ports, on which `plan` is played (every two boards in turns without
+    one). `calibration` corrects: a file's path, or a function as `uwblink.boards.load_correction` returns. A recording
+    plays `speed` times as fast as it was made; `inf` does not wait at all. `listeners` and `using` are for boards, as
+    `uwblink.record` takes them. Whoever takes ranges slowly delays the boards: one loop does both. Raises
+    `ArgumentError`, `PlanError` and what `Recording.open` and `Board.open` raise before the first range. Closing the
+    iterator closes the ports.
+
+    >>> import uwblink, uwbsim
+    >>> ports = uwbsim.VirtualPorts(
+    ...     uwbsim.load(
+    ...         '''
+    ...         run = { duration_s = 10.0 }
+    ...         ranging = { rate_hz = 50 }
+    ...         bodies = [
+    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
+    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
+    ...         ]
+    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
+    ...         '''
+    ...     )
+    ... )
+    >>> ranges = [one.range_m for one in uwblink.stream(ports.names.values(), duration_s=1.0, using=ports)]
+    >>> all(abs(found - 3.0) < 1.0 for found in ranges)
+    True
+    """
+    _positive("duration_s", duration_s)
+    _positive("speed", speed)
+    path = calibration if callable(calibration) or calibration is None else Path(calibration)
+    correct = load_correction(path) if isinstance(path, Path) else path
+    if isinstance(source, str | os.PathLike):
+        return _play(_exchanges(Path(source), correct), correct, duration_s, speed, stop)
+    chosen, told, ports = plan or RangingPlan(), as_listeners(listeners), using or SerialPorts()
+    found = identify(source, ports)
+    turns = chosen.turns(sorted(found))
+
+    def begin(ranges: Listener) -> Recorder:
+        return Recorder(found, chosen, turns, [ranges, *told], ports=ports)
+
+    return _live(begin, correct, duration_s, stop)
+
+
+def _positive(name: str, value: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+        raise ArgumentError(f"found {value!r:.40}, expected a number above 0", parameter=name)
+
+
+class _Ranges(Listener):
+    """Collects the ranges of turns, with the times that a recording gives them: those of their polls."""
+
+    def __init__(self, correct: Correction | None) -> None:
+        self._correct = correct
+        self._came_ns: dict[int, int] = {}
+        self.found: deque[StreamedRange] = deque()
+
+    def on_message(self, heard: Heard) -> None:
+        if isinstance(heard.message, RangeReport):
+            self._came_ns[heard.board] = heard.time_ns
+
+    def on_turn(self, turn: Turn) -> None:
+        if turn.report is not None:
+            initiator = turn.pair[0]
+            came_ns = self._came_ns.get(initiator, turn.time_ns)
+            (time_ns,) = exchanges_of([(came_ns, initiator, turn.report)]).time_ns.tolist()
+            self.found.append(streamed(time_ns, initiator, turn.report, self._correct))
+
+
+def _live(
+    begin: Callable[[Listener], Recorder], correct: Correction | None, duration_s: float, stop: Callable[[], bool]
+) -> Stream:
+    ranges = _Ranges(correct)
+    recorder = begin(ranges)
+    try:
+        for _ in recorder.steps(duration_s, stop):
+            while ranges.found:
+                yield ranges.found.popleft()
+        recorder.finish()
+        yield from ranges.found
+    finally:
+        recorder.close()
+
+
+def _exchanges(path: Path, correct: Correction | None) -> Exchanges:
+    with Recording.open(path) as recording:
+        if correct and "calibration" in recording.meta():
+            raise ArgumentError(f"{path}: its ranges are corrected already; stream it without `calibration`")
+        found = recording.exchanges()
+    return found[np.argsort(found.time_ns, kind="stable")]
+
+
+def _play(
+    exchanges: Exchanges, correct: Correction | None, duration_s: float, speed: float, stop: Callable[[], bool]
+) -> Stream:
+    start_s = time.monotonic()
+    first_ns = int(exchanges.time_ns[0]) if len(exchanges) else 0
+    for start in range(0, len(exchanges), AT_A_TIME):
+        part = exchanges[start : start + AT_A_TIME]
+        rows = zip(part.time_ns.tolist(), part.initiator.tolist(), _reports(part), strict=True)
+        for time_ns, initiator, report in rows:
+            since_s = (time_ns - first_ns) * 1e-9
+            if since_s > duration_s or not _wait_until(start_s + since_s / speed, stop):
+                return
+            yield streamed(time_ns, initiator, report, correct)
+
+
+def _reports(exchanges: Exchanges) -> Iterable[RangeReport]:
+    """Return exchanges as the reports that boards would have sent."""
+    names = ("target", "range_m", *STAMPS, *LEVELS)
+    columns = (getattr(exchanges, name).tolist() for name in names)
+    return (RangeReport(*row) for row in zip(*columns, strict=True))
+
+
+def _wait_until(due_s: float, stop: Callable[[], bool]) -> bool:
+    """Wait for a time of the monotonic clock; returns whether nobody said to stop meanwhile."""
+    while (wait_s := due_s - time.monotonic()) > 0:
+        if stop():
+            return False
+        time.sleep(min(wait_s, LONGEST_SLEEP_S))
+    return not stop()
