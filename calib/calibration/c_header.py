@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
+import numpy as np
+
+from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration
+from calib.calibration.power_curves import Curve as PowerCurve
 from calib.calibration.runtime import PiecewiseCurve
 from calib.ranges import FAINTEST_DBM, LOUDEST_DBM
 
@@ -68,7 +72,52 @@ static int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, int ini
         *sigma_m = UWB_SIGMA(lifted);
     return lifted < UWB_LOWEST || lifted > UWB_HIGHEST;
 }
-#endif
+"""
+
+_ERRORS: Final = """
+/* What errors to expect of corrected ranges of two tags, reflections included: their standard deviation about their
+   mean, that mean (reflections make ranges long), in metres, and the share of them that are reflected. Returns 0; 2
+   where no power was measured (all are NaN). */
+static int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, int target, double *sigma_total_m,
+                      double *mean_error_m, double *tail_share)
+{
+    double lifted, part = 0.0, noise, detour, away, square;
+    int k = 0, pair = 0;
+    *sigma_total_m = *mean_error_m = *tail_share = NAN;
+    if (!uwb_measured(fpp1_dbm) && !uwb_measured(fpp2_dbm))
+        return 2;
+    if (!uwb_measured(fpp1_dbm))
+        fpp1_dbm = fpp2_dbm;
+    if (!uwb_measured(fpp2_dbm))
+        fpp2_dbm = fpp1_dbm;
+    lifted = UWB_LIFT_OF_MEAN ? uwb_lift((fpp1_dbm + fpp2_dbm) / 2.0)
+                              : (uwb_lift(fpp1_dbm) + uwb_lift(fpp2_dbm)) / 2.0;
+    while (k + 2 < UWB_ERROR_POWERS && lifted >= uwb_error_lifted[k + 1])
+        k++;
+    part = (lifted - uwb_error_lifted[k]) / (uwb_error_lifted[k + 1] - uwb_error_lifted[k]);
+    part = part < 0.0 ? 0.0 : part > 1.0 ? 1.0 : part;
+    /* The last row is that of a pair that was not there when the calibration was made. */
+    while (pair < UWB_ERROR_PAIRS && !((uwb_error_pair[pair][0] == initiator && uwb_error_pair[pair][1] == target) ||
+                                       (uwb_error_pair[pair][0] == target && uwb_error_pair[pair][1] == initiator)))
+        pair++;
+    noise = exp(uwb_error_log_noise[k] + part * (uwb_error_log_noise[k + 1] - uwb_error_log_noise[k]) +
+                uwb_error_factor[pair][0]);
+    *tail_share = 1.0 / (1.0 + exp(-uwb_error_log_odds[k] - part * (uwb_error_log_odds[k + 1] - uwb_error_log_odds[k]) -
+                                   uwb_error_factor[pair][1]));
+    detour = uwb_error_factor[pair][2];
+    *mean_error_m = (1.0 - UWB_OUTLIER_SHARE) * *tail_share * (UWB_LEAST_M + detour);
+    square = (1.0 - UWB_OUTLIER_SHARE) *
+                 (noise * noise +
+                  *tail_share * (UWB_LEAST_M * UWB_LEAST_M + 2.0 * UWB_LEAST_M * detour + 2.0 * detour * detour)) +
+             UWB_OUTLIER_SHARE * UWB_OUTLIER_M * UWB_OUTLIER_M - *mean_error_m * *mean_error_m;
+    /* Where the curve of bias is held constant, a range may be off by what it would go on by. */
+    away = lifted < UWB_LOWEST    ? (UWB_LOWEST - lifted) * UWB_SLOPE_BELOW
+           : lifted > UWB_HIGHEST ? (lifted - UWB_HIGHEST) * UWB_SLOPE_ABOVE
+                                  : 0.0;
+    *sigma_total_m = sqrt(UWB_ERROR_SCALE * UWB_ERROR_SCALE * square + away * away);
+    *mean_error_m += UWB_ERROR_LOCATION_M;
+    return 0;
+}
 """
 
 
@@ -96,7 +145,42 @@ def c_header(calibration: Calibration) -> str:
         *_curve("bias", PiecewiseCurve(bias)),
         *_curve("sigma", PiecewiseCurve(calibration.sigma_curve)),
     ]
-    return "\n".join(lines) + _CODE
+    text = "\n".join(lines) + _CODE
+    if calibration.errors:
+        text += "\n" + "\n".join(_error_tables(calibration.errors, bias)) + _ERRORS
+    return text + "#endif\n"
+
+
+def _error_tables(model: ErrorModel, bias: PowerCurve) -> list[str]:
+    slopes = bias.beyond(np.array([bias.range[0] - 1, bias.range[1] + 1]))
+    odds = np.array(model.tail_share) / (1 - np.array(model.tail_share))
+    numbers = {
+        "LEAST_M": model.least_m,
+        "OUTLIER_SHARE": model.outlier_share,
+        "OUTLIER_M": model.outlier_m,
+        "ERROR_SCALE": model.scale,
+        "ERROR_LOCATION_M": model.location_m,
+        "SLOPE_BELOW": slopes[0],
+        "SLOPE_ABOVE": slopes[1],
+    }
+    rows = {
+        "lifted": model.lifted,
+        "log_noise": np.log(model.noise_m).tolist(),
+        "log_odds": np.log(odds).tolist(),
+    }
+    ends = [name.split("-") for name in model.pairs] + [["-1", "-1"]]
+    factors = [(np.log(p.noise), np.log(p.odds), p.detour * model.detour_m) for p in model.pairs.values()]
+    return [
+        f"#define UWB_ERROR_POWERS {len(model.lifted)}",
+        f"#define UWB_ERROR_PAIRS {len(model.pairs)}",
+        *(f"#define UWB_{name} {_number(value)}" for name, value in numbers.items()),
+        *(f"static const double uwb_error_{name}[] = {{{_numbers(row)}}};" for name, row in rows.items()),
+        f"static const int uwb_error_pair[][2] = {{{', '.join(f'{{{a}, {b}}}' for a, b in ends)}}};",
+        "/* Logarithms of the factors on noise and odds of a reflection, and the mean detour in metres. */",
+        "static const double uwb_error_factor[][3] = {",
+        *(f"    {{{_numbers(row)}}}," for row in [*factors, (0.0, 0.0, model.detour_m)]),
+        "};",
+    ]
 
 
 def _curve(name: str, curve: PiecewiseCurve) -> list[str]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+import numpy as np
+
 from calib.calibration.c_header import c_header
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
@@ -125,7 +127,30 @@ def _ros_yaml(calibration: Calibration, base: Programmed | None = None) -> str:
             f"    coefficients: {json.dumps(list(curve.coefficients))}",
             f"    range: {json.dumps(list(curve.range))}",
         ]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_error_lines(calibration)]) + "\n"
+
+
+def _error_lines(calibration: Calibration) -> list[str]:
+    """Return what errors to expect, by pair and power, as tables to interpolate in; nothing where it is not known."""
+    model = calibration.errors
+    if model is None:
+        return []
+    lifted = np.array(model.lifted)
+    lines = ["  errors:", f"    lifted: {json.dumps(list(model.lifted))}", "    pairs:"]
+    for name in [*model.pairs, "other"]:
+        ends = [0, 0] if name == "other" else [int(end) for end in name.split("-")]
+        first, second = (np.full(len(lifted), end) for end in ends)
+        shapes = model.shapes(lifted, first, second)
+        low, high = model.quantiles((0.025, 0.975), lifted, first, second).T
+        rows = {
+            "sigma_total_m": model.total_m(shapes),
+            "mean_error_m": model.mean_m(shapes),
+            "tail_share": shapes.tail_share,
+            "low95_m": low,
+            "high95_m": high,
+        }
+        lines += [f"      '{name}':", *(f"        {key}: {json.dumps(row.tolist())}" for key, row in rows.items())]
+    return lines
 
 
 def _json(calibration: Calibration, _base: Programmed | None = None) -> str:

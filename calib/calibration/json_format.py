@@ -31,7 +31,8 @@ class Reader:
             raise BadInputError(f"{self._where}: {key}: missing")
         return self._table[key]
 
-    def _wrong(self, key: str, expected: str) -> BadInputError:
+    def wrong(self, key: str, expected: str) -> BadInputError:
+        """Return the error that says what stands at a key, and what was expected."""
         found = repr(self._table[key])
         return BadInputError(f"{self._where}: {key}: found {found[:60]}, expected {expected}")
 
@@ -39,21 +40,21 @@ class Reader:
         """Return a finite number."""
         value = self._value(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self._wrong(key, "a finite number")
+            raise self.wrong(key, "a finite number")
         return float(value)
 
     def word(self, key: str) -> str:
         """Return a text."""
         value = self._value(key)
         if not isinstance(value, str):
-            raise self._wrong(key, "text")
+            raise self.wrong(key, "text")
         return value
 
     def table(self, key: str) -> dict[str, Any]:
         """Return a table."""
         value = self._value(key)
         if not isinstance(value, dict):
-            raise self._wrong(key, "a table")
+            raise self.wrong(key, "a table")
         return value
 
     def delays(self, key: str, missing: float | None = None) -> dict[int, float]:
@@ -61,7 +62,7 @@ class Reader:
         table = self.table(key)
         inner = Reader(table, f"{self._where}: {key}")
         if not all(tag.isdecimal() and tag.isascii() for tag in table):
-            raise self._wrong(key, "tag ids as keys")
+            raise self.wrong(key, "tag ids as keys")
         return {
             int(tag): missing if value is None and missing is not None else inner.number(tag)
             for tag, value in table.items()
@@ -71,20 +72,28 @@ class Reader:
         """Return rows of numbers, as many as there are in each."""
         value = self._value(key)
         if not isinstance(value, list) or len(value) != size:
-            raise self._wrong(key, f"{size} rows")
+            raise self.wrong(key, f"{size} rows")
         inner = Reader({str(k): row for k, row in enumerate(value)}, f"{self._where}: {key}")
         rows = tuple(inner.numbers(str(k)) for k in range(size))
         if any(len(row) != size for row in rows):
-            raise self._wrong(key, f"{size} numbers a row")
+            raise self.wrong(key, f"{size} numbers a row")
         return rows
 
     def numbers(self, key: str) -> tuple[float, ...]:
         """Return a list of finite numbers."""
         value = self._value(key)
         if not isinstance(value, list) or not value:
-            raise self._wrong(key, "a list of numbers")
+            raise self.wrong(key, "a list of numbers")
         inner = Reader({str(k): v for k, v in enumerate(value)}, f"{self._where}: {key}")
         return tuple(inner.number(str(k)) for k in range(len(value)))
+
+    def couples(self, key: str) -> tuple[tuple[float, float], ...]:
+        """Return a list of two numbers each, which may be empty."""
+        value = self._value(key)
+        if not isinstance(value, list) or any(not isinstance(row, list) or len(row) != 2 for row in value):
+            raise self.wrong(key, "a list of two numbers each")
+        inner = Reader({str(k): row for k, row in enumerate(value)}, f"{self._where}: {key}")
+        return tuple((row[0], row[1]) for row in (inner.numbers(str(k)) for k in range(len(value))))
 
     def curve(self, key: str) -> Curve:
         """Return a curve whose parts fit each other."""

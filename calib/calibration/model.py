@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final, Literal, Self, overload
@@ -14,10 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.calibration.display import as_html, as_text
+from calib.calibration.error_model import ErrorModel, read_errors
 from calib.calibration.json_format import Matrix, Reader
 from calib.calibration.power_curves import LIFTS, Curve, basis, ends, lift, lifted_power
 from calib.calibration.runtime import CorrectedColumns, CorrectedRange, RangeCorrector
-from calib.errors import BadInputError
+from calib.errors import BadInputError, UnanswerableError
 from calib.ranges import HALVES, Ranges
 from uwblink.arrays import Bools, Floats
 from uwblink.display import as_text as table_text
@@ -33,14 +35,23 @@ RECEPTION_VERSION: Final = 3
 
 VERSIONS: Final = (SCHEMA_VERSION, GROUPED_VERSION, RECEPTION_VERSION)
 POWER_AT: Final = ("exchange", "reception")
+OUTLIER: Final = 0.5
+"""Probability above which a range of known error is marked as an outlier."""
+
 SCALAR: Final = (float, int, np.generic)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CorrectedRanges:
     """Ranges in three stages, metres, and what is known of them, shape (n,).
 
-    `clamped` marks lifted powers at which the curves had no data and are held constant.
+    `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all of them, reflected ones
+    included, about a mean of `mean_error_m`; `tail_share` is how many such ranges of this pair at this power are
+    reflected. `tail_probability` is the same after a look at the range itself, where its true distance is known, and
+    `outlier` marks what is then neither noise nor a reflection; elsewhere it equals `tail_share`, and nothing is
+    marked. `clamped` marks lifted powers at which the curves had no data and are held constant; `sigma_total_m` grows
+    there by what they would go on by. All but `sigma_m` and `clamped` are NaN where a calibration does not say what
+    errors are made of (`Calibration.errors`), and without a power.
 
     >>> import calib
     >>> flight = calib.load_ranges(calib.sample_flight())
@@ -55,6 +66,11 @@ class CorrectedRanges:
     sigma_m: Floats
     lifted: Floats
     clamped: Bools
+    sigma_total_m: Floats
+    mean_error_m: Floats
+    tail_share: Floats
+    tail_probability: Floats
+    outlier: Bools
 
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""
@@ -91,7 +107,8 @@ class Calibration:
     A standard error is infinite where the data did not determine the delay. `power_at` says where the bias curve is
     taken: "exchange", at the lifted power of an exchange as `lift` makes it of two; or "reception", at each of the two
     powers, half of either in a range, as curves are published that correct single stamps. With `groups`, each has its
-    own curves, and the plain ones are the groups' average, for a look only.
+    own curves, and the plain ones are the groups' average, for a look only. `errors` says what the errors of corrected
+    ranges are made of, by pair and power; None where that is not known, as in older and in imported calibrations.
     """
 
     delays_ns: dict[int, float]
@@ -107,6 +124,7 @@ class Calibration:
     uncertainty: Uncertainty | None = None
     groups: dict[str, TagGroup] = field(default_factory=dict)
     power_at: str = "exchange"
+    errors: ErrorModel | None = None
     _corrector: RangeCorrector | None = field(default=None, init=False, compare=False)
 
     def __repr__(self) -> str:
@@ -142,14 +160,54 @@ class Calibration:
         flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
         delays = ranges.raw_m + self.speed_of_light * flight
         lifted = self.lifted(ranges)
+        corrected = delays - self._bias_of(ranges, lifted)
         return CorrectedRanges(
             raw_m=ranges.raw_m,
             delay_corrected_m=delays,
-            corrected_m=delays - self._bias_of(ranges, lifted),
+            corrected_m=corrected,
             sigma_m=self._curve_of(ranges, lifted, "sigma_curve"),
             lifted=lifted,
             clamped=~self.bias_curve.inside(lifted),
+            **self._errors_of(ranges, lifted, corrected - ranges.truth_m),
         )
+
+    def _errors_of(self, ranges: Ranges, lifted: Floats, error_m: Floats) -> dict[str, Any]:
+        """Return what is known of the errors of ranges (n,), by the names of `CorrectedRanges`."""
+        if self.errors is None:
+            nothing = np.full(len(ranges), np.nan)
+            names = ("sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
+            return dict.fromkeys(names, nothing) | {"outlier": np.zeros(len(ranges), dtype=bool)}
+        shapes = self.errors.shapes(lifted, ranges.initiator, ranges.target)
+        looked_at = np.isfinite(error_m)
+        tail, outlier = self.errors.tail_given(np.where(looked_at, error_m, 0.0), shapes)
+        return {
+            "sigma_total_m": np.hypot(self.errors.total_m(shapes), self.bias_curve.beyond(lifted)),
+            "mean_error_m": self.errors.mean_m(shapes),
+            "tail_share": shapes.tail_share,
+            "tail_probability": np.where(looked_at, tail, shapes.tail_share),
+            "outlier": looked_at & (outlier > OUTLIER),
+        }
+
+    def quantiles(self, ranges: Ranges, shares: Sequence[float] = (0.025, 0.975)) -> Floats:
+        """Return the errors (n, k), in metres, below which shares (k,) of the errors of such corrected ranges lie.
+
+        By pair and power; the truth lies with 95 % between a corrected range less its 97.5 % and less its 2.5 %
+        quantile. NaN without a power. Raises `UnanswerableError` for a calibration without `errors`, `BadInputError`
+        for shares that are not between 0 and 1.
+
+        >>> import calib
+        >>> known = calib.fit(calib.sample_flight()).calibration
+        >>> calib.load_ranges(calib.sample_flight(seed=2))[:2]
+        <Ranges of memory: 2 of tags 1, 2, 3>
+        >>> known.quantiles(calib.load_ranges(calib.sample_flight(seed=2))[:2], [0.5]).shape
+        (2, 1)
+        """
+        if self.errors is None:
+            raise UnanswerableError("the calibration does not say what errors are made of; fit anew from a recording")
+        lifted = self.lifted(ranges)
+        found = self.errors.quantiles(shares, lifted, ranges.initiator, ranges.target)
+        total = self.errors.total_m(self.errors.shapes(lifted, ranges.initiator, ranges.target))
+        return np.asarray(found * np.hypot(1, self.bias_curve.beyond(lifted) / total)[:, None])
 
     @overload
     def correct(
@@ -185,7 +243,7 @@ class Calibration:
         *,
         weights: tuple[Any, Any] = HALVES,
     ) -> CorrectedRange | CorrectedColumns:
-        """Correct one range, or arrays of them (n,): the corrected range and its standard deviation, in metres.
+        """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
 
         `range_m` is as the board gives it, powers are in dBm, NaN or 0 where a board has none. One range takes a few
         microseconds, for a robot's loop. `weights` are those of the two delays (`uwblink.twr.delay_weights`); halves
@@ -207,7 +265,13 @@ class Calibration:
         applied = self.apply(ranges)
         powered = np.isfinite(applied.lifted)
         corrected = np.where(powered, applied.corrected_m, applied.delay_corrected_m)
-        return CorrectedColumns(corrected, np.where(powered, applied.sigma_m, np.nan), applied.clamped)
+        return CorrectedColumns(
+            corrected,
+            np.where(powered, applied.sigma_m, np.nan),
+            applied.clamped,
+            applied.sigma_total_m,
+            applied.tail_share,
+        )
 
     def _one(self) -> RangeCorrector:
         """Return the corrector of single ranges, made when it is first asked for."""
@@ -273,6 +337,8 @@ class Calibration:
                 }
                 for name, group in self.groups.items()
             }
+        if self.errors:
+            document["errors"] = self.errors.to_dict()
         if self.uncertainty:
             document["uncertainty"] = asdict(self.uncertainty)
         return _rows_on_lines(json.dumps(document, indent=1, allow_nan=False)) + "\n"
@@ -317,6 +383,7 @@ class Calibration:
             uncertainty=_uncertainty(read),
             groups=_groups(read),
             power_at=power_at,
+            errors=read_errors(read.inside("errors")) if read.has("errors") else None,
         )
 
 

@@ -19,6 +19,9 @@ SIGMA_BINS: Final = 30
 SIGMA_FLOOR_M: Final = 0.002
 """A tick is 4.7 mm long; no range is better than half of one."""
 
+END_PART: Final = 0.1
+"""Part of its range at either end from which a curve's slope there is taken."""
+
 POPULATED: Final = (0.005, 0.995)
 """Quantiles of lifted power between which a curve is fitted; beyond them it is held constant."""
 
@@ -73,6 +76,18 @@ class Curve:
     def inside(self, lifted: Floats) -> Bools:
         """Return which lifted powers (n,) the curve was fitted at."""
         return (lifted >= self.range[0]) & (lifted <= self.range[1])
+
+    def beyond(self, lifted: Floats) -> Floats:
+        """Return by how much the curve would go on (n,) where it is held constant, straight on from its ends, metres.
+
+        Zero at powers that it was fitted at. It is what a range there may be off by.
+        """
+        low, high = self.range
+        step = END_PART * (high - low)
+        ends = self(np.array([low, low + step, high - step, high]))
+        below, above = (ends[1] - ends[0]) / step, (ends[3] - ends[2]) / step
+        away = np.abs(below) * np.maximum(low - lifted, 0.0) + np.abs(above) * np.maximum(lifted - high, 0.0)
+        return np.asarray(away)
 
 
 def populated(ordered: Floats) -> tuple[float, float]:

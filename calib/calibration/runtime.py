@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from calib.calibration.error_model import ErrorsAtOnce
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from calib.ranges import FAINTEST_DBM, LOUDEST_DBM
@@ -28,12 +29,16 @@ NEPERS_A_DB: Final = math.log(10) / 10
 class CorrectedRange(NamedTuple):
     """A corrected range and its standard deviation, metres; `clamped` where its power is beyond the curves'.
 
-    Without a power at either end the range has the delays' part only, and its standard deviation is NaN.
+    `sigma_m` is the noise of a direct range; `sigma_total_m` counts reflections in, of which `tail_share` of the ranges
+    of this pair at this power are, both NaN where the calibration does not say. Without a power at either end the range
+    has the delays' part only, and its standard deviations are NaN.
     """
 
     range_m: float
     sigma_m: float
     clamped: bool
+    sigma_total_m: float
+    tail_share: float
 
 
 class CorrectedColumns(NamedTuple):
@@ -42,6 +47,8 @@ class CorrectedColumns(NamedTuple):
     range_m: Floats
     sigma_m: Floats
     clamped: Bools
+    sigma_total_m: Floats
+    tail_share: Floats
 
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""
@@ -104,6 +111,7 @@ class RangeCorrector:
             name: (PiecewiseCurve(group.bias_curve), PiecewiseCurve(group.sigma_curve))
             for name, group in calibration.groups.items()
         }
+        self._errors = calibration.errors and ErrorsAtOnce(calibration.errors, calibration.bias_curve)
         self._member = {tag: groups[name] for name, group in calibration.groups.items() for tag in group.tags}
 
     def __call__(
@@ -122,17 +130,21 @@ class RangeCorrector:
             raise self._unknown(error.args[0]) from None
         lifted = self._lifted(fpp1_dbm, fpp2_dbm)
         if lifted != lifted:
-            return CorrectedRange(corrected, math.nan, True)
+            return CorrectedRange(corrected, math.nan, True, math.nan, math.nan)
         bias, sigma = self._plain
         clamped = not bias.low <= lifted <= bias.high
+        errors = self._errors(lifted, initiator, target) if self._errors else (math.nan, math.nan)
         if not self._member:
-            return CorrectedRange(corrected - self._bias(bias, lifted, fpp1_dbm, fpp2_dbm), sigma(lifted), clamped)
+            return CorrectedRange(
+                corrected - self._bias(bias, lifted, fpp1_dbm, fpp2_dbm), sigma(lifted), clamped, *errors
+            )
         try:
             first, second = self._member[initiator], self._member[target]
         except KeyError as error:
             raise BadInputError(f"tag {error.args[0]} is in none of the calibration's groups of tags") from None
         mean = 0.5 * sum(self._bias(curves[0], lifted, fpp1_dbm, fpp2_dbm) for curves in (first, second))
-        return CorrectedRange(corrected - mean, 0.5 * first[1](lifted) + 0.5 * second[1](lifted), clamped)
+        both = 0.5 * first[1](lifted) + 0.5 * second[1](lifted)
+        return CorrectedRange(corrected - mean, both, clamped, *errors)
 
     def _bias(self, curve: PiecewiseCurve, lifted: float, first: float, second: float) -> float:
         """Return the bias at the power of the exchange, or the mean of those at its two receptions'."""

@@ -17,7 +17,11 @@ SHORT = {"raw": "raw", "delays": "delay", "full": "full"}
 
 
 def print_table(evaluation: Evaluation, console: Console) -> None:
-    """Print errors in centimetres, a row a pair and one for all; last, the share in % that chi-square rejects."""
+    """Print errors in centimetres, a row a pair and one for all.
+
+    Last, the share in % that chi-square rejects, the spread of errors over the total sigma, and how many of them lie
+    between the quantiles for 95 %.
+    """
     table = Table(
         title="Range error in cm", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
@@ -27,6 +31,8 @@ def print_table(evaluation: Evaluation, console: Console) -> None:
         for what in ("mean", "std", "rob."):
             table.add_column(f"{SHORT[stage]}\n{what}", justify="right", no_wrap=True)
     table.add_column("chi2\nout%", justify="right", no_wrap=True)
+    for what in ("total\nz std", "in\n95%"):
+        table.add_column(what, justify="right", no_wrap=True)
     for name, group in evaluation.pairs.items():
         table.add_row(name, *_cells(group))
     table.add_section()
@@ -46,6 +52,12 @@ def remarks(evaluation: Evaluation) -> Iterator[str]:
     )
     covered = ", ".join(f"{100 * share:.1f} % for {name} %" for name, share in group.coverage.items())
     yield f"sigma covers {covered}"
+    if group.total_std == group.total_std:
+        yield (
+            f"with reflections, of which {100 * group.tail_share:.1f} % are expected: errors over the total sigma have "
+            f"a standard deviation of {group.total_std:.2f}, and {100 * group.inside_95:.1f} % lie between their "
+            "quantiles for 95 %"
+        )
     planted = evaluation.planted
     if planted:
         rms = (sum(d**2 for d in planted.delay_error_ns.values()) / len(planted.delay_error_ns)) ** 0.5
@@ -61,4 +73,8 @@ def _cells(group: ErrorStatistics) -> list[str]:
         stats = getattr(group, stage)
         figures = (stats.mean_m, stats.std_m, stats.robust_std_m)
         cells += [f"{100 * figure:.1f}" for figure in figures]
-    return [*cells, f"{100 * group.rejected:.1f}"]
+    return [*cells, f"{100 * group.rejected:.1f}", _known(group.total_std, "{:.2f}"), _known(100 * group.inside_95)]
+
+
+def _known(value: float, form: str = "{:.1f}") -> str:
+    return form.format(value) if value == value else "-"

@@ -25,6 +25,7 @@ from calib.calibration.power_curves import lift as lift_power
 from calib.estimation.arguments import check_fit
 from calib.estimation.doubts import doubts
 from calib.estimation.error_mixture import fit_error_mixture
+from calib.estimation.error_model import error_model
 from calib.estimation.losses import MIXTURE
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible
 from calib.estimation.problem import Problem, build_problem
@@ -200,6 +201,7 @@ def _calibration(
             tuple(problem.tags), _rows(covariance), _rows(_bias_covariance(problem, found)), _rows(sigma.covariance)
         ),
         groups={name: TagGroup(tuple(tags), biases[name], sigma.curves[name]) for name, tags in groups.items()},
+        errors=error_model(problem, found.residuals, found.mixture),
     )
 
 

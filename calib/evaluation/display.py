@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from calib.evaluation.statistics import ErrorStatistics, Evaluation
 
-HEADER: Final = ("pair", "n", "raw", "std", "delays", "std", "full", "std", "sigma's 95 % holds")
+HEADER: Final = ("pair", "n", "raw", "std", "delays", "std", "full", "std", "total z", "95 % holds")
 TITLE: Final = "Range errors in cm: mean and robust standard deviation, raw, with delays and fully corrected"
 MOST_PAIRS: Final = 40
 
@@ -36,4 +36,6 @@ def _cells(group: ErrorStatistics) -> tuple[str, ...]:
     cells = [str(group.raw.n)]
     for stats in (group.raw, group.delays, group.full):
         cells += [f"{100 * stats.mean_m:+.1f}", f"{100 * stats.robust_std_m:.1f}"]
-    return (*cells, f"{100 * group.coverage['95']:.0f} %")
+    if group.total_std != group.total_std:
+        return (*cells, "-", f"{100 * group.coverage['95']:.0f} %")
+    return (*cells, f"{group.total_std:.2f}", f"{100 * group.inside_95:.0f} %")

@@ -56,6 +56,11 @@ class ErrorStatistics:
     chi-square times sigma squared, `accepted` the statistics of the others. `rejected_raw` is the same share of raw
     errors with the variance that all of them have, which is what there is without a calibration. `coverage` maps a
     nominal share of a normal distribution to the share of corrected errors within its bounds.
+
+    With all that errors are made of: `total_mean` and `total_std` are mean and standard deviation of errors, less the
+    mean that is expected of them, over `sigma_total_m` (0 and 1 if right); `inside_95` is the share between the 2.5 and
+    97.5 % quantiles by pair and power, `tail_share` how many of the ranges should be reflected. NaN where the
+    calibration does not say.
     """
 
     raw: Stats
@@ -66,6 +71,10 @@ class ErrorStatistics:
     accepted: Stats
     coverage: dict[str, float]
     clamped: float
+    total_mean: float
+    total_std: float
+    inside_95: float
+    tail_share: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,9 +140,10 @@ def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluatio
     ranges = load_ranges(data)
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
+    inside = _between_quantiles(ranges, applied, calibration)
     return Evaluation(
-        _group(ranges, applied, everything),
-        {name: _group(ranges, applied, rows) for name, rows in pair_rows(ranges).items()},
+        _group(ranges, applied, everything, inside),
+        {name: _group(ranges, applied, rows, inside) for name, rows in pair_rows(ranges).items()},
         beside_planted(ranges, applied, calibration),
     )
 
@@ -198,12 +208,22 @@ def statistics(error_m: Floats) -> Stats:
     )
 
 
-def _group(ranges: Ranges, applied: CorrectedRanges, rows: Bools) -> ErrorStatistics:
+def _between_quantiles(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> Floats:
+    """Return 1 where an error (n,) lies between the quantiles that hold 95 %, else 0; NaN where they are not known."""
+    if calibration.errors is None:
+        return np.full(len(ranges), np.nan)
+    low, high = calibration.quantiles(ranges, (0.025, 0.975)).T
+    error = applied.corrected_m - ranges.truth_m
+    return np.asarray((error > low) & (error < high), dtype=np.float64)
+
+
+def _group(ranges: Ranges, applied: CorrectedRanges, rows: Bools, inside: Floats) -> ErrorStatistics:
     truth = ranges.truth_m[rows]
     errors = {name: getattr(applied, field)[rows] - truth for name, field in CORRECTION_STAGES.items()}
     z = np.abs(errors["full"]) / applied.sigma_m[rows]
     outside = z**2 > CHI_SQUARE_95
     variance = float(np.var(applied.raw_m - ranges.truth_m))
+    total = (errors["full"] - applied.mean_error_m[rows]) / applied.sigma_total_m[rows]
     return ErrorStatistics(
         **{name: statistics(error) for name, error in errors.items()},
         rejected_raw=float(np.mean(errors["raw"] ** 2 > CHI_SQUARE_95 * variance)),
@@ -211,4 +231,8 @@ def _group(ranges: Ranges, applied: CorrectedRanges, rows: Bools) -> ErrorStatis
         accepted=statistics(errors["full"][~outside]),
         coverage={name: float(np.mean(z <= bound)) for name, bound in NOMINAL.items()},
         clamped=float(np.mean(applied.clamped[rows])),
+        total_mean=float(np.mean(total)),
+        total_std=float(np.std(total)),
+        inside_95=float(np.mean(inside[rows])),
+        tail_share=float(np.mean(applied.tail_share[rows])),
     )

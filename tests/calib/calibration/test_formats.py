@@ -62,11 +62,12 @@ MAIN = """
 #include "calibration.h"
 int main(void)
 {
-    double range, one, two, corrected = 0, sigma = 0;
+    double range, one, two, corrected = 0, sigma = 0, total, mean, share;
     int initiator, target;
     while (scanf("%lf %lf %lf %d %d", &range, &one, &two, &initiator, &target) == 5) {
         int status = uwb_correct(range, one, two, initiator, target, &corrected, &sigma);
-        printf("%d %.17g %.17g\\n", status, corrected, sigma);
+        (void)uwb_errors(one, two, initiator, target, &total, &mean, &share);
+        printf("%d %.17g %.17g %.17g %.17g %.17g\\n", status, corrected, sigma, total, share, mean);
     }
     return 0;
 }
@@ -78,13 +79,14 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         pytest.skip("no C compiler on this machine")
-    known = replace(fitted, delays_ns=DELAYS_NS, **change)
+    # A tag that was not there when the fit was made has pairs that nothing is known of.
+    known = replace(fitted, delays_ns=DELAYS_NS | {50: 0.1}, **change)
     calib.export(known, "c-header", tmp_path / "calibration.h")
     (tmp_path / "main.c").write_text(MAIN)
     strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
     subprocess.run([compiler, *strict, "main.c", "-o", "main", "-lm"], cwd=tmp_path, check=True)
     random = np.random.default_rng(8)
-    tags = sorted(DELAYS_NS)
+    tags = sorted(known.delays_ns)
     rows = [
         (float(r), float(a), float(b), *map(int, random.choice(tags, 2, replace=False)))
         for r, a, b in zip(random.uniform(0, 50, 500), *random.uniform(-110, -70, (2, 500)), strict=True)
@@ -95,11 +97,18 @@ def test_the_c_header_corrects_as_python_does(tmp_path, fitted, change):
     done = subprocess.run(["./main"], cwd=tmp_path, input=lines, capture_output=True, text=True, check=True)
     found = [line.split() for line in done.stdout.splitlines()]
     assert len(found) == len(rows) + 1
-    for row, (status, corrected, sigma) in zip(rows, found, strict=False):
+    for row, (status, corrected, sigma, total, share, mean) in zip(rows, found, strict=False):
         expected = known.correct(*row)
+        columns = known.apply(
+            Ranges.from_arrays(row[0], initiator=row[3], target=row[4], fpp1_dbm=row[1], fpp2_dbm=row[2])
+        )
+        assert float(total) == pytest.approx(expected.sigma_total_m, abs=1e-12, nan_ok=True)
+        assert float(share) == pytest.approx(expected.tail_share, abs=1e-12, nan_ok=True)
+        assert float(mean) == pytest.approx(columns.mean_error_m[0], abs=1e-12, nan_ok=True)
         assert float(corrected) == pytest.approx(expected.range_m, abs=1e-12)
         assert float(sigma) == pytest.approx(expected.sigma_m, abs=1e-12, nan_ok=True)
         assert (status != "0") == expected.clamped
+    assert len({share for *_, share, _ in found}) > 100, "shares differ by pair and power"
     assert {status for status, *_ in found} == {"0", "1", "2", "-1"}
     assert found[-1][0] == "-1"
 

@@ -29,6 +29,7 @@ def test_the_file_has_the_documented_keys(fitted):
     assert {
         "schema_version", "delays_ns", "delays_std_ns", "loss", "scale_ns", "lift", "alpha_dbm", "speed_of_light",
         "bias_curve", "sigma_curve", "provenance", "uncertainty",
+        "errors",
     } == set(document)  # fmt: skip
     assert set(document["bias_curve"]) == {"knots", "coefficients", "degree", "range"} == set(document["sigma_curve"])
     assert document["loss"] == "mixture"

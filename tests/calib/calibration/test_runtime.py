@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration, TagGroup
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
@@ -22,6 +23,22 @@ def curve(rng, low_m):
     count = len(knots) - degree - 1
     low, high = sorted(rng.uniform(0.02, 3.5, 2))
     return Curve(knots, tuple(rng.uniform(low_m, 0.3, count)), degree, (float(low), float(high)))
+
+
+def random_errors(rng):
+    """Return what errors are made of: some pairs have factors, others have what is common."""
+    return ErrorModel(
+        lifted=tuple(np.sort(rng.uniform(0.02, 3.5, 5)).tolist()),
+        noise_m=tuple(rng.uniform(0.01, 0.1, 5).tolist()),
+        tail_share=tuple(rng.uniform(0.01, 0.6, 5).tolist()),
+        least_m=0.05,
+        detour_m=0.3,
+        outlier_share=0.001,
+        outlier_m=1.0,
+        location_m=0.01,
+        scale=1.03,
+        pairs={"1-2": PairErrors(1.2, 3.0, 0.5), "5-40": PairErrors(0.8, 0.2, 2.0)},
+    )
 
 
 def random_calibration(seed):
@@ -43,6 +60,7 @@ def random_calibration(seed):
         bias_curve=curve(rng, -0.2),
         sigma_curve=curve(rng, 0.01),
         groups=groups,
+        errors=random_errors(rng) if seed % 3 else None,
     )
 
 
@@ -74,7 +92,10 @@ def test_one_by_one_equals_apply(seed):
         one = known.correct(measured[k], power[0, k], power[1, k], int(pair[k, 0]), int(pair[k, 1]), weights=weights)
         assert one.range_m == pytest.approx(expected[k], abs=1e-9)
         assert one.clamped == applied.clamped[k]
+        assert one.sigma_total_m == pytest.approx(applied.sigma_total_m[k], abs=1e-9, nan_ok=True)
+        assert one.tail_share == pytest.approx(applied.tail_share[k], abs=1e-9, nan_ok=True)
         if powered[k]:
+            assert math.isfinite(one.sigma_total_m) == (known.errors is not None)
             assert one.sigma_m == pytest.approx(applied.sigma_m[k], abs=1e-9)
         else:
             assert math.isnan(one.sigma_m)
@@ -88,7 +109,7 @@ def test_numbers_of_any_kind_and_mixtures_with_arrays():
     plain = known.correct(3.0, -85.0, -86.0, 1, 2)
     assert type(plain.range_m) is float
     numpy = known.correct(np.float64(3.0), np.float64(-85.0), -86, np.int64(1), np.uint16(2))
-    assert numpy == plain
+    np.testing.assert_array_equal(numpy, plain)
     mixed = known.correct(np.array([3.0, 4.0]), -85.0, -86.0, 1, [2, 5])
     assert mixed.range_m.shape == (2,)
     assert mixed.range_m[0] == pytest.approx(plain.range_m, abs=1e-12)

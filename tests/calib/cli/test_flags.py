@@ -28,6 +28,7 @@ ONLY_FROM_PYTHON = {
     "name",
     "before",
     "section",
+    "shares",
 }
 
 

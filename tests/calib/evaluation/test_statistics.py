@@ -114,7 +114,7 @@ def test_an_evaluation_prints_on_a_screen():
             f"{100 * value:{form}}"
             for stats in (everything.raw, everything.delays, everything.full)
             for value, form in ((stats.mean_m, "+.1f"), (stats.robust_std_m, ".1f"))
-        ), f"{100 * everything.coverage['95']:.0f}", "%",
+        ), f"{everything.total_std:.2f}", f"{100 * everything.inside_95:.0f}", "%",
     ]  # fmt: skip
     assert found._repr_html_().count("<tr>") == 8
     many = replace(found, pairs={f"{k}-{k + 1}": everything for k in range(100)})

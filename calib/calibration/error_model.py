@@ -1,0 +1,276 @@
+"""What the errors of corrected ranges are made of, by pair and power: core, reflections, outliers.
+
+An error is noise about `location_m`; with a tail share noise plus a detour, a least one and an exponential one; rarely
+an outlier. Noise and share are stated at some lifted powers, in logarithms and log odds straight between them, and each
+pair has factors on noise, odds and detour; a pair that was not there when the fit was made has what is common.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+
+from calib.calibration.json_format import Reader
+from calib.calibration.power_curves import Curve
+from calib.errors import BadInputError
+from uwblink.arrays import Floats, Ints
+
+BISECTIONS: Final = 50
+FARTHEST_SIGMAS: Final = 12.0
+FARTHEST_MEANS: Final = 25.0
+"""How far quantiles are searched for, in the largest noise and the longest mean detour."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairErrors:
+    """Factors of a pair of tags on what is common: noise, odds of a reflection, mean of the exponential detour."""
+
+    noise: float
+    odds: float
+    detour: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorShapes:
+    """Of each range (n,): noise of the core, share of reflections, mean of their exponential detour, metres."""
+
+    noise_m: Floats
+    tail_share: Floats
+    detour_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorModel:
+    """Core, tail and outliers of the errors of corrected ranges, metres and shares of 1.
+
+    `noise_m` and `tail_share` are those at `lifted` powers, for a pair that is not among `pairs` (named
+    "smaller-larger"). `levels` are shares of errors and the model's levels that these were found below while fitting:
+    what makes quantiles hold where the shape does not. `scale` does so for the total standard deviation.
+    """
+
+    lifted: tuple[float, ...]
+    noise_m: tuple[float, ...]
+    tail_share: tuple[float, ...]
+    least_m: float
+    detour_m: float
+    outlier_share: float
+    outlier_m: float
+    location_m: float = 0.0
+    scale: float = 1.0
+    levels: tuple[tuple[float, float], ...] = ()
+    pairs: dict[str, PairErrors] = field(default_factory=dict)
+
+    def shapes(self, lifted: Floats, initiator: Ints, target: Ints) -> ErrorShapes:
+        """Return the shape of the errors of ranges (n,) at lifted powers between two tags, whoever initiated."""
+        return self._shapes(lifted, self._factors[self._rows(initiator, target)])
+
+    def _shapes(self, lifted: Floats, factors: Floats) -> ErrorShapes:
+        """Return shapes at lifted powers (n,), from logarithms of factors (n, 3)."""
+        nodes, share = np.array(self.lifted), np.array(self.tail_share)
+        log_odds = np.interp(lifted, nodes, np.log(share / (1 - share))) + factors[:, 1]
+        return ErrorShapes(
+            noise_m=np.exp(np.interp(lifted, nodes, np.log(self.noise_m)) + factors[:, 0]),
+            tail_share=np.asarray(1 / (1 + np.exp(-log_odds))),
+            detour_m=self.detour_m * np.exp(factors[:, 2]),
+        )
+
+    def mean_m(self, shapes: ErrorShapes) -> Floats:
+        """Return the mean of the errors (n,): how much reflections add to a range on average."""
+        inside = 1 - self.outlier_share
+        return np.asarray(self.location_m + inside * shapes.tail_share * (self.least_m + shapes.detour_m))
+
+    def total_m(self, shapes: ErrorShapes) -> Floats:
+        """Return the standard deviation of the errors (n,) about their mean, reflections included."""
+        inside, share = 1 - self.outlier_share, shapes.tail_share
+        detour = self.least_m**2 + 2 * self.least_m * shapes.detour_m + 2 * shapes.detour_m**2
+        square = inside * (shapes.noise_m**2 + share * detour) + self.outlier_share * self.outlier_m**2
+        return np.asarray(self.scale * np.sqrt(square - (self.mean_m(shapes) - self.location_m) ** 2))
+
+    def below(self, error_m: Floats, shapes: ErrorShapes) -> Floats:
+        """Return the model's share of errors below some (n,)."""
+        from scipy.special import log_ndtr, ndtr
+
+        error = error_m - self.location_m
+        noise, share = shapes.noise_m, shapes.tail_share
+        away, ratio = (error - self.least_m) / noise, noise / shapes.detour_m
+        reflected = ndtr(away) - np.exp(np.minimum(ratio * (0.5 * ratio - away) + log_ndtr(away - ratio), 0.0))
+        inside = (1 - share) * ndtr(error / noise) + share * reflected
+        wild = ndtr(error / max(self.outlier_m, 1e-9))
+        return np.asarray((1 - self.outlier_share) * inside + self.outlier_share * wild)
+
+    def quantiles(self, probabilities: Sequence[float], lifted: Floats, initiator: Ints, target: Ints) -> Floats:
+        """Return the errors (n, k) that shares (k,) of errors lie below, for ranges (n,); NaN without a power.
+
+        They are taken at the model's powers for each pair, and are straight between them.
+        """
+        given = np.asarray(probabilities, dtype=np.float64)
+        if given.ndim != 1 or not len(given) or not np.all((given > 0) & (given < 1)):
+            raise BadInputError(f"found {probabilities!r:.60}, expected shares between 0 and 1", parameter="shares")
+        place, count = self._rows(initiator, target), len(self.pairs) + 1
+        nodes = np.tile(self.lifted, count)
+        tables = self._table(self._own_levels(given), nodes, np.repeat(np.arange(count), len(self.lifted)))
+        tables = tables.reshape(count, len(self.lifted), len(given))
+        found = np.empty((len(lifted), len(given)))
+        for pair in np.unique(place):
+            rows = place == pair
+            for k in range(len(given)):
+                found[rows, k] = np.interp(lifted[rows], self.lifted, tables[pair, :, k])
+        found[~np.isfinite(lifted)] = np.nan
+        return found
+
+    def tail_given(self, error_m: Floats, shapes: ErrorShapes) -> tuple[Floats, Floats]:
+        """Return the probabilities (n,) that ranges with known errors were reflected, and that they are outliers."""
+        from scipy.special import erfcx
+
+        error, noise = error_m - self.location_m, shapes.noise_m
+        z, away, ratio = error / noise, (error - self.least_m) / noise, noise / shapes.detour_m
+        inside = 1 - self.outlier_share
+        core = inside * (1 - shapes.tail_share) * np.exp(-0.5 * z**2) / (noise * np.sqrt(2 * np.pi))
+        at = away - ratio
+        near = 0.5 * np.exp(-0.5 * away**2) * erfcx(np.minimum(at, 30.0) / -np.sqrt(2))
+        tail = np.where(at < 5, near, np.exp(np.minimum(ratio * (0.5 * ratio - away), 50.0)))
+        tail = inside * shapes.tail_share * tail / shapes.detour_m
+        wide = max(self.outlier_m, 1e-9)
+        wild = self.outlier_share * np.exp(-0.5 * (error / wide) ** 2) / (wide * np.sqrt(2 * np.pi))
+        total = core + tail + wild
+        # Nothing else reaches where all three are zero.
+        nothing = total <= 0
+        total = np.where(nothing, 1.0, total)
+        return np.asarray(tail / total), np.where(nothing, 1.0, wild / total)
+
+    def _table(self, levels: Floats, lifted: Floats, pair: Ints) -> Floats:
+        """Return quantiles (m, k) of the model itself at lifted powers of numbered pairs (m,), by bisection."""
+        flat = self._shapes(lifted, self._factors[pair])
+        shapes = ErrorShapes(
+            noise_m=flat.noise_m[:, None], tail_share=flat.tail_share[:, None], detour_m=flat.detour_m[:, None]
+        )
+        reach = FARTHEST_SIGMAS * (shapes.noise_m + self.outlier_m)
+        low = np.broadcast_to(self.location_m - reach, (len(pair), len(levels))).copy()
+        high = low + 2 * reach + self.least_m + FARTHEST_MEANS * shapes.detour_m
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            above = self.below(middle, shapes) > levels
+            high, low = np.where(above, middle, high), np.where(above, low, middle)
+        return np.asarray((low + high) / 2)
+
+    def _own_levels(self, probabilities: Floats) -> Floats:
+        """Return the model's levels below which such shares of errors were found."""
+        if not self.levels:
+            return probabilities
+        found, own = np.array(self.levels).T
+        return np.asarray(np.interp(probabilities, [0.0, *found, 1.0], [0.0, *own, 1.0]))
+
+    @cached_property
+    def _factors(self) -> Floats:
+        """Logarithms of each pair's factors (pairs + 1, 3); the last row is that of a pair that is not known."""
+        rows = [[pair.noise, pair.odds, pair.detour] for pair in self.pairs.values()]
+        return np.log([*rows, [1.0, 1.0, 1.0]])
+
+    @cached_property
+    def _codes(self) -> tuple[Ints, Ints]:
+        """Return pairs as sorted numbers, and the row of the factors of each."""
+        ends = np.array([[int(end) for end in name.split("-")] for name in self.pairs], dtype=np.int64).reshape(-1, 2)
+        codes = ends.min(axis=1, initial=2**31) << 32 | ends.max(axis=1, initial=0)
+        order = np.argsort(codes)
+        return codes[order], order
+
+    def _rows(self, initiator: Ints, target: Ints) -> Ints:
+        """Return the row of `_factors` of ranges (n,)."""
+        codes, order = self._codes
+        asked = np.minimum(initiator, target).astype(np.int64) << 32 | np.maximum(initiator, target).astype(np.int64)
+        place = np.searchsorted(codes, asked)
+        known = place < len(codes)
+        known[known] = codes[place[known]] == asked[known]
+        found = np.full(len(asked), len(codes), dtype=np.int64)
+        found[known] = order[place[known]]
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what stands in a calibration's JSON."""
+        return asdict(self)
+
+
+class ErrorsAtOnce:
+    """Total standard deviation and share of reflections of one range at a time, in plain Python, as `ErrorModel` has.
+
+    Between powers the total is that of noise and odds there, so this equals the columns.
+    """
+
+    def __init__(self, model: ErrorModel, bias_curve: Curve) -> None:
+        """Prepare tables of a model; where the bias curve is held constant the total grows."""
+        self._model, self._low, self._high = model, *bias_curve.range
+        slopes = bias_curve.beyond(np.array([self._low - 1, self._high + 1]))
+        self._below, self._above = slopes.tolist()
+        share = np.array(model.tail_share)
+        self._nodes = list(model.lifted)
+        self._rows = list(zip(np.log(model.noise_m).tolist(), np.log(share / (1 - share)).tolist(), strict=True))
+        self._pairs = {}
+        for name, pair in model.pairs.items():
+            one, two = (int(end) for end in name.split("-"))
+            logs = (math.log(pair.noise), math.log(pair.odds), model.detour_m * pair.detour)
+            self._pairs[one, two] = self._pairs[two, one] = logs
+
+    def __call__(self, lifted: float, initiator: int, target: int) -> tuple[float, float]:
+        """Return the total standard deviation in metres, and the share of reflections."""
+        model = self._model
+        noise, odds, detour = self._pairs.get((initiator, target), (0.0, 0.0, model.detour_m))
+        one, two = self._at(lifted)
+        noise, share = math.exp(noise + one), 1 / (1 + math.exp(-odds - two))
+        inside, least = 1 - model.outlier_share, model.least_m
+        square = noise * noise + share * (least * least + 2 * least * detour + 2 * detour * detour)
+        mean = inside * share * (least + detour)
+        total = model.scale**2 * (inside * square + model.outlier_share * model.outlier_m**2 - mean * mean)
+        away = self._below * max(self._low - lifted, 0.0) + self._above * max(lifted - self._high, 0.0)
+        return math.sqrt(total + away * away), share
+
+    def _at(self, lifted: float) -> tuple[float, float]:
+        """Return logarithm of noise and log odds at a lifted power, straight between the model's."""
+        nodes = self._nodes
+        k = bisect_right(nodes, lifted)
+        if k in (0, len(nodes)):
+            return self._rows[max(k - 1, 0)]
+        part = (lifted - nodes[k - 1]) / (nodes[k] - nodes[k - 1])
+        (a, b), (c, d) = self._rows[k - 1 : k + 1]
+        return a + part * (c - a), b + part * (d - b)
+
+
+def read_errors(read: Reader) -> ErrorModel:
+    """Return the model from its table; raises `BadInputError` that names the key."""
+    lifted, noise, share = (read.numbers(name) for name in ("lifted", "noise_m", "tail_share"))
+    fit = len(lifted) == len(noise) == len(share) and len(lifted) > 1
+    fit = fit and all(one < two for one, two in pairwise(lifted))
+    if not fit or min(noise) <= 0 or not all(0 < value < 1 for value in share):
+        raise read.wrong("lifted", "ascending powers, with as many noises above 0 and shares between 0 and 1")
+    pairs = read.inside("pairs")
+    names = list(read.table("pairs"))
+    if not all(_is_pair(name) for name in names):
+        raise read.wrong("pairs", "names of pairs, as in 1-2")
+    return ErrorModel(
+        lifted=lifted,
+        noise_m=noise,
+        tail_share=share,
+        **{name: read.number(name) for name in ("least_m", "detour_m", "outlier_share", "outlier_m")},
+        **{name: read.number(name) for name in ("location_m", "scale")},
+        levels=read.couples("levels"),
+        pairs={name: _pair(pairs.inside(name)) for name in names},
+    )
+
+
+def _is_pair(name: str) -> bool:
+    ends = name.split("-")
+    return len(ends) == 2 and all(end.isascii() and end.isdecimal() for end in ends)
+
+
+def _pair(read: Reader) -> PairErrors:
+    found = {name: read.number(name) for name in ("noise", "odds", "detour")}
+    for name, value in found.items():
+        if value <= 0:
+            raise read.wrong(name, "a factor above 0")
+    return PairErrors(**found)

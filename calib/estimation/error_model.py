@@ -1,0 +1,203 @@
+"""What the errors of ranges yet to come are made of, from those that were fitted.
+
+Reflections last, so a pair's share in one recording says less of its share in another than as many independent ranges
+would: how much less is read off the slopes by the shares, summed over blocks of time (`persistence`). Pairs are drawn
+to what they have in common by that, and what stays unknown of a share is in the share that is predicted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from calib.calibration.error_model import ErrorModel, PairErrors
+from calib.estimation.intervals import blocks_of
+from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
+from calib.estimation.persistence import persistence
+from calib.estimation.problem import Problem
+from calib.spread import robust_spread
+from uwblink.arrays import Floats, Ints
+
+JUDGED: Final = 20_000
+"""Ranges by which quantiles and the total sigma are put right; more would say nothing else."""
+
+FEWEST_JUDGED: Final = 200
+"""Of fewer the model's own quantiles are the better guess."""
+
+LEVELS: Final = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
+"""Shares of errors at which the model's quantiles are put right."""
+
+BEYOND_MEANS: Final = 6.0
+"""Errors longer than so many mean detours, of which an exponential leaves 0.2 %, are no part of the total sigma."""
+
+LEAST_SPREAD_M: Final = 1e-6
+"""Errors without any spread have no distribution."""
+
+ROUNDS: Final = 50
+SMALLEST_SHARE: Final = 1e-4
+
+
+def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | None) -> ErrorModel | None:
+    """Return what errors are made of; None where they have no spread.
+
+    `residual_m` (n,) are fitted less true ranges, in order of time, `mixture` what they were fitted with; without one
+    it is fitted here, about a centre of its own.
+    """
+    if robust_spread(residual_m) < LEAST_SPREAD_M:
+        return None
+    pair, names = _pairs(problem)
+    cell = problem.bins.number * CELLS // len(problem.bins.count)
+    location = 0.0
+    if mixture is None:
+        mixture = _about_their_centre(residual_m, pair, cell)
+        location = -float(mixture.of("design")[0])
+    centred = residual_m - location
+    # Powers may repeat; what is straight between two of them needs them apart.
+    nodes = np.array([np.median(problem.lifted[cell == k]) for k in range(CELLS)]) + 1e-9 * np.arange(CELLS)
+    known = _of_pairs(mixture, problem.ranges.time_ns, pair)
+    wild = _outliers(mixture, centred)
+    model = ErrorModel(
+        lifted=tuple(nodes.tolist()),
+        noise_m=tuple(np.exp(mixture.of("cell_noise")).tolist()),
+        tail_share=tuple(_share(known.common_odds + _apart(mixture.of("cell_share"))).tolist()),
+        least_m=float(np.exp(mixture.of("least")[0])),
+        detour_m=known.common_detour_m,
+        outlier_share=wild.share,
+        outlier_m=wild.rms_m,
+        location_m=location,
+        pairs={
+            name: PairErrors(noise=float(noise), odds=float(np.exp(odds - known.common_odds)), detour=float(detour))
+            for name, noise, odds, detour in zip(names, mixture.noise, known.odds, known.detour, strict=True)
+        },
+    )
+    return _put_right(model, problem, residual_m)
+
+
+def _pairs(problem: Problem) -> tuple[Ints, list[str]]:
+    """Return the pair of each range (n,), numbered as in a mixture, and the names of all."""
+    initiator, target = problem.ranges.initiator, problem.ranges.target
+    low, high = np.minimum(initiator, target), np.maximum(initiator, target)
+    codes, number = np.unique(low * (int(high.max()) + 1) + high, return_inverse=True)
+    return number, [f"{code // (int(high.max()) + 1)}-{code % (int(high.max()) + 1)}" for code in codes.tolist()]
+
+
+def _about_their_centre(residual_m: Floats, pair: Ints, cell: Ints) -> PairMixture:
+    """Fit a mixture to residuals (n,) of another loss, about a centre that is fitted along."""
+    errors = Errors(
+        error=residual_m,
+        design=np.ones((len(residual_m), 1)),
+        pair=pair,
+        cell=cell,
+        density=1 / (float(np.ptp(residual_m)) + 1e-9),
+    )
+    return fit_pair_mixture(errors, np.array([-float(np.median(residual_m))]), np.zeros((1, 1)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _PairsPredicted:
+    """Log odds of each pair (pairs,) and of one not seen yet, at the middle step; detours over the common one."""
+
+    odds: Floats
+    common_odds: float
+    detour: Floats
+    common_detour_m: float
+
+
+def _of_pairs(mixture: PairMixture, time_ns: Ints, pair: Ints) -> _PairsPredicted:
+    """Draw pairs to what they have in common, by what they know where reflections last."""
+    by_share = mixture.scores.sorts[5]
+    pairs = mixture.layout.pairs
+    factor = _lasting(by_share.slope, pair, pairs, time_ns)
+    reflected = np.bincount(pair, minlength=pairs) * mixture.tail_share
+    # One wall has one detour: a mean is known from as many reflections as there were, not from as many ranges.
+    unknown = [factor / np.maximum(known, 1e-6) for known in (np.bincount(pair, by_share.slope**2, pairs), reflected)]
+    share, share_var, any_share, any_share_var = _drawn(mixture.of("pair_share"), unknown[0])
+    mean, mean_var, any_mean, any_mean_var = _drawn(mixture.of("pair_mean"), unknown[1])
+    middle = float(np.mean(mixture.of("cell_share")))
+    common = float(np.exp(mixture.of("mean")[0] + any_mean + any_mean_var / 2))
+    return _PairsPredicted(
+        odds=_expected_odds(share + middle, share_var),
+        common_odds=float(_expected_odds(np.array(any_share + middle), np.array(any_share_var))),
+        detour=np.exp(mean + mean_var / 2 - any_mean - any_mean_var / 2),
+        common_detour_m=common,
+    )
+
+
+def _lasting(slope: Floats, pair: Ints, pairs: int, time_ns: Ints) -> float:
+    """Return by how much more sums of slopes (n,) vary than those of independent ranges would."""
+    blocks, seconds = blocks_of(time_ns)
+    count = int(blocks[-1]) + 1
+    sums = np.asarray(np.bincount(blocks * pairs + pair, slope, count * pairs), float).reshape(count, pairs)
+    within = float(np.sum(sums**2) / max(np.sum(slope**2), 1e-300))
+    return max(within, 1.0) * max(persistence(sums, seconds, pairs).factor, 1.0)
+
+
+def _drawn(value: Floats, variance: Floats) -> tuple[Floats, Floats, float, float]:
+    """Draw values (pairs,) with known variances to a common one; return them, their variances, and those of another.
+
+    The variance between pairs is the likeliest of normal values (by expectation-maximisation).
+    """
+    between = float(np.var(value)) + 1e-3
+    for _ in range(ROUNDS):
+        weight = 1 / (between + variance)
+        centre = float(np.sum(weight * value) / np.sum(weight))
+        kept = between / (between + variance)
+        between = max(float(np.mean((kept * (value - centre)) ** 2 + kept * variance)), 1e-4)
+    of_centre = float(1 / np.sum(1 / (between + variance)))
+    kept = between / (between + variance)
+    return (
+        np.asarray(centre + kept * (value - centre)),
+        np.asarray(kept * variance + (1 - kept) ** 2 * of_centre),
+        centre,
+        between + of_centre,
+    )
+
+
+def _expected_odds(log_odds: Floats, variance: Floats) -> Floats:
+    """Return the log odds of the mean share, where log odds are known with a variance (MacKay 1992)."""
+    return np.asarray(log_odds / np.sqrt(1 + np.pi / 8 * variance))
+
+
+def _apart(values: Floats) -> Floats:
+    return np.asarray(values - values.mean())
+
+
+def _share(log_odds: Floats) -> Floats:
+    return np.clip(1 / (1 + np.exp(-log_odds)), SMALLEST_SHARE, 1 - SMALLEST_SHARE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Outliers:
+    """Share and root mean square of what neither core nor tail explains, those far beyond reach apart."""
+
+    share: float
+    rms_m: float
+
+
+def _outliers(mixture: PairMixture, error_m: Floats) -> _Outliers:
+    outlier = np.clip(mixture.scores.sorts[2].slope + 1 / (1 + np.exp(-mixture.of("outliers")[0])), 0, 1)
+    reach = BEYOND_MEANS * float(mixture.tail_mean_m.max())
+    near = outlier * (np.abs(error_m) < reach)
+    share = max(float(near.mean()), 1e-9)
+    return _Outliers(share=share, rms_m=float(np.sqrt(np.sum(near * error_m**2) / max(near.sum(), 1e-9))) or reach)
+
+
+def _put_right(model: ErrorModel, problem: Problem, residual_m: Floats) -> ErrorModel:
+    """Let quantiles and the total standard deviation hold in what was fitted, as far as one number for all can."""
+    rows = np.linspace(0, len(residual_m) - 1, min(JUDGED, len(residual_m))).astype(np.int64)
+    if len(rows) < FEWEST_JUDGED:
+        return model
+    error, ranges = residual_m[rows], problem.ranges
+    shapes = model.shapes(problem.lifted[rows], ranges.initiator[rows], ranges.target[rows])
+    level = np.quantile(model.below(error, shapes), LEVELS)
+    away = error - model.mean_m(shapes)
+    reach = BEYOND_MEANS * (model.least_m + shapes.detour_m)
+    within = np.abs(away) < reach
+    z = away[within] / model.total_m(shapes)[within]
+    return replace(
+        model,
+        scale=float(np.sqrt(np.mean(z**2))),
+        levels=tuple(zip(LEVELS, np.maximum.accumulate(level).tolist(), strict=True)),
+    )

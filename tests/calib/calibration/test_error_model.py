@@ -1,0 +1,140 @@
+"""What errors are made of, against draws of core, tail and outliers, and in files."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import calib
+from calib.calibration.error_model import ErrorModel, PairErrors
+from calib.calibration.model import Calibration
+
+MODEL = ErrorModel(
+    lifted=(0.1, 0.5, 1.5),
+    noise_m=(0.08, 0.05, 0.03),
+    tail_share=(0.3, 0.2, 0.1),
+    least_m=0.05,
+    detour_m=0.3,
+    outlier_share=0.002,
+    outlier_m=0.9,
+    location_m=0.02,
+    pairs={"1-2": PairErrors(1.5, 3.0, 0.5)},
+)
+COUNT = 400_000
+
+
+def drawn(lifted, first, second, seed=0):
+    """Draw errors of one kind of range, and which of them were reflected; straight from the definition."""
+    rng = np.random.default_rng(seed)
+    known = {first, second} == {1, 2}
+    noise = np.exp(np.interp(lifted, MODEL.lifted, np.log(MODEL.noise_m))) * (1.5 if known else 1)
+    odds = np.exp(np.interp(lifted, MODEL.lifted, [np.log(t / (1 - t)) for t in MODEL.tail_share]))
+    share = 1 / (1 + 1 / (odds * (3.0 if known else 1.0)))
+    kind = rng.random(COUNT)
+    error = rng.normal(0, noise, COUNT)
+    reflected = kind < 0.998 * share
+    error[reflected] += 0.05 + rng.exponential(0.3 * (0.5 if known else 1), np.count_nonzero(reflected))
+    wild = kind > 0.998
+    error[wild] = rng.normal(0, 0.9, np.count_nonzero(wild))
+    return error + 0.02, reflected, wild
+
+
+@pytest.mark.parametrize(("lifted", "first", "second"), [(0.1, 1, 2), (0.7, 2, 1), (0.7, 1, 3), (4.0, 7, 3)])
+def test_mean_spread_quantiles_and_shares_are_those_of_draws(lifted, first, second):
+    error, reflected, wild = drawn(lifted, first, second)
+    ends = np.full(1, first), np.full(1, second)
+    shapes = MODEL.shapes(np.full(1, lifted), *ends)
+    # Four standard errors of each figure, from 400 000 draws.
+    assert MODEL.mean_m(shapes)[0] == pytest.approx(error.mean(), abs=4 * error.std() / np.sqrt(COUNT))
+    assert MODEL.total_m(shapes)[0] == pytest.approx(error.std(), rel=0.012)
+    assert shapes.tail_share[0] == pytest.approx(np.mean(reflected) / 0.998, abs=0.003)
+    shares = [0.01, 0.025, 0.3, 0.9, 0.975]
+    if lifted == 0.1 or lifted > 1.5:
+        found = MODEL.quantiles(shares, np.full(1, lifted), *ends)[0]
+        np.testing.assert_allclose([np.mean(error < q) for q in found], shares, atol=0.002)
+    for value in (-0.1, 0.05, 0.15, 0.6):
+        assert MODEL.below(np.full(1, value), shapes)[0] == pytest.approx(np.mean(error < value), abs=0.0032)
+        near = np.abs(error - value) < 0.01
+        tail, outlier = MODEL.tail_given(np.full(1, value), shapes)
+        assert tail[0] == pytest.approx(np.mean(reflected[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near) + 1))
+        assert outlier[0] == pytest.approx(np.mean(wild[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near) + 1))
+
+
+def test_errors_beyond_everything_are_outliers():
+    shapes = MODEL.shapes(np.full(3, 0.5), np.full(3, 1), np.full(3, 2))
+    tail, outlier = MODEL.tail_given(np.array([-3.0, 80.0, 1e6]), shapes)
+    assert outlier[0] > 0.999
+    assert outlier[2] == 1.0
+    assert np.isfinite(tail).all()
+
+
+def test_levels_put_quantiles_right():
+    lowered = replace(MODEL, levels=((0.025, 0.01), (0.5, 0.5), (0.975, 0.99)))
+    where = np.full(1, 0.5), np.full(1, 1), np.full(1, 2)
+    assert lowered.quantiles([0.025, 0.975], *where) == pytest.approx(MODEL.quantiles([0.01, 0.99], *where))
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return calib.fit(calib.sample_flight()).calibration
+
+
+def test_a_file_gives_it_back_and_files_without_it_open(fitted):
+    assert fitted.errors is not None
+    again = Calibration.from_json(fitted.to_json())
+    assert again.errors == fitted.errors
+    flight = calib.load_ranges(calib.sample_flight(seed=2))
+    np.testing.assert_array_equal(again.quantiles(flight), fitted.quantiles(flight))
+    document = json.loads(fitted.to_json())
+    del document["errors"]
+    old = Calibration.from_json(json.dumps(document))
+    applied = old.apply(flight)
+    assert np.isnan(applied.sigma_total_m).all()
+    assert np.isnan(applied.tail_share).all()
+    assert not applied.outlier.any()
+    np.testing.assert_array_equal(applied.corrected_m, fitted.apply(flight).corrected_m)
+    assert json.loads(json.dumps(calib.evaluate(flight, old).to_dict()))["overall"]["total_std"] is None
+    assert "-" in repr(calib.evaluate(flight, old))
+    with pytest.raises(calib.UnanswerableError, match="does not say what errors are made of"):
+        old.quantiles(flight)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("lifted", [0.1], "errors: lifted"),
+        ("noise_m", [0.0] * 8, "errors: lifted"),
+        ("tail_share", [1.5] * 8, "errors: lifted"),
+        ("pairs", {"one-two": {}}, "names of pairs"),
+        ("pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
+        ("levels", [[0.1]], "levels"),
+        ("scale", "wide", "scale"),
+    ],
+)
+def test_a_damaged_model_is_one_clear_error(fitted, key, value, said):
+    document = json.loads(fitted.to_json())
+    document["errors"][key] = value
+    with pytest.raises(calib.BadInputError, match=said):
+        Calibration.from_json(json.dumps(document), "here")
+
+
+@pytest.mark.parametrize("shares", [[], [0.0], [1.2], [[0.5]]])
+def test_shares_that_are_none(fitted, shares):
+    with pytest.raises(calib.BadInputError, match=r"`shares`: .*between 0 and 1"):
+        fitted.quantiles(calib.load_ranges(calib.sample_flight()), shares)
+
+
+def test_the_yaml_has_tables_to_interpolate_in(fitted):
+    rows: dict[str, list[str]] = {}
+    for line in calib.export(fitted, "ros-yaml").splitlines():
+        name, _, values = line.strip().partition(": ")
+        rows.setdefault(name.rstrip(":"), []).append(values)
+    pairs = [*fitted.errors.pairs, "other"]
+    assert [name for name in rows if name.strip("'") in pairs] == [f"'{name}'" for name in pairs]
+    lifted = np.array(json.loads(rows["lifted"][0]))
+    ends = np.full(len(lifted), 2), np.full(len(lifted), 1)
+    shapes = fitted.errors.shapes(lifted, *ends)
+    np.testing.assert_allclose(json.loads(rows["sigma_total_m"][0]), fitted.errors.total_m(shapes))
+    low = fitted.errors.quantiles([0.025], lifted, *ends)[:, 0]
+    np.testing.assert_allclose(json.loads(rows["low95_m"][0]), low)
