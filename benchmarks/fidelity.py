@@ -82,7 +82,7 @@ What is not alike, or not known:
 - Success against the number of initiators was not measured on boards; the simulated figures follow from frame durations, capture and preamble time-out.
 - The boards' receive noise was measured among obstacles; in the icra2023 scenarios all noise is in the published curve of standard deviation.
 - Capture (6 dB) and the first-path detector's dynamic range (15 dB) are typical values, not measured ones; materials are round values from ITU-R P.2040-3.
-- The chip is not said to go deaf after a reception error without a reset, and temperature moves clocks, not antenna delays.
+- The chip is not said to go deaf after a reception error without a reset. What temperature and voltage do to delays is the manual's typical figure, without a sign there.
 """
 
 

@@ -213,7 +213,7 @@ def errors(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -
         Picture(
             "residuals",
             partial(figures_errors.residuals, ranges, applied, calibration.alpha_dbm),
-            "What is left over distance and over power. Medians should lie on zero; recordings carry no temperature.",
+            "What is left over distance and over power. Medians should lie on zero.",
         ),
     ]
 

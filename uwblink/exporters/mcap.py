@@ -34,7 +34,7 @@ Message = tuple[int, str, str, dict[str, Any]]
 def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
     """Write `recording.mcap`; returns its messages. Times before 1970 cannot be written and raise `RecordingError`."""
     held = load(recording)
-    parts = (_poses(held), _ranges(held), _imu(held), _heights(held), _faults(held))
+    parts = (_poses(held), _ranges(held), _imu(held), _heights(held), _temperatures(held), _faults(held))
     messages = merge(*parts, key=lambda message: message[0])
     with (folder / "recording.mcap").open("wb") as file:
         count = _write(recording, file, messages)
@@ -120,6 +120,18 @@ def _heights(held: Contents) -> Iterator[Message]:
             *(held.height[n].tolist() for n in ("time_ns", "body", "height_m")), strict=True
         ):
             yield time_ns, f"/height/{body}", "uwb.Height", _known({"height_m": height})
+
+
+def _temperatures(held: Contents) -> Iterator[Message]:
+    if held.temperature:
+        names = ("time_ns", "tag", "temperature_c", "supply_v")
+        for time_ns, tag, celsius, volts in zip(*(held.temperature[n].tolist() for n in names), strict=True):
+            yield (
+                time_ns,
+                f"/temperature/{tag}",
+                "uwb.Temperature",
+                _known({"temperature_c": celsius, "supply_v": volts}),
+            )
 
 
 def _faults(held: Contents) -> Iterator[Message]:

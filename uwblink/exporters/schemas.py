@@ -40,6 +40,7 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     ),
     "uwb.Imu": _object(timestamp=_TIME, angular_velocity=_VECTOR, linear_acceleration=_VECTOR),
     "uwb.Height": _object(timestamp=_TIME, height_m=_NUMBER),
+    "uwb.Temperature": _object(timestamp=_TIME, temperature_c=_NUMBER, supply_v=_NUMBER),
 }  # fmt: skip
 """What messages hold, as JSON Schema; what is not known is left out of a message."""
 

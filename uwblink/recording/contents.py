@@ -31,8 +31,8 @@ def _no_poses() -> Poses:
 class Contents:
     """What a recording holds; only the exchanges are needed to make one.
 
-    `overheard`, `imu`, `height` and `powers` have the columns of the tables of these names, or none; `meta` is what is
-    known of the whole.
+    `overheard`, `imu`, `height`, `powers` and `temperature` have the columns of the tables of these names, or none;
+    `meta` is what is known of the whole.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
@@ -48,6 +48,7 @@ class Contents:
     imu: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     height: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     powers: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    temperature: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     cirs: list[CirRow] = field(default_factory=list)
     frames: list[FrameRow] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
@@ -79,6 +80,7 @@ class Contents:
             powers=_overheard(self.powers, chosen),
             imu=_between(self.imu, first_ns, end_ns),
             height=_between(self.height, first_ns, end_ns),
+            temperature=_between(self.temperature, first_ns, end_ns),
             cirs=[row for row in self.cirs if chosen.has(row.time_ns, row.initiator, row.target)],
             frames=[row for row in self.frames if first_ns <= row.time_ns < end_ns],
             faults=[row for row in self.faults if first_ns <= row.time_ns < end_ns],
@@ -134,7 +136,7 @@ class Contents:
         return first, far if stop_s is None else origin + round(stop_s * 1e9)
 
 
-_COLUMNS: Final = ("overheard", "imu", "height", "powers")
+_COLUMNS: Final = ("overheard", "imu", "height", "powers", "temperature")
 """The tables that are held as columns by name."""
 
 
@@ -153,7 +155,8 @@ def load(path: str | os.PathLike[str]) -> Contents:
     with Recording.open(Path(path)) as r:
         return Contents(
             exchanges=r.exchanges(), tags=r.tags(), poses=r.poses(), overheard=r.overheard(), imu=r.imu(),
-            height=r.heights(), powers=r.powers(), cirs=r.cirs(), frames=r.frames(), faults=r.faults(), meta=r.meta(),
+            height=r.heights(), powers=r.powers(), temperature=r.temperatures(), cirs=r.cirs(), frames=r.frames(),
+            faults=r.faults(), meta=r.meta(),
         )  # fmt: skip
 
 

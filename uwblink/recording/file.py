@@ -330,7 +330,17 @@ class Recording:
 
     def powers(self) -> dict[str, NDArray[Any]]:
         """Return the total powers of exchanges as columns of the table `powers`, in order of time; NaN where none."""
-        found = {name: _filled(column) for name, column in self.columns("powers").items()}
+        return self._numbers("powers")
+
+    def temperatures(self) -> dict[str, NDArray[Any]]:
+        """Return what tags read of themselves as columns of the table `temperature`, in order of time.
+
+        Temperature in degrees Celsius and supply voltage in volts; NaN where there is none.
+        """
+        return self._numbers("temperature")
+
+    def _numbers(self, table: str) -> dict[str, NDArray[Any]]:
+        found = {name: _filled(column) for name, column in self.columns(table).items()}
         order = np.argsort(found["time_ns"], kind="stable")
         return {name: column[order] for name, column in found.items()}
 
@@ -389,6 +399,7 @@ _APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
     "imu": lambda recording, columns: recording.append_columns("imu", columns),
     "height": lambda recording, columns: recording.append_columns("height", columns),
     "powers": lambda recording, columns: recording.append_columns("powers", columns),
+    "temperature": lambda recording, columns: recording.append_columns("temperature", columns),
 }
 
 _EMPTY: Final = {"BIGINT": np.int64, "DOUBLE": np.float64, "USMALLINT": np.uint16}

@@ -73,6 +73,11 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         **dict.fromkeys(("initiator", "target"), "USMALLINT"),
         **dict.fromkeys(("rxp1_dbm", "rxp2_dbm"), "DOUBLE"),
     },
+    "temperature": {
+        "time_ns": "BIGINT",
+        "tag": "USMALLINT",
+        **dict.fromkeys(("temperature_c", "supply_v"), "DOUBLE"),
+    },
 }
 
 ADDED_LATER: Final = {
@@ -80,6 +85,7 @@ ADDED_LATER: Final = {
     "imu": frozenset(TABLES["imu"]),
     "height": frozenset(TABLES["height"]),
     "powers": frozenset(TABLES["powers"]),
+    "temperature": frozenset(TABLES["temperature"]),
 }
 """Columns that a recording may lack, because it is older than they are; where all of a table's are, the table."""
 

@@ -21,7 +21,7 @@ from uwbsim.world.clocks import Clocks
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.reception import Frames, Medium
-from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS
 from uwbsim.world.world import World
 
 MASK: Final = (1 << REPORT_BITS) - 1
@@ -129,7 +129,6 @@ class Radios:
         self.lost_share = lost_share
         self.place = {tag.id: k for k, tag in enumerate(scenario.tags)}
         self._all = np.arange(len(scenario.tags))
-        self._delays = self.medium.delays()
         self._chance = stream(scenario.run.seed, "boards")
 
     def next_stamp(self, board: int, time: int) -> int:
@@ -150,10 +149,8 @@ class Radios:
 
     def frame(self, sender: int, receiver: int | None, payload: Payload, stamp: int, excess_m: float = 0.0) -> Frame:
         """Return a frame that leaves at a transmit stamp of its sender's clock, and how every board receives it."""
-        jitter = self._chance.normal() * self.scenario.radio.tx_noise_s * SUBTICKS_PER_SECOND
         place = self.place[sender]
-        left = stamp * SUBTICKS + round(jitter - self._delays[place, 0])
-        departure = int(self.medium.clocks.when(self._one(sender), np.array([left]))[0])
+        departure = int(self.medium.leave(self._one(sender), np.array([stamp]), self._chance.normal(size=1))[0])
         excess = np.zeros(len(self._all))
         if receiver in self.place:
             excess[self.place[receiver]] = excess_m

@@ -15,7 +15,9 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.schedule import schedule
 from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.clocks import Clocks
+from uwbsim.world.radio import carrier_bias_ppm
 from uwbsim.world.reception import arrive
+from uwbsim.world.temperature import AntennaDelays
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
@@ -35,8 +37,9 @@ class Conditions:
     of a second (of flicker and random walk there is only the rate that they have reached). `late` is what power adds to
     each reception and `rx_std` its noise, both on average over the two directions; `tx_std` that of transmissions.
     `at_once` and `scheduled` are the two kinds of reply, `carrier_bias_ppm` and `carrier_std_ppm` those of the carrier
-    integrator; `multipath` is the probability of a detour of `detour_s` on average, which all messages of an exchange
-    take. `quantize` says whether stamps are whole ticks and delayed transmissions on the chip's grid.
+    integrator, which reads `carrier_sign` times the rate of the initiator's clock less the target's. `multipath` is the
+    probability of a detour of `detour_s` on average, which all messages of an exchange take. `quantize` says whether
+    stamps are whole ticks and delayed transmissions on the chip's grid.
     """
 
     flight: Floats
@@ -58,7 +61,8 @@ class Conditions:
     at_once: Floats
     scheduled: Floats
     power_dbm: Floats
-    carrier_bias_ppm: float = 0.0
+    carrier_bias_ppm: Floats
+    carrier_sign: float = 1.0
     carrier_std_ppm: float = 0.0
     multipath: float = 0.0
     detour_s: float = 0.0
@@ -106,10 +110,11 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     world, clocks, radio = World.of(scenario), Clocks.of(scenario), scenario.radio
     link = world.link(i, j, start)
     later = world.link(i, j, start + round(STEP_S * SUBTICKS_PER_SECOND))
-    arrivals = [arrive(radio, link)]
+    arrivals, back = [arrive(radio, link)], link
     if any(tag.tx_power_db for tag in scenario.tags):
-        arrivals.append(arrive(radio, world.link(j, i, start)))
-    delays = np.array([tag.antenna_delays_s for tag in scenario.tags])
+        back = world.link(j, i, start)
+        arrivals.append(arrive(radio, back))
+    delays = AntennaDelays.of(scenario)
     white = np.array([tag.white_sqrt_s for tag in scenario.tags])
     share, mean_m = radio.independent_multipath
     nothing = np.zeros(len(rows))
@@ -126,14 +131,15 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         late=np.mean([arrival.bias_s for arrival in arrivals], axis=0),
         rx_std=np.sqrt(np.mean([arrival.std_s**2 for arrival in arrivals], axis=0)),
         tx_std=np.full(len(rows), radio.tx_noise_s),
-        tx_delay_initiator=delays[i, 0],
-        rx_delay_initiator=delays[i, 1],
-        tx_delay_target=delays[j, 0],
-        rx_delay_target=delays[j, 1],
+        tx_delay_initiator=delays.transmit_s(i, start),
+        rx_delay_initiator=delays.receive_s(i, start),
+        tx_delay_target=delays.transmit_s(j, start),
+        rx_delay_target=delays.receive_s(j, start),
         at_once=draw_reply_s(scenario, stream(scenario.run.seed, "reply latency"), len(rows)),
         scheduled=np.full(len(rows), scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S),
         power_dbm=link.power_dbm,
-        carrier_bias_ppm=radio.skew_bias_ppm,
+        carrier_bias_ppm=carrier_bias_ppm(radio, back.power_dbm),
+        carrier_sign=radio.carrier_sign,
         carrier_std_ppm=radio.skew_noise_ppm,
         multipath=share,
         detour_s=mean_m / SPEED_OF_LIGHT,

@@ -78,7 +78,8 @@ class _Ticks:
         self.rx_late = {side: c.late * scale + delay for side, delay in rx_delay.items()}
         self.rx_std, self.tx_std = c.rx_std * scale, c.tx_std * scale
         self.reply = {"at once": c.at_once * scale, "scheduled": c.scheduled * scale}
-        self.carrier_ppm = (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+        self.carrier_ppm = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+        self.carrier_sign = c.carrier_sign
         self.carrier_std_ppm, self.detour = c.carrier_std_ppm, c.detour_s * scale
         # What a clock's phase gathers in a tick, in ticks.
         self.white = {"initiator": c.white_initiator * scale**0.5, "target": c.white_target * scale**0.5}
@@ -219,7 +220,7 @@ def _carrier_ppm(wander: dict[str, _Wander], departure: Floats) -> Floats:
 def _intervals(
     protocol: RangingProtocol, stamps: dict[str, Floats], c: _Ticks, draws: _Draws, carrier_noise: Floats | float
 ) -> Intervals:
-    carrier = c.carrier_ppm + carrier_noise
+    carrier = c.carrier_ppm + c.carrier_sign * carrier_noise
     if draws.carrier is not None:
         carrier = carrier + draws.carrier * c.carrier_std_ppm
     none = c.flight

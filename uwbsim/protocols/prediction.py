@@ -120,7 +120,7 @@ def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, tup
         else:
             dt53 = read(i, leave[2], arrive[1]) + tx[i] - rx[i]
             dt64 = read(j, arrive[2], leave[1]) + rx[j] - tx[j]
-    carrier = (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
+    carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
     return Intervals(dt41 * ticks, dt32 * ticks, dt53 * ticks, dt64 * ticks, carrier), (leave, arrive)
 
 
@@ -171,7 +171,7 @@ def _white_clocks(
     rate over the preamble of the second message.
     """
     # How the flight changes with what the phase gains during the preamble.
-    gain = slopes["carrier_ppm"] * PPM_PER_ONE * TICK_S / RATE_SPAN_S
+    gain = c.carrier_sign * slopes["carrier_ppm"] * PPM_PER_ONE * TICK_S / RATE_SPAN_S
     total = np.zeros(len(c))
     for side, white, sign in (("initiator", c.white_initiator, 1), ("target", c.white_target, -1)):
         read = [(leave[1] - RATE_SPAN_S, -sign * gain), (leave[1], sign * gain)]

@@ -26,6 +26,7 @@ def fill_in(table: dict[str, Any], scenario: Path) -> None:
     radio = table.get("radio")
     if isinstance(radio, dict) and isinstance(radio.get("antenna"), dict) and "file" in radio["antenna"]:
         radio["antenna"] = _antenna(_found(scenario, "radio.antenna.file", radio["antenna"]["file"]))
+    _fill_in_group_delay(scenario, "radio", radio)
     ranging = table.get("ranging")
     if isinstance(ranging, dict) and isinstance(ranging.get("plan"), dict) and "file" in ranging["plan"]:
         plan = ranging["plan"]
@@ -36,6 +37,26 @@ def fill_in(table: dict[str, Any], scenario: Path) -> None:
         if isinstance(motion, dict) and motion.get("model") == "recorded" and "file" in motion:
             path = _found(scenario, f"bodies[{k}].motion.file", motion["file"])
             motion |= _trajectory(path, motion.get("body"), _duration(table))
+    for name in ("bodies", "tags"):
+        listed = table.get(name)
+        for k, one in enumerate(listed if isinstance(listed, list) else []):
+            _fill_in_profiles(scenario, f"{name}[{k}]", one)
+            _fill_in_group_delay(scenario, f"{name}[{k}]", one)
+
+
+def _fill_in_profiles(scenario: Path, where: str, one: Any) -> None:
+    """Read what the temperature and the supply voltage of a body or tag name."""
+    for key in ("temperature_c", "supply_v"):
+        profile = one.get(key) if isinstance(one, dict) else None
+        if isinstance(profile, dict) and profile.get("model") == "table" and "file" in profile:
+            rows = _rows(_found(scenario, f"{where}.{key}.file", profile["file"]), ("time_s", key))
+            profile |= {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
+
+
+def _fill_in_group_delay(scenario: Path, where: str, one: Any) -> None:
+    delay = one.get("group_delay") if isinstance(one, dict) else None
+    if isinstance(delay, dict) and delay.get("model") == "table" and "file" in delay:
+        delay |= _grid(_found(scenario, f"{where}.group_delay.file", delay["file"]), "delay_cm")
 
 
 def _found(scenario: Path, key: str, name: Any) -> Path:
@@ -78,21 +99,27 @@ def _number(path: Path, line: int, column: str, cell: str | None) -> float:
 
 def _antenna(path: Path) -> dict[str, Any]:
     """Read azimuth_deg, elevation_deg, gain_db rows into a full grid."""
-    rows = _rows(path, ("azimuth_deg", "elevation_deg", "gain_db"))
+    return _grid(path, "gain_db")
+
+
+def _grid(path: Path, name: str) -> dict[str, Any]:
+    """Read rows of azimuth_deg, elevation_deg and a value into a full grid."""
+    rows = _rows(path, ("azimuth_deg", "elevation_deg", name))
     azimuth, elevation = (sorted({row[k] for row in rows}) for k in (0, 1))
-    gain = {(row[0], row[1]): row[2] for row in rows}
-    if len(gain) != len(rows):
+    found = {(row[0], row[1]): row[2] for row in rows}
+    if len(found) != len(rows):
         raise ScenarioError(f"{path}: two rows are for the same direction")
     for a in azimuth:
         for e in elevation:
-            if (a, e) not in gain:
-                raise ScenarioError(
-                    f"{path}: a hole in the antenna table: no gain at azimuth {a:g}, elevation {e:g} degrees"
+            if (a, e) not in found:
+                what = (
+                    "a hole in the antenna table: no gain" if name == "gain_db" else f"a hole in the table: no {name}"
                 )
+                raise ScenarioError(f"{path}: {what} at azimuth {a:g}, elevation {e:g} degrees")
     return {
         "azimuth_deg": azimuth,
         "elevation_deg": elevation,
-        "gain_db": [[gain[a, e] for e in elevation] for a in azimuth],
+        name: [[found[a, e] for e in elevation] for a in azimuth],
     }
 
 

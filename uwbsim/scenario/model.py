@@ -17,6 +17,7 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.airtime import exchange_air_s
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
+from uwbsim.scenario.devices import Devices, GroupDelay, Profile
 from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints
 from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline, TwoStateMultipath
 from uwbsim.units import MS, NS, PPM, US
@@ -159,11 +160,16 @@ class Mocap(Section):
 
 
 class Body(Section):
-    """Something that carries tags, and may stand in the way of waves."""
+    """Something that carries tags, and may stand in the way of waves.
+
+    `temperature_c` and `supply_v` are those of its tags that have none of their own.
+    """
 
     name: Annotated[str, Field(min_length=1)]
     motion: Motion
     shadow: Shadow | None = None
+    temperature_c: Profile | None = None
+    supply_v: Profile | None = None
 
 
 class Tag(Section):
@@ -172,11 +178,14 @@ class Tag(Section):
     Give the aggregate `delay_ns` = transmit - receive, split 0.44 / 0.56, or both parts.
     The clock: `drift_ppm_per_sqrt_s` is the random walk of its rate (Allan deviation q sqrt(tau/3)),
     `white_ppm_sqrt_s` white noise of its rate (Allan deviation h/sqrt(tau)), `flicker_ppm` flicker noise of its rate
-    (the same Allan deviation at every tau), `ramp_ppm_per_s` what a change of temperature adds. A `passive` tag records
+    (the same Allan deviation at every tau), `ramp_ppm_per_s` what a change of temperature adds; `warm_up_ppm` is how
+    much faster it runs at first, by a transient that decays by e in every `warm_up_s`. A `passive` tag records
     the exchanges that it overhears. `tx_power_db` is how much stronger than others it sends, `power_offset_db` how much
     too high it reads powers. `pattern_db` is what its own antenna adds to `radio.antenna` by direction in its body's
     frame: coefficients of real spherical harmonics of degree 1, 2 and so on, whose root mean square over all directions
     is one (m from -l to l; 3, 8, 15 or 24 of them).
+    `temperature_c` and `supply_v` are its own, or those of its body; what they do to it is in `Devices`, and
+    `range_mm_per_k`, `range_cm_per_v`, `skew_ppm_per_k` take the place of what is said there.
     """
 
     id: TagId
@@ -190,6 +199,14 @@ class Tag(Section):
     white_ppm_sqrt_s: NotNegative = 0.0
     flicker_ppm: NotNegative = 0.0
     ramp_ppm_per_s: float = 0.0
+    warm_up_ppm: float = 0.0
+    warm_up_s: Positive = 60.0
+    temperature_c: Profile | None = None
+    supply_v: Profile | None = None
+    range_mm_per_k: float | None = None
+    range_cm_per_v: float | None = None
+    skew_ppm_per_k: float | None = None
+    group_delay: GroupDelay | None = None
     passive: bool = False
     tx_power_db: float = 0.0
     power_offset_db: float = 0.0
@@ -252,6 +269,7 @@ class Scenario(Section):
     ranging: Ranging
     radio: Radio = Radio()
     mocap: Mocap = Mocap()
+    devices: Devices = Devices()
     room: Room | None = None
     obstacles: tuple[Obstacle, ...] = ()
     min_separation_m: NotNegative = 0.0

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId, Vector
+from uwbsim.scenario.devices import GroupDelay, check_grid
 from uwbsim.scenario.published_curves import BIAS, SIGMA
 from uwbsim.units import NS, PS
 
@@ -191,17 +191,7 @@ class AntennaTable(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        for name, low, high in (("azimuth_deg", -180.0, 180.0), ("elevation_deg", -90.0, 90.0)):
-            values = getattr(self, name)
-            if len(values) < 2 or any(b <= a for a, b in itertools.pairwise(values)):
-                raise ValueError(f"{name}: must increase, and hold two values or more")
-            if values[0] != low or values[-1] != high:
-                raise ValueError(f"{name}: runs from {values[0]:g} to {values[-1]:g}, expected {low:g} to {high:g}")
-        if len(self.gain_db) != len(self.azimuth_deg):
-            raise ValueError(f"gain_db: found {len(self.gain_db)} rows, the azimuths are {len(self.azimuth_deg)}")
-        for k, row in enumerate(self.gain_db):
-            if len(row) != len(self.elevation_deg):
-                raise ValueError(f"gain_db[{k}]: found {len(row)} values, the elevations are {len(self.elevation_deg)}")
+        check_grid(self.azimuth_deg, self.elevation_deg, "gain_db", self.gain_db)
         return self
 
 
@@ -211,6 +201,11 @@ class Radio(Section):
     Sources (firmware wire format, section 5): `rx_noise_ps` and `skew_noise_ppm`, `skew_bias_ppm` from 1833 exchanges
     of MILUV; `sensitivity_dbm` a little below the weakest first path seen there (-104.2 dBm); frame settings those of
     the firmware. `capture_db` and `dynamic_range_db` are typical of the chip's correlator, and not measured here.
+
+    A board reads `carrier_sign` times the rate of its clock less that of the sender's, plus `skew_bias_ppm`, which
+    grows by `skew_bias_ppm_per_db` above -90 dBm of first-path power: 1 is the boards' convention, -1 that of firmwares
+    which print by how much the sender is ahead. `group_delay` is that of the antennas of all tags that have none of
+    their own.
     """
 
     first_path_at_1m_dbm: float = -80.0
@@ -223,6 +218,9 @@ class Radio(Section):
     rx_noise_ps: NotNegative = 116.0
     skew_noise_ppm: NotNegative = 0.20
     skew_bias_ppm: float = -0.13
+    skew_bias_ppm_per_db: float = 0.0
+    carrier_sign: Literal[-1, 1] = 1
+    group_delay: GroupDelay | None = None
     quantize: bool = True
     preamble_symbols: Literal[64, 128, 256, 512, 1024, 1536, 2048, 4096] = 128
     capture_db: NotNegative = 6.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
 from uwbsim.world.clocks import LONGEST_RUN_S, Clocks
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.reception import Medium
+from uwbsim.world.temperature import readings
 from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
@@ -44,7 +45,7 @@ class Simulated:
     the first two messages; `poses` are those of motion capture; `tags` say which body carries which tag, and where;
     `faults` are the exchanges that failed. `overheard` are the columns of what passive tags heard, `cirs` impulse
     responses (time_ns, board, initiator, target, first path in taps, 1016 magnitudes). `meta` is the recording's
-    provenance.
+    provenance. `temperature` are the columns of what tags with a temperature or a supply voltage read of them.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -72,6 +73,7 @@ class Simulated:
     cirs: list[CirRow]
     truth_m: Floats
     meta: dict[str, Any]
+    temperature: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def planted(self) -> dict[str, Any]:
@@ -160,6 +162,7 @@ def simulate(
         cirs=responses(scenario, run.world, protocol, exchanges, stamped) if scenario.ranging.get_cir else [],
         truth_m=(stamped.distance_m[0] + stamped.distance_m[1]) / 2,
         meta=_provenance(scenario),
+        temperature=readings(scenario),
     )
 
 
@@ -177,6 +180,7 @@ def write(
         recording.append_exchanges(simulated.exchanges)
         recording.append_faults(simulated.faults)
         recording.append_columns("overheard", simulated.overheard)
+        recording.append_columns("temperature", simulated.temperature)
         recording.append_cirs(simulated.cirs)
         recording.append_frames(frames)
 

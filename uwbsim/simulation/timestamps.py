@@ -23,7 +23,7 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import US
 from uwbsim.world.reception import Frames, Medium
-from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
+from uwbsim.world.true_time import SUBTICKS
 
 GRID: Final = DELAYED_TX_GRID
 
@@ -113,7 +113,6 @@ def stamp(
     """Execute exchanges (n,), message after message; `response_delay_uus` replaces the scenario's."""
     scenario, clocks = medium.scenario, medium.clocks
     delay_uus = scenario.ranging.response_delay_uus if response_delay_uus is None else response_delay_uus
-    delays = medium.delays()
     result = Stamped({}, [], [], [], draws.excess_m)
     ready = clocks.read(begun.initiator, begun.start)
     for k, message in enumerate(protocol.messages):
@@ -124,9 +123,8 @@ def stamp(
             printed = _transmission(message, reference, draws.reply_s, delay_uus)
         else:
             printed = _next_grid(-(-ready // SUBTICKS)) + ANTENNA_DELAY_TICKS
-        jitter = draws.transmit[k] * scenario.radio.tx_noise_s * SUBTICKS_PER_SECOND
-        left = np.rint(jitter - delays[sender, 0]).astype(np.int64) + printed * SUBTICKS
-        frames = Frames(sender=sender, receiver=receiver, departure=clocks.when(sender, left))
+        left = medium.leave(sender, printed, draws.transmit[k])
+        frames = Frames(sender=sender, receiver=receiver, departure=left)
         received = medium.receive(frames, draws.receive[k], draws.excess_m)
         result.stamps[f"tx{k + 1}"] = printed
         result.stamps[f"rx{k + 1}"] = received.stamp

@@ -17,6 +17,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Shadow, TwoStateMultipath
+from uwbsim.world.group_delay import group_delay_m, has_group_delays
 from uwbsim.world.pair_levels import PairLevels
 from uwbsim.world.patterns import pattern_gain_db
 from uwbsim.world.propagation import SURFACES, Link, ellipsoid_chord_m, first_path, reflections, through, with_path
@@ -190,12 +191,25 @@ def _levels(link: Link, ends: Ends) -> Link:
     return replace(link, power_dbm=link.power_dbm + level, total_dbm=link.total_dbm + level, paths_dbm=dbm)
 
 
+def _group_delays(link: Link, ends: Ends) -> Link:
+    """Antennas delay by direction: every path of a link as much as the direct one."""
+    if not has_group_delays(ends.scenario):
+        return link
+    apart = (ends.antennas_m[1] - ends.antennas_m[0]) / np.maximum(ends.distance_m, SHORTEST_M)[:, None]
+    late = np.zeros(len(apart))
+    for tags, rotation, way in zip(ends.places, ends.rotations, (apart, -apart), strict=True):
+        late = late + group_delay_m(ends.scenario, tags, np.einsum("ni,nij->nj", way, rotation))
+    paths = None if link.paths_m is None else link.paths_m + late[:, None]
+    return replace(link, excess_m=link.excess_m + late, paths_m=paths)
+
+
 CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
     "obstacles": _obstacles,
     "shadows": _shadows,
     "reflections": _reflections,
     "lasting reflections": _states,
     "fading and outages": _levels,
+    "group delays": _group_delays,
 }
 """What happens to waves on their way, in this order, for every link of every scenario; strangers' effects come last."""
 
@@ -218,8 +232,8 @@ def register_channel_effect(name: str, effect: ChannelEffect) -> None:
     ...     loss_db = 0.2 * link.distance_m
     ...     return replace(link, power_dbm=link.power_dbm - loss_db, total_dbm=link.total_dbm - loss_db)
     >>> uwbsim.register_channel_effect("rain", rain)
-    >>> list(CHANNEL_EFFECTS)
-    ['obstacles', 'shadows', 'reflections', 'lasting reflections', 'fading and outages', 'rain']
+    >>> [*CHANNEL_EFFECTS][-3:]
+    ['fading and outages', 'group delays', 'rain']
     >>> del CHANNEL_EFFECTS["rain"]
     """
     if not isinstance(name, str) or not name:

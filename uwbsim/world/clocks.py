@@ -17,6 +17,7 @@ from uwblink.ticks import COUNTER_BITS, TICKS_PER_SECOND
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.clock_noise import ClockNoise
+from uwbsim.world.temperature import thermal_rate
 from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 
 LONGEST_RUN_S: Final = 36 * 3600.0
@@ -31,8 +32,8 @@ class Clocks:
     """The clocks of all tags, indexed by the tag's place in the scenario.
 
     A clock reads t + offset + deviation(t); the deviation is skew times t plus the integral of the rate's random
-    walk and temperature ramp, constant over steps of `WALK_STEP_S`, plus the phase of its white and flicker noise. (A
-    rate that jumps at regular instants has the Allan variance q^2 tau/3 of a random walk for a shorter tau, too.)
+    walk, temperature and warm-up, constant over steps of `WALK_STEP_S`, plus the phase of its white and flicker noise.
+    (A rate that jumps at regular instants has the Allan variance q^2 tau/3 of a random walk for a shorter tau, too.)
     """
 
     offset: Ints
@@ -56,7 +57,8 @@ class Clocks:
             sigma = tag.drift_per_sqrt_s * np.sqrt(WALK_STEP_S)
             walk = np.concatenate([[0.0], np.cumsum(rng.normal(0, 1, steps) * sigma)])
             ramp = tag.ramp_per_s * WALK_STEP_S * np.arange(steps + 1)
-            rates.append(walk + ramp)
+            middle_s = np.asarray(WALK_STEP_S * (np.arange(steps + 1) + 0.5), dtype=np.float64)
+            rates.append(walk + ramp + thermal_rate(scenario, tag, middle_s))
         rate = np.array(rates)
         step = WALK_STEP_S * SUBTICKS_PER_SECOND
         phase = np.cumsum(rate[:, :-1] * step, axis=1)

@@ -22,6 +22,9 @@ FPP_OFFSET_DB: Final = 121.74
 SKEW_GRID_PPM: Final = 9.3132e-4
 """One count of the carrier integrator (firmware wire format, section 4)."""
 
+CARRIER_REFERENCE_DBM: Final = -90.0
+"""Where the bias of the carrier integrator's readings is `skew_bias_ppm`: in the middle of the boards' powers."""
+
 NULL_DEPTH: Final = 0.1
 SHADOW_HARMONICS: Final = 3
 SHADOW_ORDERS: Final = np.arange(1, SHADOW_HARMONICS + 1)
@@ -120,9 +123,17 @@ def printed_power_dbm(radio: Radio, power_dbm: Floats, noise: Floats) -> Floats:
     return truncate4(10 * np.log10(counts) - FPP_OFFSET_DB)
 
 
-def printed_skew_ppm(radio: Radio, skew_ppm: Floats, noise: Floats) -> Floats:
-    """Relative skew as the boards print it: whole counts of the carrier integrator, with its bias and noise."""
-    read = skew_ppm + radio.skew_bias_ppm + noise * radio.skew_noise_ppm
+def carrier_bias_ppm(radio: Radio, power_dbm: Floats) -> Floats:
+    """Return the bias of the carrier integrator's readings of frames with these first-path powers."""
+    return np.asarray(radio.skew_bias_ppm + radio.skew_bias_ppm_per_db * (power_dbm - CARRIER_REFERENCE_DBM))
+
+
+def printed_skew_ppm(radio: Radio, skew_ppm: Floats, noise: Floats, power_dbm: Floats) -> Floats:
+    """Relative skew as the boards print it: whole counts of the carrier integrator, with its sign, bias and noise.
+
+    `skew_ppm` is by how much the receiver's clock is faster than the sender's.
+    """
+    read = radio.carrier_sign * skew_ppm + carrier_bias_ppm(radio, power_dbm) + noise * radio.skew_noise_ppm
     if not radio.quantize:
         return read
     return truncate4(np.rint(read / SKEW_GRID_PPM) * SKEW_GRID_PPM)

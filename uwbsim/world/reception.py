@@ -6,7 +6,7 @@ distribution and no draw of it, calls `arrive`, on which `receive` is built.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ from uwbsim.units import PPM_PER_ONE
 from uwbsim.world.clocks import Clocks
 from uwbsim.world.propagation import Link
 from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
+from uwbsim.world.temperature import AntennaDelays
 from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 
 
@@ -72,6 +73,23 @@ class Medium:
     scenario: Scenario
     links: Links
     clocks: Clocks
+    delays: AntennaDelays = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Work out what antennas add to stamps."""
+        object.__setattr__(self, "delays", AntennaDelays.of(self.scenario))
+
+    def leave(self, sender: Ints, stamp: Ints, noise: Floats) -> Ints:
+        """Return the true sub-ticks (n,) at which frames leave that have transmit stamps of whole ticks (n,).
+
+        `noise` is standard normal, (n,).
+        """
+        due = stamp * SUBTICKS
+        # When it is, for the temperature, is known well enough without the delay.
+        now = self.clocks.when(sender, due) if self.delays.moving else due
+        delay = self.delays.transmit_s(sender, now)
+        early = noise * self.scenario.radio.tx_noise_s * SUBTICKS_PER_SECOND - delay * SUBTICKS_PER_SECOND
+        return self.clocks.when(sender, np.rint(early).astype(np.int64) + due)
 
     def receive(self, frames: Frames, noise: Floats, detour_m: Floats | float = 0.0) -> Reception:
         """Receive frames (n,); `noise` is standard normal, (n,), `detour_m` how much further they travel by chance."""
@@ -80,14 +98,11 @@ class Medium:
         detour = np.asarray(detour_m) / SPEED_OF_LIGHT * SUBTICKS_PER_SECOND
         flight = np.rint(arrival.flight_s * SUBTICKS_PER_SECOND + detour).astype(np.int64)
         late_s = arrival.bias_s + noise * arrival.std_s
-        delay = self.delays()[frames.receiver, 1]
+        arrives = frames.departure + flight
+        delay = self.delays.receive_s(frames.receiver, arrives) * SUBTICKS_PER_SECOND
         shift = np.rint(late_s * SUBTICKS_PER_SECOND + delay).astype(np.int64)
-        reading = self.clocks.read(frames.receiver, frames.departure + flight)
+        reading = self.clocks.read(frames.receiver, arrives)
         return Reception(stamp=(reading + shift + SUBTICKS // 2) // SUBTICKS, link=link)
-
-    def delays(self) -> Floats:
-        """Return what every tag's antenna adds to transmit and to receive stamps, in sub-ticks, (tags, 2)."""
-        return np.array([tag.antenna_delays_s for tag in self.scenario.tags]) * SUBTICKS_PER_SECOND
 
     def heard(self, power_dbm: Floats, fading: Floats | float = 0.0) -> Bools:
         """Say which frames are strong enough; `fading` is standard normal, and makes the edge soft."""
@@ -102,4 +117,4 @@ class Medium:
         skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * PPM_PER_ONE
         offsets = np.array([tag.power_offset_db for tag in self.scenario.tags])
         read_dbm = power_dbm + offsets[frames.receiver]
-        return printed_power_dbm(radio, read_dbm, power_noise), printed_skew_ppm(radio, skew, skew_noise)
+        return printed_power_dbm(radio, read_dbm, power_noise), printed_skew_ppm(radio, skew, skew_noise, power_dbm)

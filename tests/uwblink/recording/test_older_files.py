@@ -8,7 +8,7 @@ from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, Tag
 
-LATER = ("imu", "height", "powers")
+LATER = ("imu", "height", "powers", "temperature")
 
 
 @pytest.fixture
@@ -30,6 +30,7 @@ def test_a_table_that_came_later_is_empty(older, table):
             TABLES[table], 0
         )
         assert recording.show().counts[table] == 0
+        assert len(recording.temperatures()["supply_v"]) == 0
         assert len(recording.imu()["wx"]) == len(recording.heights()["body"]) == len(recording.powers()["time_ns"]) == 0
 
 

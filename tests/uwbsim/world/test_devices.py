@@ -1,0 +1,192 @@
+"""What boards do as devices: temperature, supply voltage, group delay over direction, and the carrier's reading.
+
+What is expected was worked out by hand from what is planted.
+"""
+
+import numpy as np
+import pytest
+
+import uwbsim
+from uwblink import Board, Recording, raw_range
+from uwblink.protocols.table import PROTOCOLS
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwbsim.errors import ScenarioError
+from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.world.clocks import Clocks
+from uwbsim.world.temperature import AntennaDelays
+from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+
+TYPICAL = {"range_mm_per_k": 2.15, "range_cm_per_v": 5.35}
+WARM = {"model": "warm-up", "start": 23.0, "end": 43.0, "time_constant_s": 5.0}
+
+
+def scenario(tags=({}, {}), bodies=({}, {}), devices=None, places=((0.0, 0.0, 1.0), (4.0, 0.0, 1.0)), **more):
+    """Two tags 4 m apart; 20 ps of noise dither the ticks, the same in every scenario."""
+    quiet = {"rx_noise_ps": 20.0, "skew_noise_ppm": 0.0, "skew_bias_ppm": 0.0}
+    return uwbsim.load(
+        {
+            "run": {"duration_s": 10.0, "seed": 2},
+            "ranging": {
+                "rate_hz": 100.0,
+                "pairs": [[1, 2]],
+                "reply": {"model": "fixed", "delay_us": 305.0},
+            }
+            | more.pop("ranging", {}),
+            "radio": quiet | more.pop("radio", {}),
+            "devices": devices or {},
+            "bodies": [
+                {"name": n, "motion": {"model": "static", "position_m": p}} | b
+                for n, p, b in zip("ab", places, bodies, strict=True)
+            ],
+            "tags": [{"id": k + 1, "body": n} | tag for k, (n, tag) in enumerate(zip("ab", tags, strict=True))],
+        }
+        | more
+    )
+
+
+def errors(world):
+    flight = uwbsim.simulate(world)
+    return raw_range(flight.exchanges) - flight.truth_m, flight.exchanges.time_ns * 1e-9
+
+
+def test_a_warm_up_of_20_kelvin_lengthens_ranges_by_86_mm():
+    """Two tags times 2.15 mm/K times 20 K, as the heat comes."""
+    cold, warm = (errors(scenario(bodies=[{"temperature_c": t}] * 2, devices=TYPICAL)) for t in (23.0, 43.0))
+    # The mean of 1000 ranges with 20 ps and whole ticks is known to 0.1 mm.
+    assert np.mean(warm[0]) - np.mean(cold[0]) == pytest.approx(0.086, abs=0.0005)
+    error, time_s = errors(scenario(bodies=[{"temperature_c": WARM}] * 2, devices=TYPICAL))
+    moved = 0.086 * (1 - np.exp(-time_s / 5.0))
+    assert np.mean(error - moved) == pytest.approx(np.mean(cold[0]), abs=0.0005)
+    assert np.polyfit(moved, error, 1)[0] == pytest.approx(1, abs=0.02)
+
+
+def test_a_tag_alone_half_of_that_and_a_body_only_where_its_tag_has_none():
+    bodies = ({"temperature_c": 43.0}, {"temperature_c": 43.0})
+    tags = ({"temperature_c": 23.0}, {"range_mm_per_k": 3.0})
+    cold, one = (errors(scenario(devices=TYPICAL, **more))[0] for more in ({}, {"tags": tags, "bodies": bodies}))
+    assert np.mean(one) - np.mean(cold) == pytest.approx(0.060, abs=0.0005)
+
+
+def test_a_tenth_of_a_volt_less_shortens_ranges_by_10_7_mm():
+    full, less = (errors(scenario(bodies=[{"supply_v": v}] * 2, devices=TYPICAL))[0] for v in (3.3, 3.2))
+    assert np.mean(less) - np.mean(full) == pytest.approx(-0.0107, abs=0.0005)
+
+
+def test_longer_antennas_send_later_than_stamped_and_stamp_later_than_heard():
+    world = scenario(tags=({"delay_ns": -0.5}, {}), bodies=({"temperature_c": 33.0}, {}), devices=TYPICAL)
+    delays, tags, now = AntennaDelays.of(world), np.array([0, 1]), np.array([5, 5])
+    longer = 2 * 0.0215 / SPEED_OF_LIGHT
+    np.testing.assert_allclose(delays.transmit_s(tags, now), [-0.22e-9 - 0.44 * longer, 0], atol=1e-18)
+    np.testing.assert_allclose(delays.receive_s(tags, now), [0.28e-9 + 0.56 * longer, 0], atol=1e-18)
+
+
+def test_served_boards_are_as_warm():
+    found = []
+    for celsius in (23.0, 223.0):
+        world = scenario(bodies=[{"temperature_c": celsius}] * 2, devices=TYPICAL)
+        board = Board(uwbsim.VirtualPorts(world).port(1))
+        found.append(np.mean([board.range(2).range_m for _ in range(20)]))
+    # 200 K, so that 20 ranges with whole ticks of 4.7 mm know it: to 2 mm.
+    assert found[1] - found[0] == pytest.approx(0.86, abs=0.004)
+
+
+def test_clocks_run_off_by_the_integral_of_warm_up_and_temperature():
+    ramp = {"model": "ramp", "start": 23.0, "end": 33.0, "duration_s": 5.0, "begin_s": 2.0}
+    tags = ({"skew_ppm": 3.0, "warm_up_ppm": 2.0, "warm_up_s": 4.0}, {"temperature_c": ramp, "skew_ppm_per_k": 0.5})
+    clocks, which = Clocks.of(scenario(tags=tags)), np.array([0, 1])
+    begin, end = (clocks.read(which, np.full(2, t * SUBTICKS_PER_SECOND)) for t in (0, 10))
+    gained = (end - begin) / SUBTICKS_PER_SECOND - 10
+    # Rates are constant over tenths of a second, taken in their middles.
+    np.testing.assert_allclose(gained, [30e-6 + 8e-6 * (1 - np.exp(-2.5)), 0.5e-6 * (25 + 30)], atol=2e-9)
+
+
+def test_a_profile_from_a_file_and_what_the_recording_tells(tmp_path):
+    (tmp_path / "heat.csv").write_text("time_s,temperature_c\n0,20\n10,40\n")
+    world = scenario(bodies=({"temperature_c": 25.0}, {}), devices={"reading_noise_k": 0.1, "readings_hz": 2.0})
+    text = (
+        "[run]\nduration_s = 10.0\n[ranging]\nrate_hz = 20\n[devices]\nreadings_hz = 2.0\n"
+        '[[bodies]]\nname = "a"\nmotion = { model = "static", position_m = [0, 0, 1] }\nsupply_v = 3.1\n'
+        '[[bodies]]\nname = "b"\nmotion = { model = "static", position_m = [4, 0, 1] }\n'
+        '[[tags]]\nid = 1\nbody = "a"\ntemperature_c = { model = "table", file = "heat.csv" }\n'
+        '[[tags]]\nid = 2\nbody = "b"\n'
+    )
+    (tmp_path / "s.toml").write_text(text)
+    flight = uwbsim.simulate(tmp_path / "s.toml")
+    flight.save(tmp_path / "f.uwb")
+    with Recording.open(tmp_path / "f.uwb") as recording:
+        told = recording.temperatures()
+        assert "temperature 21" in str(recording.show())
+    assert set(told["tag"].tolist()) == {1}
+    np.testing.assert_allclose(told["temperature_c"], 20 + 2 * told["time_ns"] * 1e-9, atol=1e-9)
+    np.testing.assert_array_equal(told["supply_v"], 3.1)
+    noisy = uwbsim.simulate(world).temperature
+    assert np.isnan(noisy["supply_v"]).all()
+    assert np.std(noisy["temperature_c"]) == pytest.approx(0.1, rel=0.5)
+    assert uwbsim.simulate(scenario()).temperature == {}
+
+
+def test_a_hole_in_a_profile_is_one_line(tmp_path):
+    with pytest.raises(ScenarioError, match=r"bodies\[0\]\.temperature_c.*times_s: must increase"):
+        scenario(bodies=({"temperature_c": {"model": "table", "times_s": [0, 0], "values": [1, 2]}}, {}))
+
+
+WAVES = {"model": "harmonics", "mean_cm": 1.0, "cosine_cm": [2.0, 0.5], "sine_cm": [0.0, 3.0], "elevation_cm": 4.0}
+
+
+@pytest.mark.parametrize("turned", [0.0, 30.0])
+def test_group_delay_lengthens_ranges_by_both_directions(turned):
+    """From a, b lies at azimuth 30 degrees and elevation 0, from b, a at -150 degrees."""
+    places = ((0.0, 0.0, 1.0), (4 * np.cos(np.pi / 6), 2.0, 1.0))
+    free, late = (errors(scenario(places=places, tags=tags))[0] for tags in (({}, {}), ({"group_delay": WAVES},) * 2))
+    flat = 1 + 2 * np.cos(np.pi / 6) + 0.5 * 0.5 + 3 * np.sin(np.pi / 3)
+    back = 1 - 2 * np.cos(np.pi / 6) + 0.5 * 0.5 + 3 * np.sin(np.pi / 3)
+    assert np.mean(late) - np.mean(free) == pytest.approx((flat + back) / 100, abs=0.0005)
+    one = scenario(places=places, tags=({"group_delay": WAVES | {"turned_deg": turned}}, {}))
+    seen = np.radians(30 - turned)
+    expected = 1 + 2 * np.cos(seen) + 0.5 * np.cos(2 * seen) + 3 * np.sin(2 * seen)
+    assert np.mean(errors(one)[0]) - np.mean(free) == pytest.approx(expected / 100, abs=0.0005)
+
+
+def test_group_delay_from_a_table_file_for_all(tmp_path):
+    lines = [f"{a},{e},{a / 60}" for a in (-180, -60, 60, 180) for e in (-90, 90)]
+    (tmp_path / "delay.csv").write_text("azimuth_deg,elevation_deg,delay_cm\n" + "\n".join(lines) + "\n")
+    text = (
+        "[run]\nduration_s = 2.0\n[ranging]\nrate_hz = 100\n"
+        '[radio]\nrx_noise_ps = 20.0\ngroup_delay = {{ model = "table", file = "delay.csv", turned_deg = {} }}\n'
+        '[[bodies]]\nname = "a"\nmotion = {{ model = "static", position_m = [0, 0, 1] }}\n'
+        '[[bodies]]\nname = "b"\nmotion = {{ model = "static", position_m = [0, 4, 1] }}\n'
+        '[[tags]]\nid = 1\nbody = "a"\n[[tags]]\nid = 2\nbody = "b"\n'
+    )
+    found = []
+    for turned in (0, 30):
+        (tmp_path / "s.toml").write_text(text.format(turned))
+        found.append(np.mean(errors(tmp_path / "s.toml")[0]))
+    # At 90 and -90 degrees 1.5 and -1.5 cm; turned by 30 at 60 and -120 degrees 1 and -2 cm.
+    assert found[0] - found[1] == pytest.approx(0.01, abs=0.001)
+
+
+def test_the_carrier_has_a_sign_and_a_bias_that_grows_with_power():
+    told = []
+    for radio in ({}, {"carrier_sign": -1}, {"skew_bias_ppm": 0.1, "skew_bias_ppm_per_db": 0.02}):
+        exact = {"quantize": False, "first_path_at_1m_dbm": -80.0}
+        flight = uwbsim.simulate(scenario(tags=({"skew_ppm": 5.0}, {"skew_ppm": 2.0}), radio=exact | radio))
+        told.append([np.mean(flight.exchanges.skew1_ppm), np.mean(flight.exchanges.skew2_ppm)])
+    # 4 m are 12.04 dB below a metre: -92.04 dBm, 2.04 dB below where the bias is what it is called.
+    bias = 0.1 - 0.02 * (20 * np.log10(4) - 10)
+    np.testing.assert_allclose(told, [[-3, 3], [3, -3], [-3 + bias, 3 + bias]], atol=1e-6)
+
+
+@pytest.mark.parametrize("protocol", ["ss-cfo", "ds", "ds-alt"])
+def test_event_loop_and_monte_carlo_agree_on_all_of_it(protocol):
+    """One flight with everything at once: means of 1000 ranges of either, known to 1 mm each."""
+    tags = (
+        {"skew_ppm": 2.0, "temperature_c": 60.0, "group_delay": WAVES, "tx_power_db": 4.0, "skew_ppm_per_k": 0.01},
+        {"supply_v": 3.0, "range_cm_per_v": 20.0},
+    )
+    radio = {"rx_noise_ps": 50.0, "carrier_sign": -1, "skew_bias_ppm": 0.4, "skew_bias_ppm_per_db": 0.05}
+    world = scenario(tags=tags, devices=TYPICAL, radio=radio, ranging={"protocol": protocol})
+    flight = errors(world)[0]
+    columns = range_errors_m(PROTOCOLS[protocol], conditions_of(world), 3, 20_000)
+    assert np.mean(flight) == pytest.approx(np.mean(columns), abs=0.003)
+    assert abs(np.mean(columns)) > 0.01, "there is something to agree on"
