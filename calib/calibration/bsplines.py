@@ -6,9 +6,14 @@ a fit needs of it, without the quarter of a second that importing `scipy.interpo
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
+
+ROWS_AT_ONCE: Final = 8192
+"""Points evaluated together, so that what leads to them stays in the cache."""
 
 
 def nonzero(x: Floats, knots: Floats, degree: int) -> tuple[Ints, list[Floats]]:
@@ -33,6 +38,9 @@ def nonzero(x: Floats, knots: Floats, degree: int) -> tuple[Ints, list[Floats]]:
 
 def combination(x: Floats, knots: Floats, coefficients: Floats, degree: int) -> Floats:
     """Return the sum of splines times coefficients (m,) at points (n,) inside the knots."""
+    if len(x) > ROWS_AT_ONCE:
+        pieces = [x[begin : begin + ROWS_AT_ONCE] for begin in range(0, len(x), ROWS_AT_ONCE)]
+        return np.concatenate([combination(piece, knots, coefficients, degree) for piece in pieces])
     first, values = nonzero(x, knots, degree)
     total = coefficients[first] * values[0]
     for k in range(1, degree + 1):

@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.power_curves import basis
+from calib.calibration.power_curves import DEGREE, Curve, basis
 from calib.estimation.intervals import blocks_of
 from calib.estimation.misfit import MATTERS, SMALLEST_M, Finding, examine, families, told
 from calib.estimation.persistence import FEWEST_STRETCHES
 from calib.estimation.problem import Problem
-from calib.estimation.solver import Solved, pairs_of
+from calib.estimation.solver import Solved
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -50,7 +50,7 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
     ranges = problem.ranges
     blocks, seconds = blocks_of(ranges.time_ns)
     louder = _of_a_decibel(problem, found)
-    tested = families(ranges.initiator, ranges.target, problem.lifted, ranges.truth_m, louder, seconds)
+    tested = families(problem, louder, seconds)
     judged = examine(
         found.scores,
         found.inverse,
@@ -83,9 +83,9 @@ def _matters(finding: Finding, covariance: Floats) -> bool:
 
 def _of_a_decibel(problem: Problem, found: Solved) -> Floats:
     """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
-    changed = basis(problem.lifted * DECIBEL, problem.knots) - basis(problem.lifted, problem.knots)
-    curves = [found.parameters[columns] for _, columns in problem.curves()]
-    return np.asarray(changed @ np.mean(curves, axis=0))
+    mean = np.mean([found.parameters[columns] for _, columns in problem.curves()], axis=0)
+    curve = Curve(tuple(problem.knots.tolist()), tuple(mean.tolist()), DEGREE, problem.span)
+    return curve(DECIBEL * problem.lifted) - curve(problem.lifted)
 
 
 def _of_another_shape(problem: Problem, found: Solved) -> Floats:
@@ -93,17 +93,14 @@ def _of_another_shape(problem: Problem, found: Solved) -> Floats:
     if found.mixture is None:
         return np.zeros(len(problem.error))
     share = found.mixture.tail_share * found.mixture.noise * float(np.exp(np.mean(found.mixture.of("cell_noise"))))
-    return np.asarray(SHAPE * share[pairs_of(problem.ranges.initiator, problem.ranges.target)])
+    return np.asarray(SHAPE * share[problem.pairs.number])
 
 
 def _reflected(problem: Problem, found: Solved) -> list[str]:
     """Name the pairs of which hardly a range is direct, and tags most of whose are not, where that was fitted."""
     if found.mixture is None:
         return []
-    initiator, target = problem.ranges.initiator, problem.ranges.target
-    pair, share = pairs_of(initiator, target), found.mixture.tail_share
-    first = np.unique(pair, return_index=True)[1]
-    ends = np.sort(np.column_stack([initiator[first], target[first]]), axis=1)
+    share, ends = found.mixture.tail_share, problem.pairs.ends
     tags = np.unique(ends)
     sentences = []
     far = found.mixture.tail_mean_m > FAR_M
@@ -138,7 +135,7 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
     far = problem.ranges.truth_m - np.median(problem.ranges.truth_m)
     link = found.scores.with_groups(far, np.zeros(len(far), dtype=np.int64), 1)[0]
     taken = link @ found.inverse
-    known = float(found.scores.curvature @ far**2 - taken @ link) / found.lasting.factor
+    known = float(found.scores.known() @ far**2 - taken @ link) / found.lasting.factor
     slope = 1 / np.sqrt(SCALE**-2 + max(known, 0.0))
     rows = basis(np.quantile(problem.lifted, np.linspace(0.02, 0.98, 25)), problem.knots)
     rows = np.tile(rows - rows.mean(axis=0), len(problem.groups)) / len(problem.groups)

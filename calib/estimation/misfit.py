@@ -14,7 +14,9 @@ from typing import Final
 
 import numpy as np
 
+from calib.estimation.pairs import places_of
 from calib.estimation.persistence import Persistence, persistence
+from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
 from uwblink.arrays import Floats, Ints
 
@@ -99,22 +101,18 @@ class Tested:
     lasting: Persistence
 
 
-def families(
-    initiator: Ints, target: Ints, lifted: Floats, truth_m: Floats, louder_m: Floats, seconds: float
-) -> Iterator[Family]:
+def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Family]:
     """Yield the alternatives: offsets of a pair, of a tag for a while or as its power changes, and those of arithmetic.
 
     `louder_m` (n,) is what a decibel more would do to each range. The last two are an error that grows with the
     distance, and one of the opposite sign with the other tag initiating, as a clock leaves it whose skew is not
     corrected.
     """
-    tags, ends = np.unique(np.concatenate([initiator, target]), return_inverse=True)
-    first, second = ends[: len(initiator)], ends[len(initiator) :]
-    names, ones = [f"tag {tag}" for tag in tags.tolist()], np.ones(len(initiator))
-    low, high = np.minimum(first, second), np.maximum(first, second)
-    keys, pair = np.unique(low * len(tags) + high, return_inverse=True)
-    named = [f"pair {tags[key // len(tags)]}-{tags[key % len(tags)]}" for key in keys.tolist()]
-    yield Family(kind="pair", names=named, weight=ones, place=pair)
+    tags, truth_m, bins = problem.ranges.tags(), problem.ranges.truth_m, problem.bins
+    first, second = places_of(tags, problem.ranges.initiator, problem.ranges.target)
+    names, ones = [f"tag {tag}" for tag in tags], np.ones(len(first))
+    named = [f"pair {low}-{high}" for low, high in problem.pairs.ends.tolist()]
+    yield Family(kind="pair", names=named, weight=ones, place=problem.pairs.number)
     count = segments(seconds)
     when = np.arange(len(first)) * count // len(first)
     yield Family(
@@ -124,8 +122,7 @@ def families(
         place=first * count + when,
         second=second * count + when,
     )
-    rank = np.empty(len(lifted))
-    rank[np.argsort(lifted, kind="stable")] = np.linspace(-1, 1, len(lifted))
+    rank = np.linspace(-1, 1, len(bins.count))[bins.number]
     yield Family(kind="power", names=names, weight=rank, place=first, second=second)
     size = float(np.sqrt(np.mean(louder_m**2)))
     if size > 0:
@@ -181,7 +178,7 @@ def _test(
     ends = [(family.place, 1.0)]
     if family.second is not None:
         ends.append((family.second, -1.0 if family.signed else 1.0))
-    slope, weighed = scores.score * family.weight, scores.curvature * family.weight**2
+    slope, weighed = scores.score * family.weight, scores.known() * family.weight**2
     for place, sign in ends:
         link += sign * scores.with_groups(family.weight, place, size)
         plain += sign * np.bincount(blocks * size + place, slope, minlength=count * size).reshape(count, size)

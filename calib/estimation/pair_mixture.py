@@ -16,13 +16,17 @@ from typing import Final
 import numpy as np
 
 from calib.estimation.reflections import Shape, expected
-from calib.estimation.scores import Scores, Sort, inverse_of
+from calib.estimation.scores import Scores, Sort, Sums, inverse_of
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
 CELLS: Final = 8
 """Steps of power in which share and noise may differ."""
 
+ROWS_AT_ONCE: Final = 4096
+"""Rows whose slopes are taken together, so that what leads to them stays in the cache."""
+
+ROWS_A_PLACE: Final = 16
 LEVELS: Final = 6
 """Each sample on which the fit converges has so many times the rows of the one before."""
 
@@ -41,6 +45,12 @@ SETTLED: Final = 1e-2
 
 NEARLY: Final = 0.3
 """The same for all parameters together, of which there are many that delays do not depend on."""
+
+ROUGHLY: Final = 1.0
+"""The same on a sample, from which more ranges lead away by tens."""
+
+CHORD: Final = 0.5
+"""Nearer than this to the top, the information is that of the last point where it was asked for."""
 
 LONGEST_STEP: Final = 0.7
 """Of a logarithm or a log odds."""
@@ -87,19 +97,22 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Errors:
-    """What is fitted: `error + design @ x` (n,) metres, the pair (n,) and the step of power (n,) of each range."""
+    """What is fitted: `error + design @ x` (n,) metres, and the place of each range (n,): step of power within pair."""
 
     error: Floats
     design: Floats
-    pair: Ints
-    cell: Ints
+    place: Ints
+    pairs: int
     density: float
 
-    def sample(self, rows: Ints) -> Errors:
+    @property
+    def pair(self) -> Ints:
+        """Return the pair of each range (n,)."""
+        return self.place // CELLS
+
+    def sample(self, rows: Ints | slice) -> Errors:
         """Return some rows."""
-        return replace(
-            self, error=self.error[rows], design=self.design[rows], pair=self.pair[rows], cell=self.cell[rows]
-        )
+        return replace(self, error=self.error[rows], design=self.design[rows], place=self.place[rows])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,13 +165,14 @@ def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats) -> PairMixtur
 
     `ridge` (m, m) is the inverse covariance of what is known of them beforehand, in 1/m^2.
     """
-    layout = Layout(columns=errors.design.shape[1], pairs=int(errors.pair.max()) + 1)
+    layout = Layout(columns=errors.design.shape[1], pairs=errors.pairs)
     theta, prior = _start(errors, layout, start, ridge)
     steps, success = 0, False
     for some in _levels(errors):
-        theta, prior, taken, success = _climb(some, layout, theta, prior)
+        nearly = NEARLY if some is errors else ROUGHLY
+        theta, prior, taken, success = _climb(some, layout, theta, prior, nearly)
         steps += taken
-    scores, _ = _scores(errors, layout, theta)
+    scores = _all_scores(errors, layout, theta)
     covariance = inverse_of(scores.information() + prior.precision, layout.pairs, len(SPREADS))
     return PairMixture(
         layout=layout,
@@ -191,7 +205,8 @@ def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats) -> tupl
     theta[where["mean"]] = np.log(4 * spread)
     theta[where["least"]] = np.log(0.5 * spread)
     theta[where["outliers"]] = OUTLIERS
-    theta[where["cell_noise"]] = np.log([0.9 * _spread(part) for part in _parts(residual, errors.cell, layout.cells)])
+    cells = _parts(residual, errors.place % CELLS, layout.cells)
+    theta[where["cell_noise"]] = np.log([0.9 * _spread(part) for part in cells])
     noise, odds = [], []
     for part in _parts(residual, errors.pair, layout.pairs):
         noise.append(_spread(part, spread))
@@ -242,22 +257,28 @@ def _between(theta: Floats, prior: Prior, layout: Layout, covariance: Floats | N
     return Prior(precision=precision, centre=centre, variances=variances)
 
 
-def _climb(errors: Errors, layout: Layout, theta: Floats, prior: Prior) -> tuple[Floats, Prior, int, bool]:
+def _climb(
+    errors: Errors, layout: Layout, theta: Floats, prior: Prior, nearly: float
+) -> tuple[Floats, Prior, int, bool]:
     """Climb to the top of the likelihood of some errors: parameters, prior, steps, and whether it is the top."""
     best, top, step, shorter = -np.inf, theta, np.zeros_like(theta), 0
+    information, gain = np.zeros((0, 0)), np.inf
     for steps in range(1, MAX_STEPS + 1):
-        scores, likelihood = _scores(errors, layout, theta)
+        fresh = steps == 1 or gain > CHORD
+        sums, likelihood = _sums(errors, layout, theta, squares=fresh)
         value = likelihood - 0.5 * float((theta - prior.centre) @ prior.precision @ (theta - prior.centre))
         if value < best - SETTLED and shorter < 6:
             step, shorter = 0.3 * step, shorter + 1
             theta = top + step
             continue
-        covariance = inverse_of(scores.information() + prior.precision, layout.pairs, len(SPREADS))
-        slope = scores.gradient() - prior.precision @ (theta - prior.centre)
+        information = sums.information() if fresh else information
+        covariance = inverse_of(information + prior.precision, layout.pairs, len(SPREADS))
+        slope = sums.gradient() - prior.precision @ (theta - prior.centre)
         step, shorter = covariance @ slope, 0
         own = slice(0, layout.columns)
         still = abs(float(slope[own] @ step[own])) < SETTLED
-        if still and (float(slope @ step) < NEARLY or steps > PATIENCE):
+        gain = float(slope @ step)
+        if still and (gain < nearly or steps > PATIENCE):
             return theta, prior, steps, True
         longest = float(np.max(np.abs(step[layout.columns :])))
         step *= min(1.0 if steps <= FULL_STEPS else 0.5, LONGEST_STEP / max(longest, 1e-12))
@@ -268,17 +289,46 @@ def _climb(errors: Errors, layout: Layout, theta: Floats, prior: Prior) -> tuple
     return theta, prior, steps, False
 
 
-def _scores(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, float]:
-    """Return the slopes of the log likelihood at parameters, and its value."""
+def _sums(errors: Errors, layout: Layout, theta: Floats, *, squares: bool) -> tuple[Sums, float]:
+    """Return the sums of all slopes at parameters, with those of `squares`, and the log likelihood."""
+    first, *others = _pieces(errors)
+    scores, log_density = _scores(errors.sample(first), layout, theta)
+    sums, likelihood = scores.sums(squares=squares), float(log_density.sum())
+    for rows in others:
+        scores, log_density = _scores(errors.sample(rows), layout, theta)
+        sums += scores.sums(squares=squares)
+        likelihood += float(log_density.sum())
+    return sums, likelihood
+
+
+def _pieces(errors: Errors) -> list[slice]:
+    """Return rows that are worked on together: few enough for the cache, but many more than their sums."""
+    size = max(ROWS_AT_ONCE, ROWS_A_PLACE * errors.pairs * CELLS)
+    return [slice(begin, begin + size) for begin in range(0, len(errors.error), size)]
+
+
+def _all_scores(errors: Errors, layout: Layout, theta: Floats) -> Scores:
+    """Return the slopes of all ranges at parameters."""
+    parts = [_scores(errors.sample(rows), layout, theta)[0] for rows in _pieces(errors)]
+    return replace(
+        parts[0],
+        design=errors.design,
+        score=np.concatenate([part.score for part in parts]),
+        slopes=tuple(np.concatenate(column) for column in zip(*(part.slopes for part in parts), strict=True)),
+        place=errors.place,
+    )
+
+
+def _scores(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, Floats]:
+    """Return the slopes of the log likelihood at parameters, and its value for every range (n,)."""
     part = {name: theta[rows] for name, rows in layout.slices().items()}
     residual = errors.error + errors.design @ part["design"]
-    sigma = np.exp(part["pair_noise"][:, None] + part["cell_noise"])
-    share = 1 / (1 + np.exp(-part["pair_share"][:, None] - part["cell_share"]))
-    both = errors.pair * layout.cells + errors.cell
+    sigma = np.exp(part["pair_noise"][:, None] + part["cell_noise"]).ravel()
+    share = 1 / (1 + np.exp(-part["pair_share"][:, None] - part["cell_share"])).ravel()
     shape = Shape(
-        sigma_m=sigma.ravel()[both],
-        tail_share=share.ravel()[both],
-        mean_m=np.exp(part["mean"][0] + part["pair_mean"])[errors.pair],
+        sigma_m=sigma[errors.place],
+        tail_share=share[errors.place],
+        mean_m=np.exp(part["mean"][0] + part["pair_mean"]).repeat(layout.cells)[errors.place],
         least_m=float(np.exp(part["least"][0])),
         outlier_share=float(1 / (1 + np.exp(-part["outliers"][0]))),
         outlier_density=errors.density,
@@ -286,16 +336,30 @@ def _scores(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, floa
     found = expected(residual, shape)
     z, noise = residual / shape.sigma_m, found.noise_m / shape.sigma_m
     score = -(found.core * z + found.tail * noise) / shape.sigma_m
-    by_noise = found.core * (z * z - 1) + found.tail * (noise * noise + found.noise_var - 1)
-    by_share = found.tail - shape.tail_share * (found.core + found.tail)
-    by_mean = found.tail * ((residual - shape.least_m - found.noise_m) / shape.mean_m - 1)
-    pairs, cells = (errors.pair, layout.pairs), (errors.cell, layout.cells)
-    sorts = (
-        Sort(slope=by_mean),
-        Sort(slope=found.tail * noise * (shape.least_m / shape.sigma_m)),
-        Sort(slope=1 - found.core - found.tail - shape.outlier_share),
-        *(Sort(slope=slope, place=cells[0], count=cells[1]) for slope in (by_noise, by_share)),
-        *(Sort(slope=slope, place=pairs[0], count=pairs[1]) for slope in (by_share, by_noise, by_mean)),
+    slopes = (
+        found.core * (z * z - 1) + found.tail * (noise * noise + found.noise_var - 1),
+        found.tail - shape.tail_share * (found.core + found.tail),
+        found.tail * ((residual - shape.least_m - found.noise_m) / shape.mean_m - 1),
+        found.tail * noise * (shape.least_m / shape.sigma_m),
+        1 - found.core - found.tail - shape.outlier_share,
     )
-    scores = Scores(design=errors.design, score=score, curvature=score * score, sorts=sorts)
-    return scores, float(found.log_density.sum())
+    scores = Scores(
+        design=errors.design,
+        score=score,
+        slopes=slopes,
+        place=errors.place,
+        places=layout.pairs * layout.cells,
+        sorts=_sorts(layout),
+    )
+    return scores, found.log_density
+
+
+def _sorts(layout: Layout) -> tuple[Sort, ...]:
+    """Return the sorts of parameters in the layout's order; slopes are by noise, share, mean, least and outliers."""
+    noise, share, mean, least, outliers = range(5)
+    pair, cell = np.divmod(np.arange(layout.pairs * layout.cells), layout.cells)
+    return (
+        *(Sort(slope=slope) for slope in (mean, least, outliers)),
+        *(Sort(slope=slope, whose=cell, count=layout.cells) for slope in (noise, share)),
+        *(Sort(slope=slope, whose=pair, count=layout.pairs) for slope in (share, noise, mean)),
+    )

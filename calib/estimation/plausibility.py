@@ -18,6 +18,9 @@ MOST_LEFT_OUT: Final = 0.5
 SCALE: Final = (0.75, 1.35)
 """How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
 
+ENOUGH: Final = 100_000
+"""Of more ranges, only every so many are asked for their scale."""
+
 UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet", 1000.0: "kilometres"}
 FEWEST_SPREADS: Final = 3.0
 """True distances must spread by so much more than errors for their scale to be known."""
@@ -62,7 +65,8 @@ def _mostly_left_out(ranges: Ranges) -> None:
 
 def _scale(ranges: Ranges) -> None:
     """Compare how ranges and true distances spread: a unit or two columns may be wrong."""
-    raw, truth = ranges.raw_m, ranges.truth_m
+    every = slice(None, None, max(len(ranges) // ENOUGH, 1))
+    raw, truth = ranges.raw_m[every], ranges.truth_m[every]
     slope = robust_slope(truth, raw)
     rest = robust_spread(raw - slope * truth)
     if SCALE[0] < slope < SCALE[1] or abs(slope) * robust_spread(truth) < FEWEST_SPREADS * rest:

@@ -16,7 +16,7 @@ from calib.estimation.problem import Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of
 from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import reml_penalty
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 
 PILOT: Final = 6000
 """Rows of the sample on which a start is found; from there, a few Newton steps over all rows suffice."""
@@ -96,20 +96,14 @@ def solve(
 
 def _errors(problem: Problem) -> Errors:
     """Return what the mixture is fitted to."""
-    bins = problem.bins
+    bins, pairs = problem.bins, problem.pairs
     return Errors(
         error=problem.error,
         design=problem.design,
-        pair=pairs_of(problem.ranges.initiator, problem.ranges.target),
-        cell=bins.number * CELLS // len(bins.count),
+        place=pairs.number * CELLS + bins.number * CELLS // len(bins.count),
+        pairs=len(pairs.ends),
         density=1 / (float(np.ptp(problem.error)) + 1e-9),
     )
-
-
-def pairs_of(initiator: Ints, target: Ints) -> Ints:
-    """Number the pairs of tags of ranges (n,), whoever initiated."""
-    low, high = np.minimum(initiator, target), np.maximum(initiator, target)
-    return np.unique(low * (int(high.max()) + 1) + high, return_inverse=True)[1]
 
 
 def _slopes(design: Floats, found: Solution, loss: str, ridge: Floats) -> tuple[Scores, Floats, Floats]:

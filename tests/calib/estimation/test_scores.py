@@ -1,5 +1,7 @@
 """Slopes of the likelihood against differences of it, and sums of them against sums written out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import exponnorm
@@ -14,8 +16,8 @@ def errors(n=600, pairs=3, seed=4):
     return Errors(
         error=rng.normal(0, 0.08, n) + (rng.random(n) < 0.2) * rng.exponential(0.3, n),
         design=rng.normal(size=(n, 2)),
-        pair=rng.integers(0, pairs, n),
-        cell=rng.integers(0, 8, n),
+        place=rng.integers(0, 8 * pairs, n),
+        pairs=pairs,
         density=0.2,
     )
 
@@ -30,7 +32,8 @@ def test_slopes_are_those_of_the_likelihood():
     step, found = 1e-6, []
     for k in range(len(theta)):
         moved = np.eye(len(theta))[k] * step
-        found.append((_scores(some, layout, theta + moved)[1] - _scores(some, layout, theta - moved)[1]) / (2 * step))
+        change = _scores(some, layout, theta + moved)[1] - _scores(some, layout, theta - moved)[1]
+        found.append(change.sum() / (2 * step))
     np.testing.assert_allclose(scores.gradient(), found, rtol=1e-5, atol=1e-4)
 
 
@@ -54,16 +57,17 @@ def test_the_density_is_that_of_scipy():
 def scores():
     rng = np.random.default_rng(2)
     n = 500
-    place = rng.integers(0, 4, n)
     return Scores(
         design=rng.normal(size=(n, 3)),
         score=rng.normal(size=n),
-        curvature=rng.uniform(0.5, 1, n),
+        slopes=tuple(rng.normal(size=(3, n))),
+        place=rng.integers(0, 8, n),
+        places=8,
         sorts=(
-            Sort(slope=rng.normal(size=n)),
-            Sort(slope=rng.normal(size=n), place=place, count=4),
-            Sort(slope=rng.normal(size=n), place=place, count=4),
-            Sort(slope=rng.normal(size=n), place=rng.integers(0, 2, n), count=2),
+            Sort(slope=0),
+            Sort(slope=1, whose=np.arange(8) // 2, count=4),
+            Sort(slope=2, whose=np.arange(8) // 2, count=4),
+            Sort(slope=1, whose=np.arange(8) % 2, count=2),
         ),
     )
 
@@ -72,8 +76,8 @@ def written_out(scores):
     """The matrix that `Scores` never builds."""
     columns = [scores.design * scores.score[:, None]]
     for sort in scores.sorts:
-        place = np.zeros(len(sort.slope), dtype=int) if sort.place is None else sort.place
-        columns.append(np.eye(sort.count)[place] * sort.slope[:, None])
+        whose = np.zeros(8, dtype=int) if sort.whose is None else sort.whose
+        columns.append(np.eye(sort.count)[whose[scores.place]] * scores.slopes[sort.slope][:, None])
     return np.hstack(columns)
 
 
@@ -84,8 +88,27 @@ def test_sums_are_those_of_the_matrix_written_out(scores):
     expected_sums = np.array([matrix[blocks == b].sum(axis=0) for b in range(17)])
     np.testing.assert_allclose(scores.by_block(blocks, 17), expected_sums, atol=1e-9)
     square = matrix.T @ matrix
-    square[:3, :3] = (scores.design * scores.curvature[:, None]).T @ scores.design
     np.testing.assert_allclose(scores.information(), square, atol=1e-9)
+    parts = [
+        replace(
+            scores,
+            design=scores.design[rows],
+            score=scores.score[rows],
+            place=scores.place[rows],
+            slopes=tuple(slope[rows] for slope in scores.slopes),
+        )
+        for rows in (slice(0, 300), slice(300, None))
+    ]
+    both = parts[0].sums() + parts[1].sums()
+    np.testing.assert_allclose(both.information(), square, atol=1e-9)
+    np.testing.assert_allclose(both.gradient(), matrix.sum(axis=0), atol=1e-9)
+
+
+def test_a_curvature_of_its_own_is_that_of_the_design(scores):
+    curvature = np.random.default_rng(7).uniform(0.5, 1, 500)
+    square = (scores.design * curvature[:, None]).T @ scores.design
+    plain = replace(scores, curvature=curvature)
+    np.testing.assert_allclose(plain.information()[:3, :3], square, atol=1e-9)
 
 
 def test_offsets_of_groups_are_linked_as_columns_would_be(scores):
@@ -93,7 +116,7 @@ def test_offsets_of_groups_are_linked_as_columns_would_be(scores):
     weight, place = rng.normal(size=500), rng.integers(0, 5, 500)
     offsets = np.eye(5)[place] * weight[:, None]
     link = scores.with_groups(weight, place, 5)
-    np.testing.assert_allclose(link[:, :3], (offsets * scores.curvature[:, None]).T @ scores.design, atol=1e-9)
+    np.testing.assert_allclose(link[:, :3], (offsets * scores.score[:, None] ** 2).T @ scores.design, atol=1e-9)
     rest = (offsets * scores.score[:, None]).T @ written_out(scores)[:, 3:]
     np.testing.assert_allclose(link[:, 3:], rest, atol=1e-9)
 
