@@ -47,7 +47,7 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
     """
     if robust_spread(residual_m) < LEAST_SPREAD_M:
         return None
-    pair, names = _pairs(problem)
+    pair, names = problem.pairs.number, [f"{low}-{high}" for low, high in problem.pairs.ends.tolist()]
     cell = problem.bins.number * CELLS // len(problem.bins.count)
     location = 0.0
     if mixture is None:
@@ -75,21 +75,13 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
     return _put_right(model, problem, residual_m)
 
 
-def _pairs(problem: Problem) -> tuple[Ints, list[str]]:
-    """Return the pair of each range (n,), numbered as in a mixture, and the names of all."""
-    initiator, target = problem.ranges.initiator, problem.ranges.target
-    low, high = np.minimum(initiator, target), np.maximum(initiator, target)
-    codes, number = np.unique(low * (int(high.max()) + 1) + high, return_inverse=True)
-    return number, [f"{code // (int(high.max()) + 1)}-{code % (int(high.max()) + 1)}" for code in codes.tolist()]
-
-
 def _about_their_centre(residual_m: Floats, pair: Ints, cell: Ints) -> PairMixture:
     """Fit a mixture to residuals (n,) of another loss, about a centre that is fitted along."""
     errors = Errors(
         error=residual_m,
         design=np.ones((len(residual_m), 1)),
-        pair=pair,
-        cell=cell,
+        place=pair * CELLS + cell,
+        pairs=int(pair.max()) + 1,
         density=1 / (float(np.ptp(residual_m)) + 1e-9),
     )
     return fit_pair_mixture(errors, np.array([-float(np.median(residual_m))]), np.zeros((1, 1)))
@@ -107,12 +99,12 @@ class _PairsPredicted:
 
 def _of_pairs(mixture: PairMixture, time_ns: Ints, pair: Ints) -> _PairsPredicted:
     """Draw pairs to what they have in common, by what they know where reflections last."""
-    by_share = mixture.scores.sorts[5]
+    by_share = mixture.slope("share")
     pairs = mixture.layout.pairs
-    factor = _lasting(by_share.slope, pair, pairs, time_ns)
+    factor = _lasting(by_share, pair, pairs, time_ns)
     reflected = np.bincount(pair, minlength=pairs) * mixture.tail_share
     # One wall has one detour: a mean is known from as many reflections as there were, not from as many ranges.
-    unknown = [factor / np.maximum(known, 1e-6) for known in (np.bincount(pair, by_share.slope**2, pairs), reflected)]
+    unknown = [factor / np.maximum(known, 1e-6) for known in (np.bincount(pair, by_share**2, pairs), reflected)]
     share, share_var, any_share, any_share_var = _drawn(mixture.of("pair_share"), unknown[0])
     mean, mean_var, any_mean, any_mean_var = _drawn(mixture.of("pair_mean"), unknown[1])
     middle = float(np.mean(mixture.of("cell_share")))
@@ -177,7 +169,7 @@ class _Outliers:
 
 
 def _outliers(mixture: PairMixture, error_m: Floats) -> _Outliers:
-    outlier = np.clip(mixture.scores.sorts[2].slope + 1 / (1 + np.exp(-mixture.of("outliers")[0])), 0, 1)
+    outlier = np.clip(mixture.slope("outliers") + 1 / (1 + np.exp(-mixture.of("outliers")[0])), 0, 1)
     reach = BEYOND_MEANS * float(mixture.tail_mean_m.max())
     near = outlier * (np.abs(error_m) < reach)
     share = max(float(near.mean()), 1e-9)

@@ -27,6 +27,10 @@ ROWS_AT_ONCE: Final = 4096
 """Rows whose slopes are taken together, so that what leads to them stays in the cache."""
 
 ROWS_A_PLACE: Final = 16
+
+SLOPES: Final = ("noise", "share", "mean", "least", "outliers")
+"""What a range has slopes by beside those of the design, in their order."""
+
 LEVELS: Final = 6
 """Each sample on which the fit converges has so many times the rows of the one before."""
 
@@ -142,6 +146,10 @@ class PairMixture:
     def of(self, sort: str) -> Floats:
         """Return the parameters of a sort."""
         return self.parameters[self.layout.slices()[sort]]
+
+    def slope(self, name: str) -> Floats:
+        """Return every range's slope by its own parameter of a kind of `SLOPES` (n,)."""
+        return self.scores.slopes[SLOPES.index(name)]
 
     @property
     def tail_share(self) -> Floats:
@@ -355,8 +363,8 @@ def _scores(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, Floa
 
 
 def _sorts(layout: Layout) -> tuple[Sort, ...]:
-    """Return the sorts of parameters in the layout's order; slopes are by noise, share, mean, least and outliers."""
-    noise, share, mean, least, outliers = range(5)
+    """Return the sorts of parameters in the layout's order."""
+    noise, share, mean, least, outliers = range(len(SLOPES))
     pair, cell = np.divmod(np.arange(layout.pairs * layout.cells), layout.cells)
     return (
         *(Sort(slope=slope) for slope in (mean, least, outliers)),
