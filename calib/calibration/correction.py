@@ -1,18 +1,26 @@
-"""Writes a recording again with corrected ranges."""
+"""Writes a recording again with corrected ranges, or as files that others read."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, CorrectedRanges, require_calibration
 from calib.errors import BadInputError
 from calib.ranges import Ranges
+from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
 from uwblink.recording.file import Recording
+from uwblink.twr import Exchanges
+
+NUMBERS: Final = ("sigma_m",)
+"""Columns of the table `corrected` that are NaN where a range has no power."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +32,19 @@ class Applied:
 
 
 def apply(
-    source: str | os.PathLike[str], calibration: Calibration, output: str | os.PathLike[str], *, force: bool = False
+    source: str | os.PathLike[str],
+    calibration: Calibration,
+    output: str | os.PathLike[str],
+    *,
+    to: str | None = None,
+    force: bool = False,
 ) -> Applied:
     """Write a recording again with `range_m` of every exchange corrected, and every other row of every table as it was.
 
-    Stamps stay as they were recorded. An exchange without any power gets the delays' part only. Raises `BadInputError`
-    for a recording that is corrected already, and what `Recording.open` and `check_output` raise.
+    The table `corrected` says of each exchange what it was before, its standard deviation and its flags. `to` writes a
+    folder in a form of `uwblink.exporters` instead ("csv", "parquet", "mcap", "rosbag2"). Stamps stay as they were
+    recorded. An exchange without any power gets the delays' part only. Raises `BadInputError` for a recording that is
+    corrected already, and what `Recording.open`, `check_output` and `export_recording` raise.
 
     >>> import calib, tempfile
     >>> from uwblink import Recording
@@ -42,17 +57,44 @@ def apply(
     900
     """
     require_calibration(calibration)
-    check_output(Path(output), force=force)
+    if to is None:
+        return _write(source, calibration, Path(output), force=force)
+    check_export(output, to=to, force=force)
+    with TemporaryDirectory() as place:
+        path = Path(place) / Path(source).name
+        done = _write(source, calibration, path, force=False)
+        export_recording(path, output, to=to, force=force)
+    return done
+
+
+def _write(source: str | os.PathLike[str], calibration: Calibration, output: Path, *, force: bool) -> Applied:
+    check_output(output, force=force)
     with Recording.open(source) as recording:
         if "calibration" in recording.meta():
             raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")
         exchanges = recording.exchanges()
         applied = calibration.apply(Ranges.from_exchanges(exchanges, source=Path(source).name))
-        corrected = np.where(np.isfinite(applied.lifted), applied.corrected_m, applied.delay_corrected_m)
+        table = _table(exchanges, applied)
         recording.copy(
             output,
-            replacing={"exchanges": replace(exchanges, range_m=corrected)},
+            replacing={"exchanges": replace(exchanges, range_m=table["corrected_m"]), "corrected": table},
             meta={"calibration": calibration.provenance},
             force=force,
         )
     return Applied(len(exchanges), int(np.count_nonzero(applied.clamped)))
+
+
+def _table(exchanges: Exchanges, applied: CorrectedRanges) -> dict[str, NDArray[Any]]:
+    """Return the rows of the table `corrected`, one an exchange."""
+    powered = np.isfinite(applied.lifted)
+    known = {name: np.where(powered, getattr(applied, name), np.nan) for name in NUMBERS}
+    return {
+        "time_ns": exchanges.time_ns,
+        "initiator": exchanges.initiator,
+        "target": exchanges.target,
+        "raw_m": applied.raw_m,
+        "corrected_m": np.where(powered, applied.corrected_m, applied.delay_corrected_m),
+        "clamped": applied.clamped,
+        "outlier": np.zeros(len(exchanges), dtype=bool),
+        **known,
+    }

@@ -24,13 +24,14 @@ def add_to(app: typer.Typer) -> None:
 def apply(
     recording: Annotated[Path, typer.Argument(help="Recording to correct (.uwb).")],
     calibration: CalibrationFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb); a folder with --to.")],
+    to: Annotated[str | None, typer.Option(help="csv, parquet, mcap or rosbag2: a folder instead.")] = None,
     force: Force = False,
 ) -> None:
     """Write a recording again with its ranges corrected (range_m); all else stays as it was."""
     import calib
 
-    applied = calib.apply(recording, calib.load_calibration(calibration), output, force=force)
+    applied = calib.apply(recording, calib.load_calibration(calibration), output, to=to, force=force)
     typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
 
 

@@ -55,7 +55,7 @@ def show(
 
 def export(
     recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
-    to: Annotated[str, typer.Option(help="csv, parquet, tum or mcap.")],
+    to: Annotated[str, typer.Option(help="csv, parquet, tum, mcap or rosbag2.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
     force: Force = False,
 ) -> None:

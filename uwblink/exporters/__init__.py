@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
 from uwblink.exporters.mcap import write_mcap
+from uwblink.exporters.rosbag2 import write_rosbag2
 from uwblink.exporters.tables import write_csv, write_parquet
 from uwblink.exporters.tum import write_tum
 from uwblink.plugins import NAME, Registry
@@ -44,6 +45,7 @@ _OWN: Final = (
     Exporter("parquet", write_parquet, "a Parquet file a table"),
     Exporter("tum", write_tum, "a trajectory a body (time x y z qx qy qz qw)"),
     Exporter("mcap", write_mcap, "one file of JSON messages, for Foxglove and PlotJuggler"),
+    Exporter("rosbag2", write_rosbag2, "a bag of ROS 2: PoseStamped, tf, sensor_msgs/Range and Imu"),
 )
 
 EXPORTERS: Final[Registry[Exporter]] = Registry("exporter", "uwbcal.exporters", _OWN, check_exporter)
@@ -56,6 +58,17 @@ def register_exporter(row: Exporter, *, replace: bool = False) -> None:
     `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken.
     """
     EXPORTERS.register(row, replace=replace)
+
+
+def check_export(folder: str | os.PathLike[str], *, to: str, force: bool) -> None:
+    """Raise what `export_recording` raises for a form that there is not, or a folder that cannot be written."""
+    final = Path(folder)
+    if to not in EXPORTERS:
+        raise ArgumentError(f"found {to!r:.40}, allowed: {', '.join(EXPORTERS)}", parameter="to")
+    if final.exists() and (not force or not final.is_dir()):
+        raise RecordingExistsError(f"{final}: exists already; give another name, or `force` to replace it")
+    if not final.parent.is_dir():
+        raise RecordingError(f"{final}: the folder {final.parent} does not exist; create it first")
 
 
 def export_recording(
@@ -74,13 +87,8 @@ def export_recording(
     >>> export_recording(place / "mine.uwb", place / "mine", to="csv")["exchanges.csv"]
     1
     """
-    if to not in EXPORTERS:
-        raise ArgumentError(f"to: found {to!r:.40}, allowed: {', '.join(EXPORTERS)}")
     final = Path(folder)
-    if final.exists() and (not force or not final.is_dir()):
-        raise RecordingExistsError(f"{final}: exists already; give another name, or `force` to replace it")
-    if not final.parent.is_dir():
-        raise RecordingError(f"{final}: the folder {final.parent} does not exist; create it first")
+    check_export(final, to=to, force=force)
     partial = final.with_name(f".{final.name}.{os.getpid()}.partial")
     try:
         partial.mkdir()

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 
 from uwblink.errors import RecordingError
+from uwblink.exporters.corrections import corrections
 from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
 from uwblink.recording.contents import Contents, load
 
@@ -95,7 +96,7 @@ def _poses(held: Contents) -> Iterator[Message]:
 def _ranges(held: Contents) -> Iterator[Message]:
     e = held.exchanges
     names = ("initiator", "target", "protocol", *NUMBERS)
-    columns = {name: getattr(e, name).tolist() for name in names}
+    columns = {name: getattr(e, name).tolist() for name in names} | corrections(held)
     for k in np.argsort(e.time_ns, kind="stable").tolist():
         row = {name: column[k] for name, column in columns.items()}
         yield int(e.time_ns[k]), f"/ranges/{row['initiator']}_{row['target']}", RANGE, _known(row)

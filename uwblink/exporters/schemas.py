@@ -22,7 +22,7 @@ _TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
 _VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 RANGE_NUMBERS: Final = (
-    "range_m", "corrected_m", "sigma_m", "sigma_total_m", "tail_probability", "truth_m",
+    "range_m", "corrected_m", "sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability", "truth_m",
     "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm",
 )  # fmt: skip
 RANGE_FLAGS: Final = ("clamped", "outlier")

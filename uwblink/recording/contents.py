@@ -31,7 +31,8 @@ def _no_poses() -> Poses:
 class Contents:
     """What a recording holds; only the exchanges are needed to make one.
 
-    `overheard`, `imu`, `height`, `powers` and `temperature` have the columns of the tables of these names, or none;
+    `overheard`, `imu`, `height`, `powers`, `temperature` and `corrected` have the columns of the tables of these names, or
+    none;
     `meta` is what is known of the whole.
 
     >>> from uwblink import Contents, Exchanges, Tag
@@ -49,6 +50,7 @@ class Contents:
     height: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     powers: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     temperature: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    corrected: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     cirs: list[CirRow] = field(default_factory=list)
     frames: list[FrameRow] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
@@ -78,6 +80,7 @@ class Contents:
             poses=_around(self.poses, first_ns, end_ns),
             overheard=_overheard(heard, chosen),
             powers=_overheard(self.powers, chosen),
+            corrected=_overheard(self.corrected, chosen),
             imu=_between(self.imu, first_ns, end_ns),
             height=_between(self.height, first_ns, end_ns),
             temperature=_between(self.temperature, first_ns, end_ns),
@@ -136,7 +139,7 @@ class Contents:
         return first, far if stop_s is None else origin + round(stop_s * 1e9)
 
 
-_COLUMNS: Final = ("overheard", "imu", "height", "powers", "temperature")
+_COLUMNS: Final = ("overheard", "imu", "height", "powers", "temperature", "corrected")
 """The tables that are held as columns by name."""
 
 
@@ -155,8 +158,8 @@ def load(path: str | os.PathLike[str]) -> Contents:
     with Recording.open(Path(path)) as r:
         return Contents(
             exchanges=r.exchanges(), tags=r.tags(), poses=r.poses(), overheard=r.overheard(), imu=r.imu(),
-            height=r.heights(), powers=r.powers(), temperature=r.temperatures(), cirs=r.cirs(), frames=r.frames(),
-            faults=r.faults(), meta=r.meta(),
+            height=r.heights(), powers=r.powers(), temperature=r.temperatures(), corrected=r.corrected(),
+            cirs=r.cirs(), frames=r.frames(), faults=r.faults(), meta=r.meta(),
         )  # fmt: skip
 
 

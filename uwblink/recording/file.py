@@ -344,6 +344,16 @@ class Recording:
         order = np.argsort(found["time_ns"], kind="stable")
         return {name: column[order] for name, column in found.items()}
 
+    def corrected(self) -> dict[str, NDArray[Any]]:
+        """Return what a calibration said of each exchange, in their order, as columns of the table `corrected`.
+
+        NaN where it said nothing; recordings whose ranges are as they were measured have no rows.
+        """
+        found = self.columns("corrected")
+        flags = ("clamped", "outlier")
+        numbers = {name: _filled(column) for name, column in found.items() if name not in flags}
+        return numbers | {name: np.ma.filled(found[name], False).astype(bool) for name in flags}
+
     def _readings(self, table: str) -> dict[str, NDArray[Any]]:
         found = self.columns(table)
         order = np.argsort(_filled(found["time_ns"]), kind="stable")
@@ -400,9 +410,10 @@ _APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
     "height": lambda recording, columns: recording.append_columns("height", columns),
     "powers": lambda recording, columns: recording.append_columns("powers", columns),
     "temperature": lambda recording, columns: recording.append_columns("temperature", columns),
+    "corrected": lambda recording, columns: recording.append_columns("corrected", columns),
 }
 
-_EMPTY: Final = {"BIGINT": np.int64, "DOUBLE": np.float64, "USMALLINT": np.uint16}
+_EMPTY: Final = {"BIGINT": np.int64, "BOOLEAN": np.bool_, "DOUBLE": np.float64, "USMALLINT": np.uint16}
 
 
 def _known_tables(names: Iterable[str]) -> None:

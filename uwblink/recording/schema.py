@@ -78,6 +78,13 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         "tag": "USMALLINT",
         **dict.fromkeys(("temperature_c", "supply_v"), "DOUBLE"),
     },
+    "corrected": {
+        "time_ns": "BIGINT",
+        **dict.fromkeys(("initiator", "target"), "USMALLINT"),
+        **dict.fromkeys(("raw_m", "corrected_m", "sigma_m", "sigma_total_m"), "DOUBLE"),
+        **dict.fromkeys(("mean_error_m", "tail_share", "tail_probability"), "DOUBLE"),
+        **dict.fromkeys(("clamped", "outlier"), "BOOLEAN"),
+    },
 }
 
 ADDED_LATER: Final = {
@@ -86,6 +93,7 @@ ADDED_LATER: Final = {
     "height": frozenset(TABLES["height"]),
     "powers": frozenset(TABLES["powers"]),
     "temperature": frozenset(TABLES["temperature"]),
+    "corrected": frozenset(TABLES["corrected"]),
 }
 """Columns that a recording may lack, because it is older than they are; where all of a table's are, the table."""
 

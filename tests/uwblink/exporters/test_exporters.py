@@ -73,7 +73,7 @@ def test_trajectories(tmp_path):
 
 def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     before = sorted(tmp_path.iterdir())
-    with pytest.raises(ArgumentError, match="to: found 'xls', allowed: csv, parquet, tum, mcap"):
+    with pytest.raises(ArgumentError, match="`to`: found 'xls', allowed: csv, parquet, tum, mcap, rosbag2"):
         export_recording(whole, tmp_path / "out", to="xls")
     with pytest.raises(RecordingError, match="no such recording"):
         export_recording(tmp_path / "no.uwb", tmp_path / "out", to="csv")

@@ -33,6 +33,7 @@ INSTEAD = {
     },
     "powers": {name: np.array([1.0]) for name in TABLES["powers"]},
     "temperature": {name: np.array([2.0]) for name in TABLES["temperature"]},
+    "corrected": {name: np.array([1.0]) for name in TABLES["corrected"]},
     "height": {"time_ns": np.array([3]), "body": np.array(["z"]), "height_m": np.array([np.nan])},
 }
 
@@ -53,6 +54,7 @@ def full(tmp_path):
         r.append_columns("powers", {name: np.array([2, 1]) for name in TABLES["powers"]})
         celsius = {"temperature_c": np.array([25.5, 26.0]), "supply_v": np.array([3.3, np.nan])}
         r.append_columns("temperature", {"time_ns": np.array([4, 3]), "tag": np.array([1, 3])} | celsius)
+        r.append_columns("corrected", {name: np.array([1, 0]) for name in TABLES["corrected"] if name != "sigma_m"})
         r.append_columns("height", {"height_m": np.array([0.5, 0.25])} | readings)
         r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "failed exchange", "é", 2, 1)])
     with duckdb.connect(str(path)) as db:

@@ -1,0 +1,211 @@
+"""What was exported, read by the readers that others use: mcap, rosbags, pandas, and TUM by the rules of evo."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+import calib
+from tests.uwblink.recording.test_copy import rows
+from uwblink.errors import RecordingError
+from uwblink.exporters import export_recording
+from uwblink.importers import import_recording
+from uwblink.importers.pose_bags import read_bag
+from uwblink.recording.contents import Contents, load
+from uwblink.recording.schema import Fault, Poses
+from uwblink.twr import Exchanges
+
+WHEN = 1_706_822_508_042_560_815
+
+
+@pytest.fixture
+def recording(tmp_path):
+    random = np.random.default_rng(3)
+    n = 50
+    stamps: dict[str, Any] = {name: random.integers(0, 2**32, n) for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")}
+    e = Exchanges.from_arrays(
+        random.integers(1, 4, n), random.integers(4, 7, n), time_ns=WHEN + random.permutation(n) * 10**7,
+        fpp1_dbm=random.uniform(-100, -80, n), **stamps,
+    )  # fmt: skip
+    turned = random.normal(size=(n, 4))
+    poses = Poses.from_arrays(
+        WHEN + np.arange(n) * 10**7, np.where(np.arange(n) % 2, "drone", "rover 1"), random.normal(size=(n, 3)),
+        turned / np.linalg.norm(turned, axis=1)[:, None],
+    )  # fmt: skip
+    readings = {"time_ns": WHEN + np.arange(n), "body": np.full(n, "drone")}
+    held = Contents(
+        exchanges=e,
+        poses=poses,
+        imu=readings | {name: random.normal(size=n) for name in ("wx", "wy", "wz", "ax", "ay", "az")},
+        height=readings | {"height_m": random.uniform(0, 3, n)},
+        faults=[Fault(WHEN + 4, "7", "time-out", 'no "answer"')],
+    )
+    held.save(tmp_path / "r.uwb")
+    return tmp_path / "r.uwb"
+
+
+def test_the_mcap_library_reads_every_message(recording, tmp_path):
+    held = load(recording)
+    count = export_recording(recording, tmp_path / "out", to="mcap")["recording.mcap"]
+    with (tmp_path / "out" / "recording.mcap").open("rb") as file:
+        found = [(s, c, m, json.loads(m.data)) for s, c, m in make_reader(file).iter_messages(log_time_order=False)]
+    assert len(found) == count
+    ranges = [(m.log_time, d["initiator"], d["target"], d["range_m"]) for s, _, m, d in found if s.name == "uwb.Range"]
+    e = held.exchanges
+    rows = zip(*(c.tolist() for c in (e.time_ns, e.initiator, e.target, e.range_m)), strict=True)
+    assert ranges == sorted(rows)
+    poses = [d["pose"] for s, c, _, d in found if c.topic == "/poses/drone" and s.name == "foxglove.PoseInFrame"]
+    mine = held.poses[held.poses.body == "drone"]
+    assert [[p["position"][a] for a in "xyz"] for p in poses] == mine.position_m.tolist()
+    assert [[p["orientation"][a] for a in "xyzw"] for p in poses] == mine.quaternion.tolist()
+
+
+def test_rosbags_reads_standard_messages(recording, tmp_path):
+    held = load(recording)
+    count = export_recording(recording, tmp_path / "out", to="rosbag2")["rosbag2"]
+    by_topic: dict[str, list[tuple[int, str, Any]]] = {}
+    with AnyReader([tmp_path / "out" / "rosbag2"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        for connection, time_ns, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            by_topic.setdefault(connection.topic, []).append((time_ns, connection.msgtype, message))
+    assert sum(len(found) for found in by_topic.values()) == count
+    e = held.exchanges
+    chosen = (e.initiator == 2) & (e.target == 5)
+    found = by_topic["/uwb/range_2_5"]
+    assert {kind for _, kind, _ in found} == {"sensor_msgs/msg/Range"}
+    assert [t for t, *_ in found] == sorted(e.time_ns[chosen].tolist())
+    # The message holds floats of 32 bits.
+    expected = e.range_m[chosen][np.argsort(e.time_ns[chosen])]
+    assert [m.range for *_, m in found] == pytest.approx(expected.tolist(), rel=1e-6)
+    stamp = found[0][2].header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == found[0][0]
+    assert len(by_topic["/tf"]) == len(held.poses)
+    assert by_topic["/tf"][0][2].transforms[0].child_frame_id == "rover 1"
+    imu = by_topic["/imu/drone"][3][2]
+    assert [imu.angular_velocity.x, imu.linear_acceleration.z] == [held.imu["wx"][3], held.imu["az"][3]]
+    assert imu.orientation_covariance[0] == -1, "by its definition: the attitude is not measured"
+    assert len(by_topic["/height/drone"]) == 50
+    assert by_topic["/faults"][0][2].msg == 'time-out: no "answer"'
+
+
+def test_poses_of_an_exported_bag_come_in_again(recording, tmp_path):
+    export_recording(recording, tmp_path / "out", to="rosbag2")
+    held = load(recording).poses
+    found = sorted(read_bag(tmp_path / "out" / "rosbag2"))
+    names = {"rover 1": "rover_1", "drone": "drone"}
+    columns = (held.time_ns.tolist(), held.body.tolist(), held.position_m.tolist(), held.quaternion.tolist())
+    assert found == [(t, names[b], [*p, *q]) for t, b, p, q in zip(*columns, strict=True)]
+
+
+def test_bags_without_the_extra_and_times_before_1970_are_refused(recording, tmp_path, monkeypatch):
+    Contents(exchanges=Exchanges.from_arrays([1], [2], time_ns=[-5], tx1=[0], rx1=[5], tx2=[9], rx2=[30])).save(
+        tmp_path / "old.uwb"
+    )
+    with pytest.raises(RecordingError, match="before 1970"):
+        export_recording(tmp_path / "old.uwb", tmp_path / "out", to="rosbag2")
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
+    with pytest.raises(RecordingError, match=r"pip install 'uwbcal\[bags\]'"):
+        export_recording(recording, tmp_path / "out", to="rosbag2")
+    assert not (tmp_path / "out").exists()
+
+
+def test_pandas_reads_the_tables(recording, tmp_path):
+    held = load(recording)
+    export_recording(recording, tmp_path / "parquet", to="parquet")
+    export_recording(recording, tmp_path / "csv", to="csv")
+    for frame in (
+        pd.read_parquet(tmp_path / "parquet" / "exchanges.parquet"),
+        pd.read_csv(tmp_path / "csv" / "exchanges.csv"),
+    ):
+        for name in ("time_ns", "initiator", "tx1", "rx3", "range_m", "fpp1_dbm"):
+            assert frame[name].tolist() == pytest.approx(getattr(held.exchanges, name).tolist(), rel=1e-15, abs=0)
+        assert frame["fpp2_dbm"].isna().all()
+    poses = pd.read_parquet(tmp_path / "parquet" / "poses.parquet")
+    assert poses["body"].tolist() == held.poses.body.tolist()
+    assert poses[["qx", "qy", "qz", "qw"]].to_numpy().tolist() == held.poses.quaternion.tolist()
+
+
+def test_trajectories_are_as_evo_reads_them(recording, tmp_path):
+    """`evo` takes lines that do not begin with "#", cells between single blanks, eight of them, all numbers."""
+    export_recording(recording, tmp_path / "tum", to="tum")
+    held = load(recording).poses
+    mine = held[held.body == "drone"]
+    text = (tmp_path / "tum" / "drone.tum").read_text()
+    lines = (line for line in io.StringIO(text) if not line.startswith("#"))
+    matrix = np.array([row for row in csv.reader(lines, delimiter=" ") if row]).astype(float)
+    assert matrix.shape == (len(mine), 8)
+    assert matrix[:, 1:4].tolist() == mine.position_m.tolist()
+    assert matrix[:, 4:].tolist() == mine.quaternion.tolist()
+    assert matrix[:, 0] == pytest.approx(mine.time_ns * 1e-9, abs=1e-6)
+    assert (np.diff(matrix[:, 0]) > 0).all()
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory):
+    """A flight of three tags, before and after a calibration, and what that says of each range."""
+    folder = tmp_path_factory.mktemp("corrected")
+    flight = calib.sample_flight()
+    Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(folder / "f.uwb")
+    known = calib.fit(flight).calibration
+    calib.apply(folder / "f.uwb", known, folder / "c.uwb")
+    return folder, flight.exchanges, known.apply(calib.load_ranges(folder / "f.uwb"))
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, form):
+    folder, exchanges, applied = corrected
+    calib.apply(folder / "f.uwb", calib.fit(folder / "f.uwb").calibration, tmp_path / "out", to=form)
+    read = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form]
+    frame = read(tmp_path / "out" / f"corrected.{form}")
+    assert frame["time_ns"].tolist() == exchanges.time_ns.tolist()
+    for name in ("raw_m", "corrected_m", "sigma_m", "clamped"):
+        assert frame[name].tolist() == pytest.approx(getattr(applied, name).tolist(), rel=1e-14, abs=0)
+    assert frame["clamped"].dtype == bool
+    export_recording(folder / "c.uwb", tmp_path / "again", to=form)
+    import_recording(tmp_path / "again", tmp_path / "again.uwb", importer="exported")
+    for table in ("exchanges", "corrected"):
+        assert rows(tmp_path / "again.uwb")[table] == rows(folder / "c.uwb")[table]
+
+
+def test_corrected_ranges_in_messages(corrected, tmp_path):
+    folder, exchanges, applied = corrected
+    export_recording(folder / "c.uwb", tmp_path / "mcap", to="mcap")
+    with (tmp_path / "mcap" / "recording.mcap").open("rb") as file:
+        found = {
+            (m.log_time, d["initiator"], d["target"]): d
+            for s, _, m, d in ((s, c, m, json.loads(m.data)) for s, c, m in make_reader(file).iter_messages())
+            if s.name == "uwb.Range"
+        }
+    for k in range(0, len(exchanges), 50):
+        one = found[int(exchanges.time_ns[k]), int(exchanges.initiator[k]), int(exchanges.target[k])]
+        assert one["range_m"] == applied.raw_m[k]
+        assert one["corrected_m"] == applied.corrected_m[k]
+        assert one["sigma_m"] == applied.sigma_m[k]
+        assert one["clamped"] is bool(applied.clamped[k])
+    export_recording(folder / "c.uwb", tmp_path / "bag", to="rosbag2")
+    with AnyReader([tmp_path / "bag" / "rosbag2"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        messages: list[Any] = [
+            reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/uwb/range_1_2"
+        ]
+    mine = (exchanges.initiator == 1) & (exchanges.target == 2)
+    assert [m.range for m in messages] == pytest.approx(applied.corrected_m[mine].tolist(), rel=1e-6)
+    assert all(m.variance > 0 for m in messages)
+
+
+def test_a_table_that_is_not_that_of_the_exchanges_is_left_out(corrected, tmp_path):
+    folder, *_ = corrected
+    held = load(folder / "c.uwb")
+    part = {name: column[:5] for name, column in held.corrected.items()}
+    replace(held, corrected=part).save(tmp_path / "odd.uwb")
+    export_recording(tmp_path / "odd.uwb", tmp_path / "out", to="mcap")
+    with (tmp_path / "out" / "recording.mcap").open("rb") as file:
+        ranges = [json.loads(m.data) for s, _, m in make_reader(file).iter_messages() if s.name == "uwb.Range"]
+    assert not any("corrected_m" in one for one in ranges)
