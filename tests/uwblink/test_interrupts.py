@@ -91,6 +91,20 @@ def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(tmp_path, delay
     assert files(tmp_path) == (["f.uwb"] if process.returncode else ["f.uwb", "page.html"])
 
 
+def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
+    row = "{0}.25,{1},9,{0},{2},3000000,4000000,5000000,6000000,-80.5,-81.5\n"
+    with (tmp_path / "t.csv").open("w") as file:
+        file.write("time_s,from_id,to_id,tx1,rx1,tx2,rx2,tx3,rx3,fpp1,fpp2\n")
+        file.writelines(row.format(k, k % 5, k + 500) for k in range(400_000))
+    process = started("uwblink", "import", "csv", str(tmp_path / "t.csv"), "-o", str(tmp_path / "t.uwb"))
+    wait_for(lambda: is_working(process), process)
+    time.sleep(0.2)
+    _, err = ended(process)
+    # On a quick machine it may have been done before.
+    assert (process.returncode, err) in ((130, "interrupted\n"), (0, ""))
+    assert files(tmp_path) == (["t.csv"] if process.returncode else ["t.csv", "t.uwb"])
+
+
 def wait_for(ready, process):
     for _ in range(1200):
         if ready():

@@ -65,7 +65,7 @@ def guess(
 
 
 def _with_map(row: Importer) -> Any:
-    def run(table: Path, output: Output, map_file: Path | None = None, force: Force = False) -> None:
+    def run(table: Any, output: Output, map_file: Path | None = None, force: Force = False) -> None:
         _import(row, table, output, map_file, force=force)
 
     # typer reads annotations, and these depend on the row.
@@ -88,10 +88,12 @@ def _without_map(row: Importer) -> Any:
 
 def _argument(row: Importer) -> Any:
     what = f"File to import ({' or '.join(row.suffixes)})." if row.suffixes else "Folder to import."
-    return Annotated[Path, typer.Argument(help=what)]
+    if row.read_all is None:
+        return Annotated[Path, typer.Argument(help=what)]
+    return Annotated[list[Path], typer.Argument(help=f"{what} Several are one table.")]
 
 
-def _import(row: Importer, source: Path, output: Path, map_file: Path | None, *, force: bool) -> None:
+def _import(row: Importer, source: Path | list[Path], output: Path, map_file: Path | None, *, force: bool) -> None:
     from uwblink.display import printable
     from uwblink.importers import read_source
     from uwblink.output import check_output

@@ -6,13 +6,15 @@ A reader of a kind of one's own takes a path and returns `Contents`; writing, an
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers.exchange_tables import SUFFIXES, read_table
+from uwblink.importers.exchange_bags import SUFFIXES as BAGS
+from uwblink.importers.exchange_bags import read_exchange_bag
+from uwblink.importers.exchange_tables import SUFFIXES, read_table, read_tables
 from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.motion_capture import add_poses
@@ -37,6 +39,7 @@ class Importer:
     `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
     file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
     small letters, none for a kind of folder; `name` is that of the command `uwblink import NAME`, and `help` its line.
+    `read_all`, of kinds of which several files can be one recording, takes a list of paths instead of one.
     """
 
     name: str
@@ -44,6 +47,7 @@ class Importer:
     read: Callable[[Path, Path | None], Contents]
     help: str
     map_help: str | None = None
+    read_all: Callable[[Sequence[Path], Path | None], Contents] | None = None
 
 
 def check_importer(row: Any) -> None:
@@ -71,6 +75,14 @@ _OWN: Final = (
         read_table,
         "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
         map_help="Names, units and constants (.toml).",
+        read_all=read_tables,
+    ),
+    Importer(
+        "bag",
+        BAGS,
+        read_exchange_bag,
+        "Import exchanges from messages in a bag of ROS 1, ROS 2 or MCAP.",
+        map_help="Topics, names of fields, units and constants (.toml).",
     ),
     Importer("exported", (), read_exported, "Import a folder that 'uwblink export' wrote as CSV or Parquet."),
     Importer(
@@ -105,15 +117,19 @@ def register_importer(row: Importer, *, replace: bool = False) -> None:
     IMPORTERS.register(row, replace=replace)
 
 
+Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+"""A path, or several of a kind of which several can be one recording."""
+
+
 def import_recording(
-    source: str | os.PathLike[str],
+    source: Source,
     output: str | os.PathLike[str],
     *,
     importer: str | None = None,
     map_file: str | os.PathLike[str] | None = None,
     force: bool = False,
 ) -> int:
-    """Make a recording of somebody else's file; returns how many exchanges it has.
+    """Make a recording of somebody else's file, or of several tables as one; returns how many exchanges it has.
 
     `importer` names a row of `IMPORTERS`; without it the name of the file decides. `map_file` explains a table's
     columns. Raises `ArgumentError`, `ImportTableError` and what `Recording.create` raises; nothing is written then.
@@ -131,19 +147,29 @@ def import_recording(
 
 
 def read_source(
-    source: str | os.PathLike[str], *, importer: str | None = None, map_file: str | os.PathLike[str] | None = None
+    source: Source, *, importer: str | None = None, map_file: str | os.PathLike[str] | None = None
 ) -> Contents:
     """Return what somebody else's file holds, without writing anything; parameters and errors of `import_recording`.
 
     An importer may say in `meta["notes"]`, a list of lines, what a user should know of the import.
     """
-    row = _importer(Path(source), importer)
+    sources = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(one) for one in source]
+    if not sources:
+        raise ArgumentError("found no files, expected a path or several", parameter="source")
+    row = _importer(sources[0], importer)
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"map_file: importer {row.name!r} takes none")
-    contents = row.read(Path(source), None if map_file is None else Path(map_file))
+    explained = None if map_file is None else Path(map_file)
+    contents = row.read(sources[0], explained) if len(sources) == 1 else _read_all(row, sources, explained)
     if not isinstance(contents, Contents):
         raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
     return contents
+
+
+def _read_all(row: Importer, sources: list[Path], map_file: Path | None) -> Contents:
+    if row.read_all is None:
+        raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
+    return row.read_all(sources, map_file)
 
 
 def _importer(source: Path, name: str | None) -> Importer:

@@ -3,13 +3,14 @@
 Every key is optional; docs/importing.md explains each.
 
 ```toml
-layout = "exchanges"       # or "messages" (a row a message), "parts" (some rows an exchange), "ranges" (no stamps)
+layout = "exchanges"       # or "messages", "stamps" (a row a stamp), "parts" (some rows an exchange), "ranges"
 bits = 32                  # of the counter that the stamps come from, 32 or 40
 counter = "wrapped"        # or "signed", "unwrapped"
 protocol = "ss"            # a protocol of uwblink.twr
 delimiter = ";"
 decimal = ","
 within_s = 0.5             # rows of one exchange lie no further apart
+each = "measurements"      # of bags: rows are the elements of this field of a message
 [columns]                  # our name = "their name"
 tx1 = "poll_tx_ticks"
 [units]
@@ -27,6 +28,8 @@ rx = 16436
 [antenna_delays.tags.7]
 tx = 16400
 rx = 16400
+[topics."/uwb/range"]      # of bags: topics to read, and constants for each
+to_id = 7
 ```
 """
 
@@ -45,11 +48,14 @@ from uwblink.twr import BITS, LARGEST_ID, STAMPS
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
 LEVELS: Final = ("fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2")
 DISTANCES: Final = ("range_m", "gt_range_m", *POSITIONS)
-MESSAGE_NAMES: Final = ("sequence", "message", "tx", "rx", "fpp", "rxp", "skew")
+MESSAGE_NAMES: Final = ("sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp")
 IDS: Final = ("from_id", "to_id")
-NAMES: Final = ("time_s", *IDS, *STAMPS, *LEVELS, *DISTANCES, *MESSAGE_NAMES)
+EVENT: Final = "event"
+"""The column that says whether a stamp is of sending or of receiving, in words."""
 
-LAYOUTS: Final = ("exchanges", "messages", "parts", "ranges")
+NAMES: Final = ("time_s", *IDS, *STAMPS, *LEVELS, *DISTANCES, *MESSAGE_NAMES, EVENT)
+
+LAYOUTS: Final = ("exchanges", "messages", "stamps", "parts", "ranges")
 COUNTERS: Final = ("wrapped", "signed", "unwrapped")
 STAMP_UNITS: Final = {
     "ticks": 1.0,
@@ -64,7 +70,7 @@ DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0
 DELIMITERS: Final = (",", ";", "\t", "|", " ")
 KEYS: Final = (
     "layout", "bits", "counter", "protocol", "delimiter", "decimal", "within_s",
-    "columns", "units", "constants", "ids", "antenna_delays",
+    "columns", "units", "constants", "ids", "antenna_delays", "each", "topics",
 )  # fmt: skip
 REGISTER_MAX: Final = 65_535
 
@@ -91,6 +97,8 @@ class ColumnMap:
     constants: dict[str, float | str] = field(default_factory=dict)
     ids: dict[str, int] = field(default_factory=dict)
     antenna_delays: dict[int | None, dict[str, int]] = field(default_factory=dict)
+    each: str | None = None
+    topics: dict[str, dict[str, float | str]] = field(default_factory=dict)
 
     def header(self, name: str) -> str:
         """Return what the table calls one of `NAMES`."""
@@ -108,9 +116,13 @@ def load_map(path: Path) -> ColumnMap:
     file.known(units, ("stamps", "time", "distance"), "units.")
     for name, value in columns.items():
         file.check(f"columns.{name}", value, isinstance(value, str), "the name of a column")
-    for name, value in constants.items():
-        good = is_number(value) or (name in IDS and isinstance(value, str))
-        file.check(f"constants.{name}", value, good, "a finite number")
+    _constants(file, "constants", constants)
+    for topic, values in file.section("topics").items():
+        file.check(f"topics.{topic}", values, isinstance(values, dict), "a table of constants, which may be empty")
+        file.known(values, NAMES, f"topics.{topic}.")
+        _constants(file, f"topics.{topic}", values)
+    each = table.get("each")
+    file.check("each", each, each is None or isinstance(each, str), "the name of a field")
     for name, value in ids.items():
         file.check(f"ids.{name}", value, _is_id(value), f"a whole number from 0 to {LARGEST_ID}")
     within = table.get("within_s", 1.0)
@@ -130,7 +142,15 @@ def load_map(path: Path) -> ColumnMap:
         constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
         ids=ids,
         antenna_delays=_antenna_delays(file),
+        each=each,
+        topics=file.section("topics"),
     )
+
+
+def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
+    for name, value in values.items():
+        good = is_number(value) or (name in IDS and isinstance(value, str))
+        file.check(f"{where}.{name}", value, good, "a finite number")
 
 
 def _is_id(value: Any) -> bool:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, STAMP_UNITS, ColumnMap, load_map
-from uwblink.importers.messages import from_messages, from_parts, has_ends
+from uwblink.importers.messages import from_messages, from_parts, from_single_stamps, has_ends
 from uwblink.importers.stamps import NEVER, beyond, clocks, how_counted, stamps_of, to_ticks
 from uwblink.importers.table_rows import Bad, Rows, missing, read_rows, take
 from uwblink.importers.trials import SAMPLE, Reading, Sample, Trial, try_others
@@ -47,7 +47,10 @@ def read_table(source: Path, map_file: Path | None = None) -> Contents:
 
 def read_tables(sources: Sequence[Path], map_file: Path | None = None) -> Contents:
     """Return the exchanges of several files with the same columns as one table; see `read_table`."""
-    return convert(read_rows(sources, load_map(map_file) if map_file else ColumnMap()))
+    column_map = load_map(map_file) if map_file else ColumnMap()
+    if column_map.topics or column_map.each:
+        raise ImportTableError(f"{map_file}: topics and each are of bags; {sources[0]} is a table")
+    return convert(read_rows(sources, column_map))
 
 
 def convert(rows: Rows) -> Contents:
@@ -59,9 +62,12 @@ def convert(rows: Rows) -> Contents:
             raise missing(rows, name)
     layout = rows.column_map.layout or _layout(rows)
     protocol = rows.column_map.protocol
-    if layout in ("messages", "parts"):
+    if layout in ("messages", "stamps", "parts"):
         rows = take(rows, np.flatnonzero(_ends(rows, bad)))
-        if layout == "messages":
+        if layout == "stamps":
+            rows, lonely = _messages(rows)
+            bad += lonely
+        if layout != "parts":
             rows, found, incomplete = from_messages(rows)
             protocol = protocol or found
         else:
@@ -87,11 +93,20 @@ def convert(rows: Rows) -> Contents:
     )
 
 
+def _messages(rows: Rows) -> tuple[Rows, list[Bad]]:
+    for name in ("stamp", "event", "message"):
+        if not rows.has(name):
+            raise missing(rows, name)
+    return from_single_stamps(rows)
+
+
 def _layout(rows: Rows) -> str:
     if all(rows.has(name) for name in STAMPS[:4]):
         return "exchanges"
     if rows.has("tx") and rows.has("rx"):
         return "messages"
+    if rows.has("stamp") and rows.has("event"):
+        return "stamps"
     if rows.has("range_m") and not any(rows.has(name) for name in STAMPS):
         return "ranges"
     raise missing(rows, next(name for name in STAMPS if not rows.has(name)))

@@ -1,7 +1,8 @@
 """Long tables, in which an exchange has several rows, as rows of exchanges.
 
-Either each row is a message with the stamps of its sender and its receiver, or each row has some of the columns of an
-exchange, as where both devices report. Rows belong together by pair and sequence number, or by pair and time.
+Either each row is a message with the stamps of its sender and its receiver, or one of these stamps, or each row has
+some of the columns of an exchange, as where both devices report. Rows belong together by pair and sequence number, or
+by pair and time.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.importers.stamps import NEVER
-from uwblink.importers.table_rows import Bad, Rows, take
+from uwblink.importers.table_rows import RECEIVED, SENT, Bad, Rows, take
 from uwblink.twr import STAMPS
 
 _OF_MESSAGE: Final = {"fpp": "fpp", "rxp": "rxp", "skew": "skew"}
@@ -55,6 +56,44 @@ def from_messages(rows: Rows) -> tuple[Rows, str, list[Bad]]:
     return take(exchanges, np.flatnonzero(whole)), protocol, bad
 
 
+def from_single_stamps(rows: Rows) -> tuple[Rows, list[Bad]]:
+    """Return rows that are messages, of rows that each have one stamp, and the rows whose message lacks one or has two.
+
+    Rows belong together by sender, receiver, number of the message, and sequence number or time.
+    """
+    order, group = _stamps_of_messages(rows)
+    rows = take(rows, order)
+    count = int(group[-1]) + 1 if len(group) else 0
+    start = np.searchsorted(group, np.arange(count))
+    found, whole = {}, np.ones(count, dtype=bool)
+    for name, kind in (("tx", SENT), ("rx", RECEIVED)):
+        mine = rows.cells["event"] == kind
+        whole &= np.bincount(group, weights=mine, minlength=count) == 1
+        found[name] = _put(rows.cells["stamp"], group, mine, count)
+    others = {name: column for name, column in rows.cells.items() if name not in ("stamp", "event")}
+    messages = take(rows, start)
+    messages.cells = {name: np.fmax.reduceat(column, start) for name, column in others.items()} | found if count else {}
+    bad = [Bad(int(rows.origin[row]), "event", "one tx and one rx of a message") for row in start[~whole]]
+    return take(messages, np.flatnonzero(whole)), bad
+
+
+def _stamps_of_messages(rows: Rows) -> tuple[Ints, Ints]:
+    """Return the order in which the stamps of a message stand together, and their message, (n,) each."""
+    time = rows.time_ns if rows.time_ns is not None else np.arange(len(rows), dtype=np.int64)
+    keys = [rows.ids["from_id"], rows.ids["to_id"]]
+    keys += [_key(rows.cells[name]) for name in ("sequence", "message") if name in rows.cells]
+    order = np.lexsort((time, *reversed(keys)))
+    begins: Bools = np.ones(len(rows), dtype=bool)
+    begins[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
+    if rows.time_ns is not None:
+        begins[1:] |= np.diff(time[order].astype(np.float64)) > rows.column_map.within_s * 1e9
+    return order, np.cumsum(begins) - 1
+
+
+def _key(column: Floats) -> Ints:
+    return np.nan_to_num(column, nan=-1).astype(np.int64)
+
+
 def from_parts(rows: Rows) -> tuple[Rows, list[Bad]]:
     """Return exchanges of rows that each have some of the columns, and the rows in which one has two values."""
     order, group, _ = _groups(rows, numbered=False)
@@ -81,7 +120,7 @@ def _groups(rows: Rows, *, numbered: bool = True) -> tuple[Ints, Ints, Ints]:
     time = rows.time_ns if rows.time_ns is not None else np.arange(len(rows), dtype=np.int64)
     keys = [low, high]
     if "sequence" in rows.cells:
-        keys.append(np.nan_to_num(rows.cells["sequence"], nan=-1).astype(np.int64))
+        keys.append(_key(rows.cells["sequence"]))
     order = np.lexsort((np.arange(len(rows)), time, *reversed(keys)))
     begins: Bools = np.ones(len(rows), dtype=bool)
     begins[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)

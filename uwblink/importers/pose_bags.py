@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ImportTableError
+from uwblink.importers.bags import opened
 
 Row = tuple[int, str, list[float]]
 
@@ -27,23 +28,11 @@ def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Iterator[Ro
     are none, all of the next kind of `MESSAGES`; a body is what a topic is called beside the name of its driver, and
     that of a transform its child frame.
     """
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportTableError(f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'") from error
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            wanted = _chosen(path, {c.topic: c.msgtype for c in reader.connections}, topics)
-            used = [c for c in reader.connections if c.topic in wanted]
-            for connection, _, raw in reader.messages(connections=used):
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                for time_ns, child, values in MESSAGES[connection.msgtype](message):
-                    yield time_ns, wanted[connection.topic] or child or body_of(connection.topic), values
-    except (AnyReaderError, OSError, ValueError) as error:
-        if isinstance(error, ImportTableError):
-            raise
-        raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
+    with opened(path) as bag:
+        wanted = _chosen(path, bag.kinds, topics)
+        for topic, kind, _, message in bag.messages(wanted):
+            for time_ns, child, values in MESSAGES[kind](message):
+                yield time_ns, wanted[topic] or child or body_of(topic), values
 
 
 def body_of(topic: str) -> str:

@@ -102,10 +102,19 @@ class Table:
         """Return columns as float64 (n,), NaN where a cell is empty or no number."""
         return self.read(numbers=names)[0]
 
-    def word(self, name: str, row: int) -> str:
-        """Return one cell as text."""
-        found = self._read([(name, self._word(self._place(name)))], row)[0]
-        return str(found[0]) if len(found) else ""
+    def words_at(self, name: str, rows: Iterable[int]) -> dict[int, str]:
+        """Return cells of a column as text, by their rows (0 is the first)."""
+        import duckdb
+
+        place = self._place(name)
+        cell = self._word(place)
+        counted = f"SELECT {cell} AS word, row_number() OVER () - 1 AS row FROM {self._relation.source}"  # noqa: S608 - columns by place
+        query = f"SELECT row, word FROM ({counted}) WHERE row IN (SELECT unnest(?::BIGINT[]))"  # noqa: S608 - as above
+        bound = [*self._keys(place, cell), str(self.path), sorted(set(rows))]
+        try:
+            return {int(row): str(word) for row, word in self._db.execute(query, bound).fetchall()}
+        except duckdb.Error as error:
+            raise ImportTableError(f"{self.path}: cannot be read as a table ({first_line(error)})") from error
 
     def whole_numbers(self, name: str, missing: int) -> Ints:
         """Return a column of whole numbers exactly, also those that a float does not hold; others are `missing`."""
@@ -162,14 +171,13 @@ class Table:
         text = f"replace({text}, ',', '.')" if self._relation.decimal_comma else text
         return f"TRY_CAST({text} AS DOUBLE)"
 
-    def _read(self, cells: list[tuple[str, str]], row: int | None = None) -> list[NDArray[Any]]:
+    def _read(self, cells: list[tuple[str, str]]) -> list[NDArray[Any]]:
         import duckdb
 
         chosen = ", ".join(f"{cell} AS r{k}" for k, (_, cell) in enumerate(cells))
         places = [self.names.index(name) for name, _ in cells]
         keys = [key for k, place in enumerate(places) for key in self._keys(place, cells[k][1])]
         query = f"SELECT {chosen} FROM {self._relation.source}"  # noqa: S608 - columns by place, r0, r1 ...
-        query += "" if row is None else f" LIMIT 1 OFFSET {row:d}"
         try:
             found = self._db.execute(query, [*keys, str(self.path)]).fetchnumpy()
             if self._dialect is not None:

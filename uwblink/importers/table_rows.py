@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCES, IDS, ISO, NAMES, TIME_UNITS, ColumnMap
+from uwblink.importers.column_map import DISTANCES, EVENT, IDS, ISO, NAMES, TIME_UNITS, ColumnMap
 from uwblink.importers.stamps import NEVER, whole
 from uwblink.importers.table import EXACT, Table
 from uwblink.recording.schema import Fault
@@ -22,7 +22,10 @@ WORDS_FROM: Final = 0.01
 """Share of ids that are no numbers from which on all are taken for words; fewer are faults."""
 
 FAULT: Final = "unusable row"
-_COUNTED: Final = (*STAMPS, "tx", "rx")
+SENT, RECEIVED = 1.0, 2.0
+"""What becomes of the words in a column of events."""
+
+_COUNTED: Final = (*STAMPS, "tx", "rx", "stamp")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +70,10 @@ class Rows:
         for k, path in enumerate(self.paths):
             here = [one for one in bad if self.file[one.row] == k]
             lines = dict(zip((one.row for one in here), self._lines(path, here), strict=True))
+            cells = self._cells(path, here)
             for one in here:
                 when = 0 if self.time_ns is None else int(self.time_ns[one.row])
-                text = self._found(path, one)
+                text = self._found(one, cells)
                 detail = f"row {lines[one.row]}, {text}, expected {one.expected}"
                 found.append(Fault(max(when, 0) if when == NEVER else when, path.name, FAULT, detail))
             for line in self.too_long.get(k, ()):
@@ -84,15 +88,25 @@ class Rows:
                 table.read(words=table.names[:1])
             return table.lines(np.array([self.row[one.row] for one in bad], dtype=np.int64))
 
-    def _found(self, path: Path, bad: Bad) -> str:
+    def _cells(self, path: Path, bad: list[Bad]) -> dict[tuple[str, int], str]:
+        """Return what stands in the cells of bad rows of a file, by the column's header and the row's place."""
+        headers: dict[str, list[int]] = {}
+        for one in bad:
+            if one.name not in self.column_map.constants:
+                headers.setdefault(self.column_map.header(one.name), []).append(int(self.row[one.row]))
+        found: dict[tuple[str, int], str] = {}
+        with Table(path, self.column_map.delimiter, self.column_map.decimal) as table:
+            for header, places in headers.items():
+                if header in table.names:
+                    found |= {(header, place): word for place, word in table.words_at(header, places).items()}
+        return found
+
+    def _found(self, bad: Bad, cells: dict[tuple[str, int], str]) -> str:
         header = self.column_map.header(bad.name)
         if bad.name in self.column_map.constants:
             return f"constant {bad.name!r}: found {str(self.column_map.constants[bad.name])[:40]!r}"
-        with Table(path, self.column_map.delimiter, self.column_map.decimal) as table:
-            if header not in table.names:
-                return f"column {header[:60]!r}"
-            cell = table.word(header, int(self.row[bad.row]))
-        return f"column {header[:60]!r}: found {cell[:40]!r}"
+        cell = cells.get((header, int(self.row[bad.row])))
+        return f"column {header[:60]!r}" if cell is None else f"column {header[:60]!r}: found {cell[:40]!r}"
 
 
 def read_rows(paths: Sequence[Path], column_map: ColumnMap) -> Rows:
@@ -144,6 +158,8 @@ def _read_file(path: Path, column_map: ColumnMap) -> _File:
         table.require(headers.values())
         found = table.numbers(headers.values())
         cells = {name: found[header] for name, header in headers.items()}
+        if EVENT in headers:
+            cells[EVENT] = _events(table.read(words=[headers[EVENT]])[1][headers[EVENT]])
         count = len(next(iter(cells.values())))
         cells |= {n: np.full(count, v) for n, v in column_map.constants.items() if not isinstance(v, str)}
         constant = {n: np.full(count, v) for n, v in column_map.constants.items() if isinstance(v, str)}
@@ -155,6 +171,12 @@ def _read_file(path: Path, column_map: ColumnMap) -> _File:
         words = {name: table.read(words=[headers[name]])[1][headers[name]] for name in wordy} | constant
         time_ns = _times(table, column_map, headers, cells)
         return _File(path, count, cells, words, time_ns, table.rejected())
+
+
+def _events(words: NDArray[np.str_]) -> Floats:
+    """Return 1 where a word is of sending ("tx", "sent"), 2 where it is of receiving ("rx", "received"), else NaN."""
+    first = np.char.lower(words.astype("U1"))
+    return np.select([np.isin(first, ["t", "s"]), first == "r"], [SENT, RECEIVED], np.nan)
 
 
 def _missing(table: Table, column_map: ColumnMap, name: str) -> ImportTableError:

@@ -3,16 +3,20 @@
 import csv
 import gzip
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import duckdb
 import numpy as np
 import pytest
 
-from uwblink.errors import ImportTableError
-from uwblink.importers import import_recording
+from uwblink.errors import ArgumentError, ImportTableError
+from uwblink.importers import import_recording, read_source
 from uwblink.importers.exchange_tables import read_table, read_tables
 from uwblink.recording.contents import load
 
+BIN = Path(sys.executable).parent
 TICKS = 128 * 499_200_000
 AIR = 299_702_547.0
 HEADER = ["time_s", "from_id", "to_id", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3", "fpp1", "fpp2"]
@@ -107,7 +111,13 @@ def test_several_files_are_one_table(tmp_path):
     rows = flights()
     paths = [write(tmp_path / f"{k}.csv", wrapped(rows[k::2])) for k in (0, 1)]
     same(read_tables(paths), rows[0::2] + rows[1::2])
+    same(read_source(paths), rows[0::2] + rows[1::2])
     assert len(read_table(tmp_path).exchanges) == len(rows)
+    words = [BIN / "uwblink", "import", "csv", *paths, "-o", tmp_path / "o.uwb"]
+    done = subprocess.run([*map(str, words)], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.splitlines()[0].split(": ")[1]) == (0, f"{len(rows)} exchanges")
+    with pytest.raises(ArgumentError, match="found no files"):
+        read_source([])
     write(tmp_path / "2.csv", [{"time_s": 1, "from_id": 1, "to_id": 2, "range_m": 3}])
     with pytest.raises(ImportTableError, match="other columns than"):
         read_table(tmp_path)
@@ -225,6 +235,17 @@ def test_large_ids_get_numbers(tmp_path):
     found = read_table(write(tmp_path / "t.csv", rows))
     assert set(found.exchanges.initiator) == {1, 2, 3}
     assert found.meta["tag_names"]["1"] == str(2**60 + 1)
+
+
+def test_headers_that_two_columns_share_and_nobody_uses(tmp_path):
+    rows = flights()
+    lines = write(tmp_path / "t.csv", wrapped(rows)).read_text().splitlines()
+    (tmp_path / "t.csv").write_text(
+        "\n".join(f"{'note,note' if k == 0 else 'a,b'},{line}" for k, line in enumerate(lines))
+    )
+    same(read_table(tmp_path / "t.csv"), rows)
+    with pytest.raises(ImportTableError, match="two columns are called 'note'"):
+        read_table(tmp_path / "t.csv", mapped(tmp_path, '[columns]\nskew1 = "note"\n'))
 
 
 def test_what_the_device_reported_is_kept_beside_the_stamps(tmp_path):

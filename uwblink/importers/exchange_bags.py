@@ -1,0 +1,113 @@
+"""Exchanges in bags of ROS 1, ROS 2 and MCAP: fields of messages by a map, as if they were columns of a table.
+
+A message becomes a row whose columns are its fields, `header.frame_id`; a time (`header.stamp`) is whole nanoseconds,
+and the numbers of an array are `stamps.0`, `stamps.1` ...
+`topic` and `log_time` are columns, too. From there on a bag is a table of JSON lines.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+
+from uwblink.errors import ImportTableError
+from uwblink.importers.bags import Bag, opened
+from uwblink.importers.column_map import ColumnMap, load_map
+from uwblink.importers.exchange_tables import convert
+from uwblink.importers.table_rows import read_rows
+from uwblink.recording.contents import Contents
+
+SUFFIXES: Final = (".bag", ".mcap", ".db3")
+LONGEST_ARRAY: Final = 16
+"""Numbers of an array that become columns; longer ones are images and the like."""
+
+STAMP: Final = "header.stamp"
+LOGGED: Final = "log_time"
+
+
+def read_exchange_bag(source: Path, map_file: Path | None = None) -> Contents:
+    """Return the exchanges of a bag; `map_file` says which topics and fields they are in. Raises `ImportTableError`."""
+    if not source.exists():
+        raise ImportTableError(f"{source}: no such bag")
+    column_map = load_map(map_file) if map_file else ColumnMap()
+    with TemporaryDirectory() as place, opened(source) as bag:
+        table = Path(place) / f"{source.name}.jsonl"
+        first = _write(table, _rows(bag, column_map, _topics(bag, column_map)))
+        if first is None:
+            raise ImportTableError(f"{source}: no message on the topics of the map")
+        found = convert(read_rows([table], _timed(column_map, first)))
+    return replace(found, meta={**found.meta, "source": "import bag", "imported_from": source.name})
+
+
+def _topics(bag: Bag, column_map: ColumnMap) -> list[str]:
+    kinds = bag.kinds
+    if not column_map.topics and len(kinds) == 1:
+        return list(kinds)
+    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(kinds.items()))[:400] or "none"
+    if not column_map.topics:
+        raise ImportTableError(
+            f'{bag.path}: a `map_file` must say which topics, as [topics."/name"]; there are {listed}'
+        )
+    for topic in column_map.topics:
+        if topic not in kinds:
+            raise ImportTableError(f"{bag.path}: no topic {topic[:80]!r}; there are {listed}")
+    return list(column_map.topics)
+
+
+def _timed(column_map: ColumnMap, first: Mapping[str, Any]) -> ColumnMap:
+    """Return a map with a column for the time, which is in nanoseconds where nobody says otherwise."""
+    unit = column_map.time_unit or "ns"
+    if "time_s" in column_map.columns or "time_s" in column_map.constants:
+        return replace(column_map, time_unit=unit)
+    stamped = isinstance(first.get("header"), dict) and "stamp" in first["header"]
+    columns = column_map.columns | {"time_s": STAMP if stamped else LOGGED}
+    return replace(column_map, columns=columns, time_unit=unit)
+
+
+def _rows(bag: Bag, column_map: ColumnMap, topics: list[str]) -> Iterator[dict[str, Any]]:
+    for topic, _, time_ns, message in bag.messages(topics):
+        fields = _plain(message)
+        row = {**fields, "topic": topic, LOGGED: time_ns, **column_map.topics.get(topic, {})}
+        yield from _elements(bag.path, row, column_map.each)
+
+
+def _elements(path: Path, row: dict[str, Any], each: str | None) -> Iterable[dict[str, Any]]:
+    """Return a row for each element of a field, or the row itself where none is named."""
+    if each is None:
+        return [row]
+    if not isinstance(row.get(each), list):
+        raise ImportTableError(f"{path}: each: a message of {row['topic']} has no list {each[:60]!r}")
+    return [row | {each: one} for one in row[each]]
+
+
+def _plain(value: Any) -> Any:
+    """Return a message as JSON has it; what JSON has no word for is None."""
+    names = getattr(value, "__dataclass_fields__", None)
+    if names is not None:
+        if "sec" in names and "nanosec" in names:
+            return int(value.sec) * 1_000_000_000 + int(value.nanosec)
+        return {name: _plain(getattr(value, name)) for name in names if not name.isupper() and name != "__msgtype__"}
+    if isinstance(value, np.ndarray):
+        return {str(k): _plain(one) for k, one in enumerate(value.tolist())} if value.size <= LONGEST_ARRAY else None
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, bool | int | str) else None
+
+
+def _write(path: Path, rows: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
+    """Write rows as JSON lines; returns the first, None where there is none."""
+    first = None
+    with path.open("w", encoding="utf-8") as file:
+        for row in rows:
+            first = first or row
+            file.write(json.dumps(row, allow_nan=False) + "\n")
+    return first
