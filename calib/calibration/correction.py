@@ -19,7 +19,7 @@ from uwblink.output import check_output
 from uwblink.recording.file import Recording
 from uwblink.twr import Exchanges
 
-NUMBERS: Final = ("sigma_m",)
+NUMBERS: Final = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
 """Columns of the table `corrected` that are NaN where a range has no power."""
 
 
@@ -73,7 +73,10 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
         if "calibration" in recording.meta():
             raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")
         exchanges = recording.exchanges()
-        applied = calibration.apply(Ranges.from_exchanges(exchanges, source=Path(source).name))
+        ranges = Ranges.from_exchanges(
+            exchanges, poses=recording.poses(), tags=recording.tags(), source=Path(source).name
+        )
+        applied = calibration.apply(ranges)
         table = _table(exchanges, applied)
         recording.copy(
             output,
@@ -95,6 +98,6 @@ def _table(exchanges: Exchanges, applied: CorrectedRanges) -> dict[str, NDArray[
         "raw_m": applied.raw_m,
         "corrected_m": np.where(powered, applied.corrected_m, applied.delay_corrected_m),
         "clamped": applied.clamped,
-        "outlier": np.zeros(len(exchanges), dtype=bool),
+        "outlier": applied.outlier,
         **known,
     }

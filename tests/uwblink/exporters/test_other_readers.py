@@ -166,9 +166,10 @@ def test_corrected_ranges_leave_with_what_is_known_of_each(corrected, tmp_path, 
     read = {"csv": pd.read_csv, "parquet": pd.read_parquet}[form]
     frame = read(tmp_path / "out" / f"corrected.{form}")
     assert frame["time_ns"].tolist() == exchanges.time_ns.tolist()
-    for name in ("raw_m", "corrected_m", "sigma_m", "clamped"):
+    for name in ("raw_m", "corrected_m", "sigma_m", "sigma_total_m", "tail_share", "tail_probability", "clamped"):
         assert frame[name].tolist() == pytest.approx(getattr(applied, name).tolist(), rel=1e-14, abs=0)
-    assert frame["clamped"].dtype == bool
+    assert frame["clamped"].dtype == frame["outlier"].dtype == bool
+    assert frame["outlier"].tolist() == applied.outlier.tolist()
     export_recording(folder / "c.uwb", tmp_path / "again", to=form)
     import_recording(tmp_path / "again", tmp_path / "again.uwb", importer="exported")
     for table in ("exchanges", "corrected"):
@@ -189,6 +190,9 @@ def test_corrected_ranges_in_messages(corrected, tmp_path):
         assert one["range_m"] == applied.raw_m[k]
         assert one["corrected_m"] == applied.corrected_m[k]
         assert one["sigma_m"] == applied.sigma_m[k]
+        assert one["sigma_total_m"] == applied.sigma_total_m[k]
+        assert one["tail_probability"] == applied.tail_probability[k]
+        assert one["outlier"] is bool(applied.outlier[k])
         assert one["clamped"] is bool(applied.clamped[k])
     export_recording(folder / "c.uwb", tmp_path / "bag", to="rosbag2")
     with AnyReader([tmp_path / "bag" / "rosbag2"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
@@ -197,7 +201,7 @@ def test_corrected_ranges_in_messages(corrected, tmp_path):
         ]
     mine = (exchanges.initiator == 1) & (exchanges.target == 2)
     assert [m.range for m in messages] == pytest.approx(applied.corrected_m[mine].tolist(), rel=1e-6)
-    assert all(m.variance > 0 for m in messages)
+    assert [m.variance for m in messages] == pytest.approx((applied.sigma_total_m[mine] ** 2).tolist(), rel=1e-6)
 
 
 def test_a_table_that_is_not_that_of_the_exchanges_is_left_out(corrected, tmp_path):
