@@ -31,9 +31,8 @@ def _no_poses() -> Poses:
 class Contents:
     """What a recording holds; only the exchanges are needed to make one.
 
-    `overheard`, `imu`, `height`, `powers`, `temperature` and `corrected` have the columns of the tables of these names, or
-    none;
-    `meta` is what is known of the whole.
+    `overheard`, `imu`, `height`, `powers`, `temperature` and `corrected` have the columns of the tables of these names,
+    or none; `meta` is what is known of the whole.
 
     >>> from uwblink import Contents, Exchanges, Tag
     >>> x = Exchanges.from_arrays([1, 2], [2, 3], tx1=[0, 9], rx1=[5, 3], tx2=[1005, 1003], rx2=[3000, 3009])
