@@ -3,10 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup demo test lint format bench bench-large bench-workbench bench-boards bench-stream accuracy fidelity endurance rooms coverage lock clean
+.PHONY: $(shell sed -n 's/^\([a-z -]*\):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST)))
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z -]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 setup: $(STAMP) ## prepare .venv with exactly the locked versions
 
@@ -35,6 +35,16 @@ coverage: setup ## run the whole test suite and measure what it reaches (10 minu
 
 rooms: setup ## draw the rooms into docs/architecture.md from the imports
 	$(BIN)/python -m tests.rooms
+
+lowest newest: ## run the whole test suite on the lowest versions that pyproject.toml allows, or on the newest
+	$(PYTHON) -m venv .venv-$@
+	$(PYTHON) -m tests.bounds $@ > .venv-$@/requirements.txt
+	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --upgrade -r .venv-$@/requirements.txt
+	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation .
+	.venv-$@/bin/python -m pytest -n 2 --dist loadfile
+
+fuzz: setup ## run commands on 2000 damaged files and options (10 minutes)
+	$(BIN)/python -m tests.fuzz.commands
 
 lint: setup ## check style (ruff) and types (mypy)
 	$(BIN)/ruff check .
@@ -77,4 +87,4 @@ lock: setup ## write the versions now in .venv to requirements-dev.lock
 		$(BIN)/python -m pip freeze --disable-pip-version-check --exclude-editable; } > requirements-dev.lock
 
 clean: ## remove .venv, caches and the demo
-	rm -rf .venv demo .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-lowest .venv-newest demo .mypy_cache .ruff_cache .pytest_cache .hypothesis

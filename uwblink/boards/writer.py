@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Final, Self
@@ -19,6 +20,7 @@ from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow
 from uwblink.recording.snapshots import SnapshotMaker
+from uwblink.twr import Exchanges
 from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import Cir, Overheard, RangeReport
 
@@ -53,22 +55,27 @@ class Batch:
     def write(self, recording: Recording) -> None:
         """Append everything in one transaction; raises `RecordingError`."""
         with recording.transaction():
-            recording.append_frames(self.frames)
-            if self.exchanges:
-                recording.append_exchanges(exchanges_of(self.exchanges))
-            recording.append_overheard(overheard_row(*row) for row in self.overheard)
-            recording.append_cirs(
-                CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
-                for t, board, c in self.cirs
-            )
-            recording.append_faults(self.faults)
+            self.append_to(recording)
+
+    def append_to(self, recording: Recording) -> None:
+        """Append everything; raises `RecordingError`."""
+        recording.append_frames(self.frames)
+        if self.exchanges:
+            recording.append_exchanges(exchanges_of(self.exchanges))
+        recording.append_overheard(overheard_row(*row) for row in self.overheard)
+        recording.append_cirs(
+            CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
+            for t, board, c in self.cirs
+        )
+        recording.append_faults(self.faults)
 
 
 class RecordingWriter(Listener):
     """A listener that writes a live recording. A context manager: leaving it writes what is left."""
 
     def __init__(self, recording: Recording) -> None:
-        """Begin writing."""
+        """Begin writing; raises `RecordingError` where what would be written cannot be read back."""
+        check_writing(recording)
         self._recording = recording
         self._batch = Batch()
         self._lock = threading.Lock()
@@ -145,9 +152,49 @@ class RecordingWriter(Listener):
                     batch.write(self._recording)
             except RecordingError as error:
                 self._error = error
+            except Exception as error:  # whatever it is: nobody else sees what ends this thread
+                self._error = RecordingError(
+                    f"{self._recording.path}: cannot be written any more ({type(error).__name__}: {error}). "
+                    "What was written before is kept"
+                )
             self._written_s = time.monotonic()
             self._snapshots.look()
         self._snapshots.close()
+
+
+class _Withdrawn(RecordingError):  # noqa: N818 - nothing is wrong
+    """Ends a transaction without a trace."""
+
+
+def check_writing(recording: Recording) -> None:
+    """Raise `RecordingError` unless a row of each kind comes back as it was written; leaves nothing behind.
+
+    `recording` is a new one, with nothing in it. Another version of a library may write otherwise, and an hour later
+    is too late to know.
+    """
+    probe = Batch(
+        frames=[FrameRow(1, "probe", "in", bytes(range(256)))],
+        exchanges=[(2, 1, RangeReport(2, 1.25, 3, 4, 5, 6, 7, 8, -80.5, -81.5, 0.25, -0.25))],
+        cirs=[(3, 1, Cir(1, 2, 3500, (0, 65535, 7)))],
+        faults=[Fault(4, "probe", "kind", "a 'detail'", 1, 2)],
+    )
+    with suppress(_Withdrawn), recording.transaction():
+        probe.append_to(recording)
+        written, back = map(_values, (exchanges_of(probe.exchanges), recording.exchanges()))
+        same = {
+            "frames": recording.frames() == probe.frames,
+            "exchanges": written == back,
+            "cirs": recording.cirs() == [CirRow(3, 1, 1, 2, 3.5, (0, 65535, 7))],
+            "faults": recording.faults() == probe.faults,
+        }
+        if not all(same.values()):
+            wrong = ", ".join(table for table, good in same.items() if not good)
+            raise RecordingError(f"{recording.path}: what is written comes back otherwise (tables: {wrong})")
+        raise _Withdrawn("tried")
+
+
+def _values(exchanges: Exchanges) -> str:
+    return str({name: column.tolist() for name, column in exchanges.to_dict().items()})
 
 
 def overheard_row(time_ns: int, listener: int, heard: Overheard) -> dict[str, float]:

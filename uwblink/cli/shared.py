@@ -66,9 +66,10 @@ def run(
             app(args=list(sys.argv[1:] if arguments is None else arguments))
         except (Exception, KeyboardInterrupt, SystemExit) as error:
             if not interrupted():
-                if not isinstance(error, mistakes):
+                text = _said(error, mistakes)
+                if text is None:
                     raise
-                typer.echo(f"error: {with_flags(str(error), FLAGS | dict(flags))}", err=True)
+                typer.echo(f"error: {one_line(with_flags(text, FLAGS | dict(flags)))}", err=True)
                 found = (number for kind, number in (statuses or {}).items() if isinstance(error, kind))
                 status = next(found, MISTAKE)
     if interrupted():
@@ -76,6 +77,22 @@ def run(
         typer.echo("interrupted", err=True)
         status = INTERRUPTED
     sys.exit(status)
+
+
+def _said(error: BaseException, mistakes: tuple[type[Exception], ...]) -> str | None:
+    """Return what to say of an error that comes of what the command was given; None for one of the program."""
+    if isinstance(error, mistakes):
+        return str(error)
+    if isinstance(error, RuntimeWarning):
+        return f"numbers beyond what can be computed with ({error}); nothing was written"
+    if isinstance(error, MemoryError):
+        return "not enough memory for that; nothing was written"
+    return None
+
+
+def one_line(text: str) -> str:
+    """Return a text with what is no printable character as an escape; names and cells of files may hold anything."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextmanager
@@ -124,7 +141,7 @@ def interrupts() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Print what is wrong with plug-ins as one line, as errors are; leave other warnings as they are."""
+    """Print what is wrong with plug-ins as one line, as errors are; take overflows and the like for errors."""
     shown = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
@@ -133,8 +150,7 @@ def _plain_warnings() -> Iterator[None]:
         else:
             shown(message, category, *where, **more)
 
-    warnings.showwarning = show
-    try:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # of NumPy: what comes after them is nonsense
+        warnings.showwarning = show
         yield
-    finally:
-        warnings.showwarning = shown

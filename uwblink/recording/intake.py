@@ -44,9 +44,10 @@ class _Kind(NamedTuple):
 
 
 _REFUSED: Final = (
+    # First, because older versions of DuckDB would take a macro of the file for what the others ask.
+    _Kind("a macro", "SELECT function_name FROM system.main.duckdb_functions() WHERE NOT internal"),
     _Kind("a schema", "SELECT schema_name FROM system.main.duckdb_schemas() WHERE NOT internal"),
     _Kind("a view", "SELECT view_name FROM system.main.duckdb_views() WHERE NOT internal"),
-    _Kind("a macro", "SELECT function_name FROM system.main.duckdb_functions() WHERE NOT internal"),
     _Kind("a type", "SELECT type_name FROM system.main.duckdb_types() WHERE NOT internal"),
     _Kind("a sequence", "SELECT sequence_name FROM system.main.duckdb_sequences()"),
     _Kind(

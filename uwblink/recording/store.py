@@ -136,9 +136,13 @@ class Store:
             column = columns[name]
             batch[name] = np.ascontiguousarray(np.ma.getdata(column))
             values.append(f'"{name}"')
+            if TABLES[table][name] == "BLOB":
+                # Not every version takes bytes from an array; all take digits.
+                batch[name] = np.array([data.hex() for data in batch[name].tolist()], dtype=object)
+                values[-1] = f'unhex("{name}")'
             if np.ma.is_masked(column):
                 batch[f"no_{name}"] = np.ma.getmaskarray(column)
-                values[-1] = f'CASE WHEN "no_{name}" THEN NULL ELSE "{name}" END'
+                values[-1] = f'CASE WHEN "no_{name}" THEN NULL ELSE {values[-1]} END'
         listed = ", ".join(f'"{name}"' for name in names)
         self._db.register("batch", batch)
         with self._fitting(table):
@@ -207,9 +211,9 @@ class Store:
         except duckdb.Error as error:
             with suppress(duckdb.Error):
                 self.execute("ROLLBACK")
+            hint = "; is the disk full?" if isinstance(error, duckdb.IOException) else "."
             raise RecordingError(
-                f"{self.path}: cannot be written any more ({_first_line(error)}); is the disk full? "
-                "What was written before is kept"
+                f"{self.path}: cannot be written any more ({_first_line(error)}){hint} What was written before is kept"
             ) from error
         except RecordingError:
             with suppress(duckdb.Error):

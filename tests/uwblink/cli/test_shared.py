@@ -6,6 +6,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 
@@ -31,6 +32,8 @@ class WorseError(MineError):
         (RecordingError("f.uwb: exists; or `force` and `map_file`"), 2, "error: f.uwb: exists; or --force and --map\n"),
         (MineError("mine"), 2, "error: mine\n"),
         (WorseError("worse"), 1, "error: worse\n"),
+        (MineError("a\nb\x1b[31m \ud800"), 2, "error: a\\nb\\x1b[31m \\ud800\n"),
+        (MemoryError(), 2, "error: not enough memory for that; nothing was written\n"),
     ],
 )
 def test_an_error_is_one_line_and_a_status(error, code, line, capsys):
@@ -45,6 +48,23 @@ def test_an_error_is_one_line_and_a_status(error, code, line, capsys):
         shared.run(app, MineError, statuses={WorseError: 1}, arguments=["fail"])
     assert end.value.code == code
     assert capsys.readouterr().err == line
+
+
+def test_numbers_beyond_numbers_are_an_error_and_not_a_result(capsys):
+    app = shared.new_app("Try.")
+
+    @app.command()
+    def fail() -> None:
+        print((np.array([1e300]) * 1e300)[0])
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        with pytest.raises(SystemExit) as end:
+            shared.run(app, arguments=["fail"])
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: numbers beyond what can be computed with (overflow")
 
 
 def test_an_error_of_nobody_is_not_swallowed():

@@ -42,7 +42,10 @@ ENDLESS = (
         (["DROP TABLE meta", f"CREATE VIEW meta AS {ENDLESS}"], "a view, meta"),
         (["DROP TABLE poses", "CREATE VIEW poses AS SELECT * FROM exchanges, range(1000000)"], "a view, poses"),
         # What would stand for the database's own functions, and lie about the rest.
-        (["CREATE MACRO duckdb_views() AS TABLE SELECT 1 WHERE false", "CREATE VIEW a AS SELECT 1"], "a view, a"),
+        (
+            ["CREATE MACRO duckdb_views() AS TABLE SELECT 1 WHERE false", "CREATE VIEW a AS SELECT 1"],
+            "a macro, duckdb_views",
+        ),
         (["CREATE MACRO duckdb_functions() AS TABLE SELECT 1 WHERE false"], "a macro, duckdb_functions"),
         (["CREATE MACRO count(a) AS 17"], "a macro, count"),
         (["CREATE MACRO list_position(a, b) AS 1"], "a macro, list_position"),

@@ -1,0 +1,218 @@
+"""Damaged files of every kind, and hostile options, through every command: `python -m tests.fuzz.commands`.
+
+A case is a number: it says which kind of file is damaged how, and which command takes it, the same on every machine.
+What must not happen: an exception that nobody caught, a warning of NumPy, more than 20 s, more than 2 GB, a status that
+is not 0, 1 or 2, an error of several lines, and an output beside an error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import multiprocessing
+import os
+import random
+import resource
+import shlex
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import calib.cli
+import uwblink.cli
+import uwbsim.cli
+from tests.fuzz.mutations import WORDS, damage_recording
+from tests.fuzz.seeds import KINDS, Kind, write_seeds
+
+MAINS: Final = {"uwblink": uwblink.cli.main, "uwbsim": uwbsim.cli.main, "calib": calib.cli.main}
+LONGEST_S: Final = 20.0
+MOST_BYTES: Final = 2_000_000_000
+USAGE: Final = ("Usage:", "─ Error ─")
+"""What a mistake in options is answered with: how it would be right, in a few lines."""
+
+OPTIONS_SHARE: Final = 0.1
+"""Share of cases in which an option is damaged and not the file."""
+
+
+class Outcome(NamedTuple):
+    """How a command ended: its status, what it printed, and the exception that nobody caught, or None."""
+
+    status: int | None
+    error_text: str
+    uncaught: str | None
+
+
+def words_of(kind: Kind, damaged: Path, seeds: Path, out: Path, rng: random.Random) -> list[str]:
+    """Return the words of one of a kind's commands."""
+    words = shlex.split(rng.choice(kind.commands))
+    for k, word in enumerate(words):
+        place = {"{}": str(damaged), "{out}": str(out)}
+        for name in place:
+            word = word.replace(name, place[name])
+        if "{" in word:
+            head, _, rest = word.partition("{")
+            word = head + str(seeds / rest.rstrip("}"))
+        words[k] = word
+    return words
+
+
+def damage_options(words: list[str], rng: random.Random) -> list[str]:
+    """Change, drop or double one of a command's words after the first two."""
+    changed = list(words)
+    place = rng.randrange(2, len(changed))
+    hostile = rng.choice(WORDS).replace("\x00", "").encode("utf-8", "replace").decode()
+    changed[place : place + 1] = rng.choice(([], [hostile], [changed[place]] * 2, [changed[place], hostile]))
+    return changed
+
+
+def prepare(number: int, seeds: Path, place: Path) -> list[str]:
+    """Damage what case `number` damages, in `place`; returns the words of its command."""
+    rng = random.Random(number)
+    kind = rng.choice(KINDS)
+    damaged = place / kind.file
+    if rng.random() < OPTIONS_SHARE:
+        shutil.copyfile(seeds / kind.file, damaged)
+        return damage_options(words_of(kind, damaged, seeds, _output(kind, place), rng), rng)
+    if kind.mutations:
+        data = rng.choice(kind.mutations)((seeds / kind.file).read_bytes(), rng)
+        damaged.write_bytes(b"" if data is None else data)
+    else:
+        damage_recording(seeds / kind.file, damaged, rng)
+    return words_of(kind, damaged, seeds, _output(kind, place), rng)
+
+
+def _output(kind: Kind, place: Path) -> Path:
+    return place / ("out.html" if kind.file == "scenario.toml" else "out")
+
+
+def execute(words: list[str]) -> Outcome:
+    """Run a command in this process."""
+    printed, errors = io.StringIO(), io.StringIO()
+    sys.argv = words
+    uncaught: str | None = None
+    status: int | None = 0
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
+        try:
+            MAINS[words[0]]()
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else 0 if end.code is None else 99
+        except BaseException as error:
+            frames = [f for f in traceback.extract_tb(error.__traceback__) if "/tests/" not in f.filename]
+            where = next((f for f in reversed(frames) if any(f"/{m}/" in f.filename for m in MAINS)), frames[-1])
+            uncaught = f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {str(error)[:120]!r}"
+    return Outcome(status, errors.getvalue(), uncaught)
+
+
+def judge(outcome: Outcome, written: list[Path]) -> str:
+    """Return what is wrong with how a command ended; nothing where it ended well."""
+    if outcome.uncaught:
+        return f"uncaught {outcome.uncaught}"
+    if outcome.status not in (0, 1, 2):
+        return f"status {outcome.status}"
+    lines = outcome.error_text.splitlines()
+    said = [line for line in lines if not line.startswith("warning: ")]
+    if outcome.status == 2 and not any(lines_of_usage in outcome.error_text for lines_of_usage in USAGE):
+        if len(said) != 1 or not said[0].startswith("error: "):
+            return f"an error of {len(said)} lines: {' / '.join(said)[:200]!r}"
+        if not said[0].isprintable():
+            return f"an error that steers the terminal: {said[0][:200]!r}"
+        if written:
+            return "an output beside an error"
+    return ""
+
+
+def _work(connection: Connection, seeds: Path, folder: Path) -> None:
+    """Take numbers of cases and return what is wrong with each."""
+    resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
+    while True:
+        number = connection.recv()
+        place = folder / str(number)
+        place.mkdir()
+        os.chdir(place)  # a hostile word may be the name of an output
+        words = prepare(number, seeds, place)
+        outcome = execute(words)
+        wrong = judge(outcome, [*place.glob("out*")])
+        connection.send((wrong, outcome.status, words))
+        if not wrong:
+            os.chdir(folder)
+            shutil.rmtree(place)
+
+
+class Runner:
+    """A process that tries cases, and is replaced when it hangs or dies."""
+
+    def __init__(self, seeds: Path, folder: Path) -> None:
+        """Begin with nothing running."""
+        self._seeds, self._folder = seeds, folder
+        self.statuses: Counter[int | None] = Counter()
+        self._process: Any = None
+        self._pipe: Any = None
+
+    def run(self, number: int) -> str:
+        """Try a case; returns what is wrong, or nothing."""
+        if self._process is None or not self._process.is_alive():
+            self._start()
+        self._pipe.send(number)
+        begun = time.monotonic()
+        while not self._pipe.poll(0.5):
+            if not self._process.is_alive():
+                return f"died with {self._process.exitcode}"
+            if time.monotonic() > begun + LONGEST_S:
+                self.close()
+                return f"more than {LONGEST_S:.0f} s"
+        wrong, status, words = self._pipe.recv()
+        self.statuses[status] += 1
+        return f"{wrong}   [{' '.join(words)[:150]}]" if wrong else ""
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._process = None
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(theirs, self._seeds, self._folder), daemon=True)
+        self._process.start()
+
+
+def main() -> int:
+    """Try cases and print what is wrong; status 1 where anything is."""
+    parser = argparse.ArgumentParser(description="Run commands on damaged files.")
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--cases", type=int, default=2000)
+    parser.add_argument("--keep", type=Path, help="folder for the damaged files of cases that went wrong")
+    options = parser.parse_args()
+    found: Counter[str] = Counter()
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory() as scratch:
+        seeds, folder = Path(scratch) / "seeds", (options.keep or Path(scratch) / "cases").absolute()
+        write_seeds(seeds)
+        folder.mkdir(parents=True, exist_ok=True)
+        runner = Runner(seeds, folder)
+        for number in range(options.first, options.first + options.cases):
+            wrong = runner.run(number)
+            if wrong:
+                found[wrong.partition("   [")[0]] += 1
+                print(f"case {number}: {wrong}", flush=True)
+        runner.close()
+    print(
+        f"{options.cases} cases, {sum(found.values())} wrong, {time.monotonic() - begun:.0f} s; ended with",
+        dict(runner.statuses),
+    )
+    for wrong, count in found.most_common():
+        print(f"{count:6d}  {wrong}")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
