@@ -126,9 +126,7 @@ def optimum(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Find the delay of the scheduled message that gives the least variance per second of air time."""
-    import math
-
+    """Find the delay of the scheduled message at which the mean of a second of a pair's ranges errs least."""
     import uwbsim
     from uwbsim.output import check_folder
     from uwbsim.pages import optimum_file, write_optima
@@ -147,8 +145,8 @@ def optimum(
     typer.echo(f"{'protocol':10s}{'best delay':>12s}{'one range':>12s}{'takes':>10s}{'mean of 1 s':>14s}")
     for one in found:
         typer.echo(
-            f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} us{100 * one.std_m:9.2f} cm{1e6 * one.duration_s:7.0f} us"
-            f"{1e3 * math.sqrt(one.score_m2s):11.3f} mm" + ("  (the edge of what boards take)" if one.on_edge else "")
+            f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} us{100 * one.rms_m:9.2f} cm{1e6 * one.duration_s:7.0f} us"
+            f"{1e3 * one.second_rms_m:11.3f} mm" + ("  (the edge of what boards take)" if one.on_edge else "")
         )
 
 

@@ -64,13 +64,13 @@ def error_over(curves: Mapping[str, ErrorCurve], x: str, *, logarithmic: bool = 
 
 
 def optimum_curve(found: Optimum) -> Figure:
-    """Standard deviation of one range, and of the mean of a second full of them, over the delay."""
+    """Root mean squared error of one range, and of the mean of a second full of them, over the delay."""
     figure = Figure(figsize=WIDE, layout="constrained")
     left, right = figure.subplots(1, 2)
     delays = 1e6 * found.delays_s
-    left.plot(delays, 100 * np.sqrt(found.variance_m2), color=PALETTE[2])
-    right.plot(delays, 1000 * np.sqrt(found.scores_m2s), color=PALETTE[2])
-    for axes, y in ((left, 100 * found.std_m), (right, 1000 * np.sqrt(found.score_m2s))):
+    left.plot(delays, 100 * np.sqrt(found.range_m2), color=PALETTE[2])
+    right.plot(delays, 1000 * np.sqrt(found.second_m2), color=PALETTE[2])
+    for axes, y in ((left, 100 * found.rms_m), (right, 1000 * found.second_rms_m)):
         axes.plot([1e6 * found.delay_s], [y], "o", color=PALETTE[0])
         axes.annotate(f"{1e6 * found.delay_s:.0f} us", (1e6 * found.delay_s, y), (6, 8), textcoords="offset points")
         _microseconds(axes)

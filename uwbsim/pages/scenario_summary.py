@@ -105,7 +105,7 @@ def preview(scenario: Scenario | Source) -> Preview:
         pairs=tuple(pairs),
         exchanges=len(plan.start),
         rate_hz=len(plan.start) / duration,
-        fastest_hz=scenario.ranging.fastest_hz(),
+        fastest_hz=scenario.ranging.fastest_hz(radio.preamble_symbols),
         air_share=scenario.ranging.air_share(radio.preamble_symbols),
         duration_s=duration,
     )

@@ -12,25 +12,28 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
-from uwbsim.scenario.airtime import after_marker_s, before_marker_s, exchange_air_s, frame_s, message_bytes
+from uwbsim.scenario.airtime import (
+    TURNAROUND_S,
+    after_marker_s,
+    exchange_air_s,
+    exchange_s,
+    frame_s,
+    message_bytes,
+)
 from uwbsim.scenario.loading import Source, as_scenario
-from uwbsim.scenario.model import BoardReply, FixedReply, QuantileReply, Scenario
-from uwbsim.simulation.air import RECEIVER_ON_S, TURNAROUND_S
+from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.air import RECEIVER_ON_S
 
 MOST: Final = 50_000_000
 """Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""
 
 SAMPLE: Final = 200_000
 """Errors of each protocol that are kept."""
-
-MEDIAN_REPLY_S: Final = 305e-6
-"""Of the measured boards."""
-"""Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
 
 WINNER_DELAYS_US: Final = (300, 600, 1000, 1500, 2000, 3000, 5000)
 
@@ -204,20 +207,13 @@ def _outcome(scenario: Scenario, protocol: RangingProtocol, conditions: Conditio
     )
 
 
-def _at_once_s(reply: BoardReply | FixedReply | QuantileReply) -> float:
-    if reply.model == "boards":
-        return MEDIAN_REPLY_S
-    return reply.delay_s if reply.model == "fixed" else float(reply.at_s(np.array([0.5]))[0])
-
-
 def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | None = None) -> dict[str, float]:
     """Return what an exchange takes: `air_s`, `duration_s`, `radio_on_s`.
 
     `scheduled_s` replaces the scenario's delay.
     """
     symbols = scenario.radio.preamble_symbols
-    scheduled = scheduled_s or scenario.ranging.response_delay_uus * UUS_TICKS * TICK_S
-    at_once = _at_once_s(scenario.ranging.reply)
+    scheduled, at_once = scheduled_s or scenario.ranging.scheduled_s, scenario.ranging.at_once_s
     lengths = message_bytes(protocol)
     marker, end = 0.0, after_marker_s(lengths[0])
     radio = 2 * frame_s(lengths[0], symbols)
@@ -229,7 +225,7 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
         end = marker + after_marker_s(length)
     return {
         "air_s": exchange_air_s(protocol, symbols),
-        "duration_s": before_marker_s(symbols) + end,
+        "duration_s": exchange_s(protocol, symbols, scheduled, at_once),
         "radio_on_s": radio,
     }
 
@@ -243,8 +239,8 @@ def calibrated(conditions: Conditions) -> Conditions:
 def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[dict[str, Any]]:
     """Say which protocol wins at which delay of the scheduled reply, as a calibration leaves it, by prediction.
 
-    By `rmse`, a single range; by `per_second`, the mean squared error times the time that an exchange takes, which is
-    what counts where the air is full and ranges are averaged.
+    By `rmse`, a single range; by `per_second`, the mean of as many as one pair has in a second of its own
+    (`Prediction.mean_of`), which is what counts where the air is full and ranges are averaged.
     """
     world = calibrated(conditions_of(scenario, 2048))
     rows = []
@@ -252,10 +248,10 @@ def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[di
         here = world.with_columns(scheduled=delay_us * 1e-6)
         rmse, score = {}, {}
         for protocol in protocols:
-            bias, variance = predict(protocol, here).pooled()
-            duration = costs(scenario, protocol, delay_us * 1e-6)["duration_s"]
-            rmse[protocol.name] = float(np.sqrt(bias**2 + variance))
-            score[protocol.name] = (bias**2 + variance) * duration
+            found = predict(protocol, here)
+            duration = costs(scenario, protocol, delay_us * 1e-6)["duration_s"] + TURNAROUND_S
+            rmse[protocol.name] = float(np.sqrt(found.mean_of(1)))
+            score[protocol.name] = found.mean_of(1 / duration)
         rows.append(
             {
                 "scheduled_us": delay_us,

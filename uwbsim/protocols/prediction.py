@@ -58,6 +58,14 @@ class Prediction:
         """Return mean and variance over all states together: the variance has the spread of the means in it."""
         return float(np.mean(self.mean_m)), float(np.mean(self.variance_m2) + np.var(self.mean_m))
 
+    def mean_of(self, count: float) -> float:
+        """Return the mean squared error, in square metres, of the mean of `count` ranges in one state, over all states.
+
+        Noise averages away with their number. What a state does to the mean (skew in single-sided ranging, an
+        obstacle) is the same in each of them, and stays.
+        """
+        return float(np.mean(self.mean_m**2) + np.mean(self.variance_m2) / count)
+
 
 def predict(protocol: RangingProtocol, c: Conditions) -> Prediction:
     """Predict the error of a protocol under conditions (n,)."""

@@ -12,8 +12,9 @@ from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.comparison import calibrated, chosen, costs
-from uwbsim.protocols.conditions import Conditions, conditions_of
+from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.prediction import predict
+from uwbsim.scenario.airtime import TURNAROUND_S
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 
@@ -26,27 +27,29 @@ POINTS: Final = 121
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Optimum:
-    """The best delay, and the curve: delays in seconds, variance of a range in m^2, and variance times time in m^2 s.
+    """The best delay, and the curve: delays in seconds, mean squared error of a range and of a second of them in m^2.
 
+    `rms_m` is the error of one range, `second_rms_m` that of the mean of as many as a pair has in a second: noise
+    averages away with their number, what skew leaves does not. `duration_s` is how long one takes, turnaround included.
     `on_edge` says that the best delay is the shortest or the longest one that boards take.
     """
 
     protocol: str
     delay_s: float
-    std_m: float
+    rms_m: float
     duration_s: float
-    score_m2s: float
+    second_rms_m: float
     on_edge: bool
     delays_s: Floats
-    variance_m2: Floats
-    scores_m2s: Floats
+    range_m2: Floats
+    second_m2: Floats
 
     def __repr__(self) -> str:
         """Return one line."""
         edge = " (the edge of what boards take)" if self.on_edge else ""
         return (
-            f"{self.protocol}: best delay {1e6 * self.delay_s:.0f} us{edge}, one range {100 * self.std_m:.2f} cm in "
-            f"{1e6 * self.duration_s:.0f} us, mean of a second {1e3 * self.score_m2s**0.5:.3f} mm"
+            f"{self.protocol}: best delay {1e6 * self.delay_s:.0f} us{edge}, one range {100 * self.rms_m:.2f} cm in "
+            f"{1e6 * self.duration_s:.0f} us, mean of a second {1e3 * self.second_rms_m:.3f} mm"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -56,12 +59,13 @@ class Optimum:
 
 
 def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds", overhead_s: float = 0.0) -> Optimum:
-    """Minimise mean squared error times duration over the delay of the scheduled message.
+    """Minimise the mean squared error of the mean of a second's exchanges over the delay of the scheduled message.
 
-    A second of air holds 1/duration exchanges, whose mean has the variance of one times the duration. Antenna delays,
+    A second holds 1/duration exchanges of a pair, one after the other at the boards' turnaround. The variance of their
+    mean is that of one times the duration; the bias that skew, drift and motion leave is that of one. Antenna delays,
     power bias and reflections are left out: calibration deals with them, and no delay does. `scenario` is whatever
     `load` takes, or a `Scenario`, `protocol` a name or a row of `PROTOCOLS`; `overhead_s` is what an exchange takes
-    besides, in seconds (commands, turnaround). Raises `ParameterError`.
+    besides, in seconds (others on the air). Raises `ParameterError`.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -85,30 +89,29 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
     # The grid of delayed transmissions would show as teeth of 8 ns on the curve.
     world = replace(world, quantize=False)
     delays = np.geomspace(SHORTEST_S, LONGEST_S, POINTS)
-    squares = np.array([_square_m2(protocol, world, delay) for delay in delays])
-    durations = np.array([costs(scenario, protocol, float(d))["duration_s"] + overhead_s for d in delays])
-    scores = squares * durations
-    best = int(np.argmin(scores))
+
+    def duration(delay: float) -> float:
+        return costs(scenario, protocol, delay)["duration_s"] + TURNAROUND_S + overhead_s
+
+    def errors(delay: float) -> tuple[float, float]:
+        """Return the mean squared error of one range, and of the mean of a second of them."""
+        found = predict(protocol, world.with_columns(scheduled=delay))
+        return found.mean_of(1), found.mean_of(1 / duration(delay))
+
+    one, second = np.array([errors(float(delay)) for delay in delays]).T
+    best = int(np.argmin(second))
     low, high = delays[max(best - 1, 0)], delays[min(best + 1, POINTS - 1)]
-
-    def score(delay: float) -> float:
-        return _square_m2(protocol, world, delay) * (costs(scenario, protocol, delay)["duration_s"] + overhead_s)
-
-    refined = float(minimize_scalar(score, bounds=(low, high), method="bounded", options={"xatol": 1e-8}).x)
-    delay = min((refined, float(delays[best])), key=score)
+    refined = minimize_scalar(lambda d: errors(d)[1], bounds=(low, high), method="bounded", options={"xatol": 1e-8})
+    delay = min((float(refined.x), float(delays[best])), key=lambda d: errors(d)[1])
+    one_m2, second_m2 = errors(delay)
     return Optimum(
         protocol=protocol.name,
         delay_s=delay,
-        std_m=float(np.sqrt(_square_m2(protocol, world, delay))),
-        duration_s=costs(scenario, protocol, delay)["duration_s"] + overhead_s,
-        score_m2s=score(delay),
+        rms_m=math.sqrt(one_m2),
+        duration_s=duration(delay),
+        second_rms_m=math.sqrt(second_m2),
         on_edge=best in (0, POINTS - 1),
         delays_s=delays,
-        variance_m2=squares,
-        scores_m2s=scores,
+        range_m2=one,
+        second_m2=second,
     )
-
-
-def _square_m2(protocol: RangingProtocol, world: Conditions, delay_s: float) -> float:
-    bias, variance = predict(protocol, world.with_columns(scheduled=delay_s)).pooled()
-    return bias**2 + variance

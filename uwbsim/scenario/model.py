@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from uwblink.arrays import Floats
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.scenario.airtime import exchange_air_s
+from uwbsim.scenario.airtime import TURNAROUND_S, exchange_air_s, exchange_s
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.devices import Devices, GroupDelay, Profile
 from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints
@@ -23,11 +23,10 @@ from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline, TwoStat
 from uwbsim.units import MS, NS, PPM, US
 
 ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
-PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
+MEDIAN_REPLY_S: Final = 305e-6
+"""Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
 
-OVERHEAD_S: Final = 0.0015
-"""From the last stamp of an exchange until the board answers the next command: start-up of the poll, three frames, and
-the transfer over USB (firmware wire format, 1.5)."""
+PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
 
 PATTERN_SIZES: Final = (0, 3, 8, 15, 24)
 """How many spherical harmonics there are up to a degree, without the one that is the same everywhere."""
@@ -113,11 +112,6 @@ class Ranging(Section):
         for pair in self.pairs if self.pairs != "between-bodies" else ():
             if pair[0] == pair[1]:
                 raise ValueError(f"pairs: tag {pair[0]} cannot range with itself")
-        if self.plan != "aloha" and self.rate_hz > self.fastest_hz():
-            raise ValueError(
-                f"rate_hz: found {self.rate_hz:g}, at this response_delay_uus the air allows "
-                f"at most {self.fastest_hz():.0f}"
-            )
         return self
 
     @property
@@ -130,10 +124,22 @@ class Ranging(Section):
         """Return in seconds how long a robot waits for an exchange that it cannot hear."""
         return self.list_timeout_ms * MS
 
-    def fastest_hz(self) -> float:
+    @property
+    def scheduled_s(self) -> float:
+        """Return the delay of the scheduled message in seconds."""
+        return self.response_delay_uus * UUS_S
+
+    @property
+    def at_once_s(self) -> float:
+        """Return the median latency of a reply at once, in seconds."""
+        if self.reply.model == "fixed":
+            return self.reply.delay_s
+        return float(self.reply.at_s(np.array(0.5))) if self.reply.model == "quantiles" else MEDIAN_REPLY_S
+
+    def fastest_hz(self, preamble_symbols: int) -> float:
         """Return how many exchanges a second one after the other allow."""
-        scheduled = sum(message.timing == "scheduled" for message in PROTOCOLS[self.protocol].messages)
-        return 1 / (OVERHEAD_S + scheduled * self.response_delay_uus * UUS_S)
+        row = PROTOCOLS[self.protocol]
+        return 1 / (exchange_s(row, preamble_symbols, self.scheduled_s, self.at_once_s) + TURNAROUND_S)
 
     def air_share(self, preamble_symbols: int) -> float:
         """Return the share of time for which the plan keeps the air busy."""
@@ -296,6 +302,12 @@ class Scenario(Section):
         self._check_reflections(ids)
         self._check_places()
         self._check_plan(ids)
+        fastest = self.ranging.fastest_hz(self.radio.preamble_symbols)
+        if self.ranging.plan != "aloha" and self.ranging.rate_hz > fastest:
+            raise ValueError(
+                f"ranging.rate_hz: found {self.ranging.rate_hz:g}, at this response_delay_uus the air allows "
+                f"at most {fastest:.0f}"
+            )
         if not self.pairs():
             raise ValueError("ranging.pairs: no two tags sit on different bodies, so nobody ranges")
         return self

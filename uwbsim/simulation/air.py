@@ -17,7 +17,7 @@ import simpy
 
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
-from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
+from uwbsim.scenario.airtime import TURNAROUND_S, after_marker_s, before_marker_s, message_bytes
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 PREAMBLE_TIMEOUT_S: Final = 6.521e-3
@@ -25,9 +25,6 @@ PREAMBLE_TIMEOUT_S: Final = 6.521e-3
 
 RECEIVER_ON_S: Final = 40e-6
 """From the end of a frame until the receiver is on again (firmware wire format, 3.1)."""
-
-TURNAROUND_S: Final = 0.5e-3
-"""From the end of an exchange until the initiator's host can command the next."""
 
 WEAK, COLLIDED, BUSY, FOREIGN, LATE = "below sensitivity", "collision", "receiver busy", "another's frame", "too late"
 

@@ -12,8 +12,12 @@ import pytest
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.protocols.comparison import calibrated, compare, costs, over_reply, over_skew, paper_bias_m, winners
 from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.monte_carlo import range_errors_m
+from uwbsim.protocols.prediction import predict
 from uwbsim.protocols.reply_delay import optimum
+from uwbsim.scenario.airtime import TURNAROUND_S
 from uwbsim.scenario.loading import load
+from uwbsim.simulation.run import simulate
 
 ROOT = Path(__file__).parents[3]
 BIN = Path(sys.executable).parent
@@ -55,8 +59,9 @@ def test_an_exchange_takes_what_its_frames_and_replies_take(scenario):
 def test_the_table_says_which_wins_where(scenario):
     rows = winners(scenario, [PROTOCOLS["ss-cfo"], PROTOCOLS["ds"]])
     # Short replies leave the carrier integrator little to spoil, and cost double-sided ranging its short third leg.
-    assert rows[0]["rmse"] == rows[0]["per_second"] == "ss-cfo"
-    assert rows[-1]["rmse"] == rows[-1]["per_second"] == "ds"
+    assert (rows[0]["rmse"], rows[-1]["rmse"]) == ("ss-cfo", "ds")
+    # What the carrier reads wrong on average stays, however many ranges are averaged.
+    assert {row["per_second"] for row in rows} == {"ds"}
 
 
 def test_curves_follow_the_paper(scenario):
@@ -73,15 +78,55 @@ def test_curves_follow_the_paper(scenario):
 def test_the_optimum_is_where_nothing_near_is_better(scenario):
     found = optimum(scenario, PROTOCOLS["ds"])
     assert not found.on_edge
-    assert found.score_m2s <= found.scores_m2s.min() * (1 + 1e-9)
+    assert found.second_rms_m**2 <= found.second_m2.min() * (1 + 1e-9)
     # (1 + r + r^2) (T + a), r = 305/T: the least of it, with the rest of the exchange a, by hand.
     delays = np.linspace(300e-6, 3e-3, 100_000)
-    rest = costs(scenario, PROTOCOLS["ds"], 1e-3)["duration_s"] - 1e-3
+    rest = costs(scenario, PROTOCOLS["ds"], 1e-3)["duration_s"] - 1e-3 + TURNAROUND_S
     r = 305e-6 / delays
     by_hand = delays[np.argmin((1 + r + r**2) * (delays + rest))]
     assert found.delay_s == pytest.approx(by_hand, rel=0.03)
     assert optimum(scenario, PROTOCOLS["ds-sym"]).on_edge
     assert optimum(scenario, PROTOCOLS["ds"], 2e-3).delay_s > 1.3 * found.delay_s, "overhead favours longer replies"
+
+
+@pytest.mark.parametrize("name", ["ss", "ss-cfo", "ds", "ds-sym"])
+def test_a_bias_does_not_average_away(scenario, name):
+    """The mean of many simulated ranges of one state, beside what is predicted for it."""
+    world = calibrated(conditions_of(scenario, 64))
+    count = 400
+    errors = range_errors_m(PROTOCOLS[name], world, 5, count * len(world)).reshape(count, len(world))
+    predicted = predict(PROTOCOLS[name], world)
+    # Squares of 64 means are known to 18 %, so their root to 9 %; where skew rules, to much less.
+    simulated = np.sqrt(np.mean(errors.mean(axis=0) ** 2))
+    assert np.sqrt(predicted.mean_of(count)) == pytest.approx(simulated, rel=0.02 if name == "ss" else 0.25)
+    assert np.sqrt(predicted.mean_of(1)) == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.03)
+    alone = np.sqrt(predicted.mean_of(1) / count)
+    assert (simulated > 10 * alone) == (name == "ss")
+
+
+def test_the_mean_of_a_second_keeps_what_skew_leaves(scenario):
+    found = {name: optimum(scenario, name) for name in ("ss", "ds")}
+    reply_s = found["ss"].delay_s
+    c = calibrated(conditions_of(scenario, 2048))
+    skew = np.sqrt(np.mean((0.5 * 299_702_547 * (c.rate_initiator - c.rate_target) * reply_s) ** 2))
+    assert found["ss"].second_rms_m == pytest.approx(skew, rel=0.02)
+    assert found["ss"].second_rms_m > 20 * found["ds"].second_rms_m
+    # Of a protocol without a bias it is the error of one over the root of their number.
+    best = found["ds"]
+    assert best.second_rms_m == pytest.approx(best.rms_m * np.sqrt(best.duration_s), rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["ss", "ds", "ds-sym"])
+def test_compare_counts_as_many_exchanges_a_second_as_a_run_has(name):
+    settings = ["run.duration_s=4", f"ranging.protocol={name}"]
+    fastest = load(TEST1, settings)
+    fastest = fastest.ranging.fastest_hz(fastest.radio.preamble_symbols)
+    crowded = load(TEST1, [*settings, f"ranging.rate_hz={0.999 * fastest}"])
+    time_ns = simulate(crowded).exchanges.time_ns
+    said = compare(crowded, [name], 1000).outcomes[0].rate_hz
+    assert said == pytest.approx(fastest, rel=1e-9)
+    # Replies at once take 4 us longer on average than in the median, and a second has whole exchanges.
+    assert 1e9 * (len(time_ns) - 1) / np.ptp(time_ns) == pytest.approx(said, rel=0.004)
 
 
 def test_calibrated_leaves_skew_and_noise(scenario):
@@ -117,7 +162,7 @@ def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
     assert json.loads(done.stdout)["bias_m"] == pytest.approx(0.4495, abs=0.0005)
     assert "standard deviation" in run("predict", "--protocol", "ds").stdout
     done = run("optimum", TEST1, "--protocols", "ds", "-o", tmp_path / "o", "--json")
-    assert json.loads(done.stdout)[0]["delay_s"] == pytest.approx(633e-6, rel=0.02)
+    assert json.loads(done.stdout)[0]["delay_s"] == pytest.approx(811e-6, rel=0.02)
     assert (tmp_path / "o" / "optimum-ds.png").read_bytes().startswith(b"\x89PNG")
 
 
