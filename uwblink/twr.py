@@ -239,7 +239,7 @@ def raw_range(exchanges: Exchanges) -> Floats:
 def delay_weights(exchanges: Exchanges) -> tuple[Floats, Floats]:
     """Weights of the two antenna delays: t_f calibrated = t_f raw + w_i d_i + w_j d_j.
 
-    (1/2, 1/2) for SS-TWR and (1/2, K/2) for the paper's DS-TWR (ICRA 2023, section IV).
+    (1/2, 1/2) for SS-TWR and (1/2, K/2) for the paper's DS-TWR (ICRA 2023, section III).
     """
     spans = intervals(exchanges)
     initiator = np.full(len(exchanges), np.nan)

@@ -144,7 +144,7 @@ class Calibration:
         return lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
 
     def apply(self, ranges: Ranges) -> CorrectedRanges:
-        """Correct ranges: c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section IV), then the curve.
+        """Correct ranges: c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section III), then the curve.
 
         Raises `BadInputError` naming the tags that have no delay in this calibration.
         """

@@ -27,7 +27,7 @@ POPULATED: Final = (0.005, 0.995)
 
 
 def lift(power_dbm: Floats, alpha_dbm: float) -> Floats:
-    """Return 10^((p - alpha)/10) (ICRA 2023, section V)."""
+    """Return 10^((p - alpha)/10) (ICRA 2023, section IV)."""
     # exp takes a third of the time of a power of ten.
     return np.asarray(np.exp((power_dbm - alpha_dbm) * (np.log(10) / 10)))
 

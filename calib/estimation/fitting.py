@@ -65,7 +65,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
 
     `scale_ns` is the scale of the robust loss in time of flight, estimated from the data by default; `fixed_ns` are
     delays that are known; `groups` name tags that share a curve (by default all do). `sequential` is the recipe of ICRA
-    2023, sections IV and V: delays first, then the curve on what they leave. `reference_power_dbm` is the power at
+    2023, sections III and IV: delays first, then the curve on what they leave. `reference_power_dbm` is the power at
     which the curve is zero, `alpha_dbm` by default (a sequential fit keeps the recipe's own constant, unless one is
     given). `minimum_norm` fits even where the pairs leave delays free, with the smallest ones that agree with the data.
     Raises `UnanswerableError` when there are too few ranges, their power does not vary, or the pairs do not determine

@@ -24,7 +24,7 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     """Return the calibration with the delay of one more tag; everything known stays as it was.
 
     `data` is what `load_ranges` takes.
-    Start is the closed form of ICRA 2023, section IV, for one pair (the median of what is missing); result a robust
+    Start is the closed form of ICRA 2023, section III, for one pair (the median of what is missing); result a robust
     fit over all exchanges with calibrated tags, at the centre of the core of their errors. Raises `BadInputError`
     where the tag is known already or not in the data, `UnanswerableError` where too few exchanges help.
 

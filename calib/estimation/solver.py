@@ -143,7 +143,7 @@ def _first_ridge(problem: Problem) -> Floats:
 
 
 def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None, reference: float | None) -> Solved:
-    """Delays first, then the curves on what they leave, as in ICRA 2023, section IV and V, with our splines.
+    """Delays first, then the curves on what they leave, as in ICRA 2023, section III and IV, with our splines.
 
     The curves keep their constants and the delays are those of the first step, unless a `reference` is asked for.
     """

@@ -1,7 +1,7 @@
 """What a calibration is worth to a robot: an EKF that tracks one body from its ranges to the others.
 
 State is the body's position; its velocity and attitude are inputs taken from motion capture, velocity with noise; the
-other bodies are known (ICRA 2023, section VI). Three filters see the same ranges: raw with a fixed variance,
+other bodies are known (ICRA 2023, section V). Three filters see the same ranges: raw with a fixed variance,
 calibrated with a fixed variance, and calibrated with the variance of the sigma curve.
 """
 

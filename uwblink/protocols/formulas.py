@@ -72,7 +72,7 @@ def carrier_delays(t: Intervals) -> tuple[Floats, Floats]:
 
 
 def double_sided_delays(t: Intervals) -> tuple[Floats, Floats]:
-    """Weights of `double_sided`, ICRA 2023, section IV: 1/2 and K/2."""
+    """Weights of `double_sided`, ICRA 2023, section III: 1/2 and K/2."""
     return np.full_like(t.dt41, 0.5), _clock_ratio(t) / 2
 
 

@@ -318,5 +318,5 @@ def over_state(
 
 
 def paper_bias_m(skew_ppm: float, reply_s: float) -> float:
-    """Return the bias of SS-TWR, c/2 times relative skew times reply (ICRA 2023, section III)."""
+    """Return the bias of SS-TWR, c/2 times relative skew times reply (ICRA 2023, section II)."""
     return 0.5 * SPEED_OF_LIGHT * skew_ppm * 1e-6 * reply_s

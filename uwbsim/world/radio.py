@@ -81,7 +81,7 @@ def path_gain_db(radio: Radio, distance_m: Floats) -> Floats:
 
 
 def lifted(power_dbm: Floats) -> Floats:
-    """Lifted power 10^((p - alpha)/10) (ICRA 2023, section V)."""
+    """Lifted power 10^((p - alpha)/10) (ICRA 2023, section IV)."""
     return np.asarray(10 ** ((power_dbm - ALPHA_DBM) / 10))
 
 

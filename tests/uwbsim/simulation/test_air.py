@@ -42,7 +42,7 @@ def test_a_missing_message_costs_the_preamble_timeout():
     outcome = played([[slot(0, 0, 0, 1, (True, False, True)), slot(1, 100, 0, 1)]])
     assert (outcome.lost, outcome.reason) == ([1, -1], [air.WEAK, ""])
     # From marker to marker: the rest of the poll, the receiver going on, the wait, the next command, its preamble.
-    assert np.diff(outcome.start)[0] / US == pytest.approx(39 + 40 + 6521 + 500 + 138.4, abs=2)
+    assert np.diff(outcome.start)[0] / US == pytest.approx(39 + 40 + 6521 + 1000 + 138.4, abs=2)
 
 
 def test_two_polls_at_once_collide_at_equal_power():
