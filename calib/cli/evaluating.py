@@ -55,51 +55,32 @@ def evaluate(
 def localize(
     recordings: Recordings,
     calibration: CalibrationFile,
+    training: Annotated[
+        Path | None, typer.Option(help="Flight on which the fixed variances are tuned; else they are the fit's (.uwb).")
+    ] = None,
+    process_noise: Annotated[
+        float, typer.Option(help="White noise of the velocity input, m/s an axis at 100 Hz; gains depend on it.")
+    ] = 0.3,
+    seeds: Annotated[int, typer.Option(help="Runs with other noise, of which mean and spread are told.")] = 3,
     tum: Annotated[
         Path | None, typer.Option(help="Folder for the estimated trajectories, one file a body and filter (.tum).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     force: Force = False,
 ) -> None:
-    """Track each moving body by its ranges, raw, calibrated and weighted by their variance, and print the RMSE in m."""
-    from dataclasses import asdict
-
+    """Track each moving body by its ranges, with and without calibration, and print the RMSE in m."""
     import calib
-    from calib.evaluation import FILTERS, PAPER_RMSE_M, as_tum, summarize
-    from uwblink.output import write_text
+    from calib.evaluation import Settings, localization_json, localization_text, summarize, write_tum
 
     known = calib.load_calibration(calibration)
-    found = [one for path in recordings for one in calib.localize(path, known)]
+    settings = Settings(velocity_std_mps=process_noise, seeds=seeds)
+    found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
     if tum:
-        tum.mkdir(parents=True, exist_ok=True)
-        for one in found:
-            for stage, track in one.tracks.items():
-                name = "".join(c if c.isalnum() or c in "-_" else "_" for c in f"{one.source}-{one.body}-{stage}")
-                write_text(tum / f"{name}.tum", as_tum(track), force=force)
-    summary = summarize(found)
+        write_tum(found, tum, force=force)
     if as_json:
-        rows = [
-            {"recording": one.source, "body": one.body, "rmse_m": {s: one.tracks[s].rmse_m for s in FILTERS}}
-            for one in found
-        ]
-        typer.echo(json.dumps({"scenarios": rows, "summary": asdict(summary)}, indent=1))
+        typer.echo(json.dumps(localization_json(found), indent=1))
         return
-    typer.echo(f"{'RMSE of the position (m)':34s}{'raw':>8s}{'calibrated':>13s}{'and variance':>14s}")
-    for one in found:
-        figures = [one.tracks[stage].rmse_m for stage in FILTERS]
-        typer.echo(f"{one.source + ' ' + one.body:34s}{figures[0]:8.3f}{figures[1]:13.3f}{figures[2]:14.3f}")
-    mean, less = summary.rmse_m, summary.reduction
-    typer.echo(f"{'mean':34s}{mean['raw']:8.3f}{mean['calibrated']:13.3f}{mean['variance']:14.3f}")
-    typer.echo(f"{'':42s}{-100 * less['calibrated']:+12.0f} %{-100 * less['variance']:+12.0f} %")
-    paper = PAPER_RMSE_M
-    typer.echo(
-        f"{'ICRA 2023, its own flights':34s}{paper['raw']:8.3f}{paper['calibrated']:13.3f}{paper['variance']:14.3f}"
-    )
-    typer.echo(
-        f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
-        f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
-        f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate"
-    )
+    typer.echo(localization_text(found, summarize(found), settings))
 
 
 def doctor(

@@ -11,6 +11,7 @@ FLAGS: Final = {
     "groups": "--group",
     "scale_ns": "--scale",
     "reference_power_dbm": "--reference-power",
+    "velocity_std_mps": "--process-noise",
 }
 
 

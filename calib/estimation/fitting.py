@@ -129,6 +129,10 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             *warnings_of(ranges, applied, float(np.mean(inliers)), problem.free),
         ]
         provenance = _provenance(ranges, inliers, fixed, sequential, problem, found, warnings, reference)
+        provenance["error_std_m"] = {
+            "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
+            "corrected": float(np.std(residuals)),
+        }
         return FitResult(
             calibration=replace(calibration, provenance=provenance),
             ranges=ranges,

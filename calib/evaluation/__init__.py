@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, as_tum, summarize
+    from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, Settings, summarize
+    from calib.evaluation.localization_display import as_tum, localization_json, localization_text, write_tum
     from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation
 
 __all__ = [
@@ -14,8 +15,12 @@ __all__ = [
     "PAPER_RMSE_M",
     "ErrorStatistics",
     "Evaluation",
+    "Settings",
     "as_tum",
+    "localization_json",
+    "localization_text",
     "summarize",
+    "write_tum",
 ]
 
 _HOMES: Final = {
@@ -24,8 +29,12 @@ _HOMES: Final = {
     "Evaluation": "calib.evaluation.statistics",
     "FILTERS": "calib.evaluation.localization",
     "PAPER_RMSE_M": "calib.evaluation.localization",
-    "as_tum": "calib.evaluation.localization",
+    "Settings": "calib.evaluation.localization",
+    "as_tum": "calib.evaluation.localization_display",
+    "localization_json": "calib.evaluation.localization_display",
+    "localization_text": "calib.evaluation.localization_display",
     "summarize": "calib.evaluation.localization",
+    "write_tum": "calib.evaluation.localization_display",
 }
 
 if not TYPE_CHECKING:

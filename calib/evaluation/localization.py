@@ -1,36 +1,55 @@
 """What a calibration is worth to a robot: an EKF that tracks one body from its ranges to the others.
 
 State is the body's position; its velocity and attitude are inputs taken from motion capture, velocity with noise; the
-other bodies are known (ICRA 2023, section V). Three filters see the same ranges: raw with a fixed variance,
-calibrated with a fixed variance, and calibrated with the variance of the sigma curve.
+other bodies are known (ICRA 2023, section V). Four filters see the same ranges and the same noise of velocity: raw and
+calibrated with fixed variances, calibrated with the variance of the sigma curve, and calibrated with all that a
+calibration says of errors, reflections included. `calib.evaluation.onboard` does without motion capture.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import zlib
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from calib.calibration.model import Calibration, require_calibration
-from calib.errors import UnanswerableError
+from calib.calibration.model import Calibration, CorrectedRanges, require_calibration
+from calib.errors import BadInputError, UnanswerableError
+from calib.evaluation.range_updates import Heard, RangeErrors, gated, weighed
+from calib.ranges import Ranges
 from calib.sources import Data, Flight, load_flight
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
+from uwblink.recording.schema import Poses
 
-FILTERS: Final = ("raw", "calibrated", "variance")
+FILTERS: Final = ("raw", "calibrated", "variance", "robust")
+ROBUST: Final = "robust"
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
-"""Mean over six scenarios (ICRA 2023, Table II)."""
+"""Mean over six scenarios (ICRA 2023, its only table): flights of its own, another filter's noise."""
+
+TUNED_OVER: Final = (0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.6, 1.0)
+"""Fixed standard deviations that are tried, in metres."""
+
+TUNED_RANGES: Final = 2500
+"""Ranges of each body of a training flight by which they are judged."""
+
+FEWEST_REFUSED: Final = 4
+LEAST_OUTLIERS: Final = 1e-3
+LEAST_OUTLIER_M: Final = 3.0
+"""What a filter has to reckon with that a calibration has not seen: a thousandth of any size."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How the filter is set up.
+    """How the filters are set up.
 
-    The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; a range is taken
-    when its squared innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is
-    its 99.9 % quantile). After `reopen` refusals in a row the filter widens its uncertainty by `initial_std_m`, so
-    that it cannot lock itself out.
+    The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; that is the process
+    noise. Percentages depend on it: the noisier velocity, the more the ranges decide. A range is taken when its squared
+    innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 % quantile);
+    the robust filter has no gate. A filter that believed none for `reopen_s` widens its uncertainty by the largest
+    innovation that it refused, so that it finds back from anywhere. `seeds` are runs with other noise, each body and
+    flight with its own; tracks are those of the first, `seed`.
     """
 
     velocity_std_mps: float = 0.3
@@ -38,18 +57,37 @@ class Settings:
     initial_std_m: float = 0.1
     fixed_std_m: float | None = None
     gate: float = 10.83
-    reopen: int = 25
+    reopen_s: float = 0.5
     seed: int = 0
+    seeds: int = 3
+
+    def __post_init__(self) -> None:
+        """Refuse what no filter can run with; raises `BadInputError`."""
+        for name in ("velocity_std_mps", "velocity_rate_hz", "initial_std_m", "gate", "reopen_s"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise BadInputError(f"found {getattr(self, name)!r:.40}, expected a number above 0", parameter=name)
+        if not 1 <= self.seeds <= 1000:
+            raise BadInputError(f"found {self.seeds!r:.40}, expected 1 to 1000", parameter="seeds")
+
+
+@dataclass(frozen=True, slots=True)
+class FixedStd:
+    """The fixed standard deviations of ranges, by filter, and where they come from, in words."""
+
+    std_m: dict[str, float]
+    source: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """How one filter did: times (n,), estimates and truth (n, 3), normalised errors, and what was refused.
 
-    `std_m` (n,) is the filter's own opinion of its error: the root of the sum of its three variances.
+    `std_m` (n,) is the filter's own opinion of its error: the root of the sum of its three variances. `attitude`
+    (n, 4), x y z w, is the filter's input.
     """
 
     time_ns: Ints
+    attitude: Floats
     estimate_m: Floats
     truth_m: Floats
     std_m: Floats
@@ -67,25 +105,39 @@ class Track:
         return float(np.sqrt(np.mean(np.sum((self.estimate_m - self.truth_m) ** 2, axis=1))))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Localization:
-    """One body of one recording: a track for each of `FILTERS`."""
+    """One body of one recording: a track for each of `FILTERS`, and the RMSE of each over seeds (seeds,) in metres.
+
+    `simulated` says whether the flight was; `fixed` are the fixed variances of the filters that have one.
+    """
 
     source: str
     body: str
     tracks: dict[str, Track]
+    rmse_m: dict[str, Floats]
+    fixed: FixedStd
+    simulated: bool
 
     def __repr__(self) -> str:
-        """Return how far off each track is, on one line."""
-        found = ", ".join(f"{name} {track.rmse_m:.3f} m" for name, track in self.tracks.items())
+        """Return how far off each filter is, over seeds, on one line."""
+        found = ", ".join(f"{name} {np.mean(rmse):.3f} m" for name, rmse in self.rmse_m.items())
         return f"{self.body} of {self.source}: rms error {found}"
 
 
-def localize(data: Data | Flight, calibration: Calibration, settings: Settings | None = None) -> list[Localization]:
-    """Track every body that moves and ranges in a recording, one at a time, with an extended Kalman filter.
+def localize(
+    data: Data | Flight,
+    calibration: Calibration,
+    settings: Settings | None = None,
+    *,
+    training: Data | Flight | None = None,
+) -> list[Localization]:
+    """Track every body that moves and ranges in a recording, one at a time, with extended Kalman filters.
 
-    `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`. Raises
-    what `Calibration.apply` raises, and `UnanswerableError` where no body moves or the recording has no poses.
+    `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`. The fixed
+    variances are the best ones on the flight `training`; without it those of the errors that the calibration was fitted
+    to, as it remembers them; never those of the flight itself, which a filter cannot know. Raises what
+    `Calibration.apply` raises, and `UnanswerableError` where no body moves or the recording has no poses.
 
     >>> import calib
     >>> known = calib.fit(calib.sample_flight()).calibration
@@ -98,39 +150,85 @@ def localize(data: Data | Flight, calibration: Calibration, settings: Settings |
     require_calibration(calibration)
     chosen = settings or Settings()
     flight = data if isinstance(data, Flight) else load_flight(data)
-    ranges = flight.ranges
-    applied = calibration.apply(ranges)
-    error = applied.raw_m - ranges.truth_m
-    fixed = chosen.fixed_std_m or float(np.std(error))
-    measured = {"raw": applied.raw_m, "calibrated": applied.corrected_m, "variance": applied.corrected_m}
-    std = {"raw": np.full(len(ranges), fixed), "calibrated": np.full(len(ranges), fixed), "variance": applied.sigma_m}
+    fixed = fixed_std(calibration, chosen, training)
+    applied = calibration.apply(flight.ranges)
     found = []
-    for body in flight.moving_bodies():
-        problem = _problem(flight, body)
-        if problem is None:
-            continue
-        tracks = {
-            stage: _filter(problem, measured[stage][problem.rows], std[stage][problem.rows], chosen)
-            for stage in FILTERS
-        }
-        found.append(Localization(ranges.source, body, tracks))
+    for problem in _problems(flight):
+        noises = [_Noise.drawn(problem, chosen, chosen.seed + k) for k in range(chosen.seeds)]
+        ranges = _filters(flight.ranges[problem.rows], applied, problem.rows, calibration, fixed.std_m)
+        tracks = _run(problem, list(ranges.values()), noises, chosen)
+        found.append(
+            Localization(
+                source=flight.ranges.source,
+                body=problem.body,
+                tracks={name: tracks[k][0] for k, name in enumerate(ranges)},
+                rmse_m={name: np.array([track.rmse_m for track in tracks[k]]) for k, name in enumerate(ranges)},
+                fixed=fixed,
+                simulated=flight.ranges.planted is not None,
+            )
+        )
     if not found:
         raise UnanswerableError(
-            f"{ranges.source}: no body moves among poses and ranges, so there is nothing to localize"
+            f"{flight.ranges.source}: no body moves among poses and ranges, so there is nothing to localize"
         )
     return found
 
 
-@dataclass(frozen=True, slots=True)
+def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
+    """Return the fixed standard deviations of raw and calibrated ranges, by what is known before the flight.
+
+    The one that is given; else the best ones on a training flight; else those of the errors that the calibration was
+    fitted to, or its sigma at the middle of its powers, where it is too old to remember them.
+    """
+    if settings.fixed_std_m is not None:
+        return FixedStd(dict.fromkeys(("raw", "calibrated"), settings.fixed_std_m), "given")
+    if training is not None:
+        return _tuned(training if isinstance(training, Flight) else load_flight(training), calibration, settings)
+    known = calibration.provenance.get("error_std_m")
+    if isinstance(known, dict) and {"raw", "corrected"} <= set(known):
+        return FixedStd(
+            {"raw": float(known["raw"]), "calibrated": float(known["corrected"])}, "of the errors that were fitted"
+        )
+    middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
+    return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
+
+
+def _tuned(flight: Flight, calibration: Calibration, settings: Settings) -> FixedStd:
+    """Return the standard deviations with which the filters err least on a flight."""
+    applied = calibration.apply(flight.ranges)
+    squares = np.zeros((2, len(TUNED_OVER)))
+    for whole in _problems(flight):
+        problem = whole.first(TUNED_RANGES)
+        noises = [_Noise.drawn(problem, settings, settings.seed)]
+        measured = (applied.raw_m[problem.rows], applied.corrected_m[problem.rows])
+        ranges = [_Ranges(m, np.full(len(m), std)) for m in measured for std in TUNED_OVER]
+        errors = [tracks[0].rmse_m for tracks in _run(problem, ranges, noises, settings)]
+        squares += np.array(errors).reshape(squares.shape) ** 2
+    best = [TUNED_OVER[k] for k in np.argmin(squares, axis=1)]
+    return FixedStd({"raw": best[0], "calibrated": best[1]}, f"tuned on {flight.ranges.source}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Problem:
     """What is known of one body at each of its ranges: rows of the flight, true place, own lever arm turned into the
     world, and the other antenna's place, (n, 3) each."""
 
+    body: str
     rows: Ints
     time_ns: Ints
+    attitude: Floats
     place: Floats
     arm: Floats
     other: Floats
+
+    def first(self, count: int) -> _Problem:
+        """Return its first ranges."""
+        columns = ("rows", "time_ns", "attitude", "place", "arm", "other")
+        return replace(self, **{name: getattr(self, name)[:count] for name in columns})
+
+
+def _problems(flight: Flight) -> list[_Problem]:
+    return [problem for body in flight.moving_bodies() if (problem := _problem(flight, body)) is not None]
 
 
 def _problem(flight: Flight, body: str) -> _Problem | None:
@@ -148,66 +246,193 @@ def _problem(flight: Flight, body: str) -> _Problem | None:
     antenna = antennas_m(flight.poses, flight.tags, own, time)
     away = antennas_m(flight.poses, flight.tags, other, time)
     known = np.isfinite(place).all(axis=1) & np.isfinite(antenna).all(axis=1) & np.isfinite(away).all(axis=1)
-    return _Problem(rows[known], time[known], place[known], (antenna - place)[known], away[known])
+    return _Problem(
+        body=body,
+        rows=rows[known],
+        time_ns=time[known],
+        attitude=_attitude(flight.poses, body, time[known]),
+        place=place[known],
+        arm=(antenna - place)[known],
+        other=away[known],
+    )
 
 
-def _filter(problem: _Problem, measured_m: Floats, std_m: Floats, settings: Settings) -> Track:
-    rng = np.random.default_rng(settings.seed)
-    count = len(problem.rows)
+def _attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
+    """Return the attitude of a body at the pose nearest to each time, (n, 4)."""
+    rows = np.flatnonzero(poses.body == body)
+    known = poses.time_ns[rows]
+    after = np.clip(np.searchsorted(known, time_ns), 1, max(len(known) - 1, 1))
+    nearest = np.where(
+        time_ns - known[after - 1] < known[np.minimum(after, len(known) - 1)] - time_ns, after - 1, after
+    )
+    return poses.quaternion[rows[np.minimum(nearest, len(rows) - 1)]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Ranges:
+    """What a filter measures (n,), its standard deviation (n,), and what errors are made of if it reckons with it."""
+
+    measured_m: Floats
+    std_m: Floats
+    errors: list[RangeErrors] | None = None
+
+
+def _filters(
+    ranges: Ranges, applied: CorrectedRanges, rows: Ints, calibration: Calibration, fixed: dict[str, float]
+) -> dict[str, _Ranges]:
+    """Return what each of `FILTERS` measures; the robust one only where it is known what errors are made of."""
+    raw, corrected, sigma = applied.raw_m[rows], applied.corrected_m[rows], applied.sigma_m[rows]
+    found = {
+        "raw": _Ranges(raw, np.full(len(rows), fixed["raw"])),
+        "calibrated": _Ranges(corrected, np.full(len(rows), fixed["calibrated"])),
+        "variance": _Ranges(corrected, sigma),
+    }
+    if calibration.errors is not None:
+        noise, errors = range_errors(calibration, ranges)
+        found[ROBUST] = _Ranges(corrected - calibration.errors.location_m, noise, errors)
+    return found
+
+
+def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, list[RangeErrors]]:
+    """Return the noise (n,) of corrected ranges, and what their errors are made of besides.
+
+    Raises `UnanswerableError` for a calibration that does not say.
+    """
+    model = calibration.errors
+    if model is None:
+        raise UnanswerableError("the calibration does not say what errors are made of; fit anew from a recording")
+    lifted = calibration.lifted(ranges)
+    shapes = model.shapes(lifted, ranges.initiator, ranges.target)
+    errors = [
+        RangeErrors(
+            share=float(share),
+            least_m=model.least_m,
+            detour_m=float(detour),
+            outlier=max(model.outlier_share, LEAST_OUTLIERS),
+            outlier_m=max(model.outlier_m, LEAST_OUTLIER_M),
+        )
+        for share, detour in zip(shapes.tail_share, shapes.detour_m, strict=True)
+    ]
+    return np.hypot(shapes.noise_m, calibration.bias_curve.beyond(lifted)), errors
+
+
+@dataclass(frozen=True, slots=True)
+class _Noise:
+    """A start (3,) and displacements between ranges (n, 3), both with noise."""
+
+    start: Floats
+    moves: Floats
+
+    @classmethod
+    def drawn(cls, problem: _Problem, settings: Settings, seed: int) -> _Noise:
+        """Draw the noise of a body in a flight: its own, and the same for every filter."""
+        own = [zlib.crc32(part) for part in (problem.time_ns.tobytes(), problem.body.encode())]
+        rng = np.random.default_rng([seed, *own])
+        moves = np.diff(problem.place, axis=0, prepend=problem.place[:1])
+        noise = rng.normal(size=moves.shape) * np.sqrt(_spread(problem, settings))[:, None]
+        return cls(problem.place[0] + rng.normal(size=3) * settings.initial_std_m, moves + noise)
+
+
+def _spread(problem: _Problem, settings: Settings) -> Floats:
+    """Return by how much velocity's noise widens each axis between ranges (n,), in square metres."""
     dt = np.diff(problem.time_ns, prepend=problem.time_ns[:1]) * 1e-9
-    spread = settings.velocity_std_mps**2 / settings.velocity_rate_hz * np.maximum(dt, 0)
-    moves = np.diff(problem.place, axis=0, prepend=problem.place[:1])
-    moves = moves + rng.normal(size=(count, 3)) * np.sqrt(spread)[:, None]
-    variance = std_m**2
-    x = problem.place[0] + rng.normal(size=3) * settings.initial_std_m
-    p = np.eye(3) * settings.initial_std_m**2
-    estimate, nis, nees, opinion = np.empty((count, 3)), np.empty(count), np.empty(count), np.empty(count)
-    accepted, refused = np.zeros(count, dtype=bool), 0
-    eye = np.eye(3)
+    return np.asarray(settings.velocity_std_mps**2 / settings.velocity_rate_hz * np.maximum(dt, 0))
+
+
+def _run(problem: _Problem, ranges: list[_Ranges], noises: list[_Noise], settings: Settings) -> list[list[Track]]:
+    """Run filters with every noise, all at once: arrays are (filters, noises, ...). Return their tracks."""
+    shape, count = (len(ranges), len(noises)), len(problem.rows)
+    time_s, spread, eye = problem.time_ns * 1e-9, _spread(problem, settings), np.eye(3)
+    measured, variance = (np.array([getattr(r, name) for r in ranges]) for name in ("measured_m", "std_m"))
+    variance = variance**2
+    moves = np.array([noise.moves for noise in noises])
+    x = np.tile([noise.start for noise in noises], (len(ranges), 1, 1))
+    p = np.tile(eye * settings.initial_std_m**2, (*shape, 1, 1))
+    estimate, covariance = np.empty((count, *shape, 3)), np.empty((count, *shape, 3, 3))
+    nis, accepted = np.empty((count, *shape)), np.zeros((count, *shape), dtype=bool)
+    reopening = Reopening(shape, settings.reopen_s, float(time_s[0]))
     for k in range(count):
-        x = x + moves[k]
+        x = x + moves[:, k]
         p = p + spread[k] * eye
         towards = x + problem.arm[k] - problem.other[k]
-        distance = float(np.sqrt(towards @ towards))
-        h = towards / max(distance, 1e-6)
-        gain = p @ h
-        s = float(h @ gain) + variance[k]
-        innovation = measured_m[k] - distance
+        distance = np.sqrt(np.einsum("fsi,fsi->fs", towards, towards))
+        h = towards / np.maximum(distance, 1e-6)[..., None]
+        ph = np.matmul(p, h[..., None])[..., 0]
+        innovation = measured[:, k, None] - distance
+        s = np.einsum("fsi,fsi->fs", h, ph) + variance[:, k, None]
         nis[k] = innovation**2 / s
-        if nis[k] < settings.gate:
-            x = x + gain * (innovation / s)
-            p = p - np.outer(gain, gain) / s
-            accepted[k], refused = True, 0
-        else:
-            refused += 1
-            if refused >= settings.reopen:
-                p, refused = p + eye * settings.initial_std_m**2, 0
-        estimate[k] = x
-        opinion[k] = p[0, 0] + p[1, 1] + p[2, 2]
-        wrong = x - problem.place[k]
-        nees[k] = wrong @ np.linalg.solve(p, wrong)
-    return Track(
-        time_ns=problem.time_ns,
-        estimate_m=estimate,
-        truth_m=problem.place,
-        std_m=np.sqrt(opinion),
-        nis=nis,
-        nees=nees,
-        accepted=accepted,
-    )
+        heard = _heard(innovation, s, ranges, k, settings.gate)
+        gain = ph / s[..., None]
+        x = x + gain * heard.noise_m[..., None]
+        p = p + gain[..., None] * gain[..., None, :] * (heard.variance_m2 - s)[..., None, None]
+        p = p + reopening.widening(heard.believed, innovation, float(time_s[k]))[..., None, None] * eye
+        estimate[k], covariance[k], accepted[k] = x, p, heard.believed
+    wrong = estimate - problem.place[:, None, None, :]
+    nees = np.einsum("kfsi,kfsi->kfs", wrong, np.linalg.solve(covariance, wrong[..., None])[..., 0])
+    std = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    return [
+        [
+            Track(
+                time_ns=problem.time_ns,
+                attitude=problem.attitude,
+                estimate_m=estimate[:, f, s],
+                truth_m=problem.place,
+                std_m=std[:, f, s],
+                nis=nis[:, f, s],
+                nees=nees[:, f, s],
+                accepted=accepted[:, f, s],
+            )
+            for s in range(shape[1])
+        ]
+        for f in range(shape[0])
+    ]
+
+
+def _heard(innovation: Floats, variance: Floats, ranges: list[_Ranges], k: int, gate: float) -> Heard:
+    """Return what all filters make of range k: a gate for most, the whole of its error for those who reckon with it."""
+    heard = gated(innovation, variance, gate)
+    for f, one in enumerate(ranges):
+        if one.errors is not None:
+            own = weighed(innovation[f], variance[f], one.errors[k])
+            heard.noise_m[f], heard.variance_m2[f], heard.believed[f] = own.noise_m, own.variance_m2, own.believed
+    return heard
+
+
+class Reopening:
+    """Widens filters that believe nothing any more, by the largest innovation that they refused meanwhile."""
+
+    def __init__(self, shape: tuple[int, ...], after_s: float, start_s: float) -> None:
+        """Begin at `start_s` with filters that just believed a range."""
+        self._after_s = after_s
+        self._believed_s = np.full(shape, start_s)
+        self._refused = np.zeros(shape, dtype=np.int64)
+        self._largest = np.zeros(shape)
+
+    def widening(self, believed: Bools, innovation_m: Floats, now_s: float) -> Floats:
+        """Return what to add to the variance of each axis, in square metres; nothing for most."""
+        self._refused = np.where(believed, 0, self._refused + 1)
+        self._largest = np.where(believed, 0.0, np.maximum(self._largest, np.abs(innovation_m)))
+        self._believed_s = np.where(believed, now_s, self._believed_s)
+        lost = (self._refused >= FEWEST_REFUSED) & (now_s - self._believed_s >= self._after_s)
+        widening = np.where(lost, self._largest**2, 0.0)
+        self._believed_s = np.where(lost, now_s, self._believed_s)
+        self._refused, self._largest = np.where(lost, 0, self._refused), np.where(lost, 0.0, self._largest)
+        return widening
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """Over all bodies of all recordings: mean RMSE by stage, its reduction, mean NIS and NEES of the last stage.
+    """Over all bodies of all recordings: mean RMSE by filter, its reduction, mean NIS and NEES of the variance filter.
 
-    `nis` is over accepted ranges, of which a gate at 99.9 % leaves 0.99; `nees` should be 3, a state's dimension.
+    `rmse_m` are means over seeds, too, `spread_m` standard deviations over seeds of the mean over bodies (NaN of one
+    seed). `nis` is over accepted ranges, of which a gate at 99.9 % leaves 0.99; `nees` should be 3, a state's size.
     `nis_bounds` and `nees_bounds` hold 95 % of such means if the filter is consistent: chi-square over the number of
     independent values (Bar-Shalom, Li and Kirubarajan 2001, section 5.4), where a NEES counts once in the time that the
     error takes to forget. `nis_inside` and `nees_inside` are the shares of single values within their 95 % bounds.
     """
 
     rmse_m: dict[str, float]
+    spread_m: dict[str, float]
     reduction: dict[str, float]
     nis: float
     nis_bounds: tuple[float, float]
@@ -220,13 +445,16 @@ class Summary:
 
 def summarize(found: list[Localization]) -> Summary:
     """Average over bodies and recordings, each counting the same, as in the paper."""
-    rmse = {stage: float(np.mean([one.tracks[stage].rmse_m for one in found])) for stage in FILTERS}
+    filters = [name for name in FILTERS if all(name in one.tracks for one in found)]
+    means = {name: np.mean([one.rmse_m[name] for one in found], axis=0) for name in filters}
+    rmse = {name: float(np.mean(over)) for name, over in means.items()}
     last = [one.tracks["variance"] for one in found]
     nis = np.concatenate([track.nis[track.accepted] for track in last])
     nees = np.concatenate([track.nees for track in last])
     return Summary(
         rmse_m=rmse,
-        reduction={stage: 1 - rmse[stage] / rmse["raw"] for stage in FILTERS[1:]},
+        spread_m={name: float(np.std(over, ddof=1)) if len(over) > 1 else np.nan for name, over in means.items()},
+        reduction={name: 1 - rmse[name] / rmse["raw"] for name in filters[1:]},
         nis=float(np.mean(nis)),
         nis_bounds=_bounds(len(nis), 1),
         nis_inside=_inside(nis, 1),
@@ -265,12 +493,3 @@ def _independent(values: Floats) -> float:
     small = np.flatnonzero(correlation < 0.05)
     end = int(small[0]) if len(small) else len(centred)
     return len(centred) / (1 + 2 * float(correlation[1:end].sum()))
-
-
-def as_tum(track: Track) -> str:
-    """Return an estimated trajectory in TUM form, without rotation: only the position is estimated."""
-    rows = [
-        f"{time * 1e-9:.9f} {x:.6f} {y:.6f} {z:.6f} 0 0 0 1"
-        for time, (x, y, z) in zip(track.time_ns.tolist(), track.estimate_m.tolist(), strict=True)
-    ]
-    return "# time x y z qx qy qz qw\n" + "\n".join(rows) + "\n"

@@ -19,7 +19,7 @@ from calib.estimation.fitting import fit
 from calib.estimation.losses import MIXTURE
 from calib.estimation.passive_listeners import OverheardDelay, heard_delays
 from calib.estimation.result import FitResult
-from calib.evaluation.localization import FILTERS, Localization, localize, summarize
+from calib.evaluation.localization import Localization, localize, summarize
 from calib.evaluation.statistics import Evaluation, evaluate
 from calib.ranges import Ranges, concatenate
 from calib.sources import Data, each, load_each, opened
@@ -113,7 +113,11 @@ class Campaign:
         if self.tracks:
             plain["localization"] = {
                 "scenarios": [
-                    {"recording": t.source, "body": t.body, "rmse_m": {s: t.tracks[s].rmse_m for s in FILTERS}}
+                    {
+                        "recording": t.source,
+                        "body": t.body,
+                        "rmse_m": {name: float(rmse.mean()) for name, rmse in t.rmse_m.items()},
+                    }
                     for t in self.tracks
                 ],
                 "summary": asdict(summarize(self.tracks)),

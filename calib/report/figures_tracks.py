@@ -1,4 +1,4 @@
-"""Figures of localization: error over time, trajectories from above, and the table of the paper as bars."""
+"""Figures of localization: error over time, trajectories from above, and RMSE as bars."""
 
 from __future__ import annotations
 
@@ -7,22 +7,32 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, Localization, summarize
+from calib.evaluation.localization import Localization, summarize
 from calib.figures import COLOURS, label
 
-COLOUR_OF: Final = {"raw": COLOURS["raw"], "calibrated": COLOURS["delays"], "variance": COLOURS["full"]}
-NAMES: Final = {"raw": "raw", "calibrated": "calibrated", "variance": "calibrated, with variance"}
+COLOUR_OF: Final = {
+    "raw": COLOURS["raw"],
+    "calibrated": COLOURS["delays"],
+    "variance": COLOURS["full"],
+    "robust": "0.45",
+}
+NAMES: Final = {
+    "raw": "raw",
+    "calibrated": "calibrated",
+    "variance": "calibrated, with variance",
+    "robust": "reckoning with reflections",
+}
 
 
 def rmse_bars(found: list[Localization]) -> Figure:
-    """RMSE of each body in each recording, their mean, and the paper's mean."""
+    """RMSE of each body in each recording over seeds, and their mean."""
     figure = Figure(figsize=(8.0, 3.4), layout="constrained")
     axes = figure.subplots()
-    names = [f"{one.source.removesuffix('.uwb')}\n{one.body}" for one in found] + ["mean", "ICRA 2023\n(its flights)"]
+    names = [f"{one.source.removesuffix('.uwb')}\n{one.body}" for one in found] + ["mean"]
     mean = summarize(found).rmse_m
-    for k, stage in enumerate(FILTERS):
-        heights = [one.tracks[stage].rmse_m for one in found] + [mean[stage], PAPER_RMSE_M[stage]]
-        axes.bar(np.arange(len(names)) + 0.27 * (k - 1), heights, 0.25, color=COLOUR_OF[stage], label=NAMES[stage])
+    for k, stage in enumerate(mean):
+        heights = [float(one.rmse_m[stage].mean()) for one in found] + [mean[stage]]
+        axes.bar(np.arange(len(names)) + 0.21 * (k - 1.5), heights, 0.2, color=COLOUR_OF[stage], label=NAMES[stage])
     axes.set_xticks(np.arange(len(names)), names, fontsize="small")
     label(axes, "", "RMSE of the position (m)")
     axes.legend(frameon=False, fontsize="small")
@@ -30,11 +40,10 @@ def rmse_bars(found: list[Localization]) -> Figure:
 
 
 def error_over_time(one: Localization) -> Figure:
-    """Norm of the position error over time in the three stages, with three sigmas of the last filter's own opinion."""
+    """Norm of the position error over time by filter, with three sigmas of the variance filter's own opinion."""
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     axes = figure.subplots()
-    for stage in FILTERS:
-        track = one.tracks[stage]
+    for stage, track in one.tracks.items():
         time = (track.time_ns - track.time_ns[0]) * 1e-9
         wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
         axes.plot(time, wrong, lw=0.9, color=COLOUR_OF[stage], label=NAMES[stage])

@@ -1,0 +1,102 @@
+"""A localization on one screen, as JSON, and as trajectories in files."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+from calib.evaluation.localization import (
+    PAPER_RMSE_M,
+    Localization,
+    Settings,
+    Summary,
+    Track,
+    summarize,
+)
+from uwblink.output import write_text
+
+NAMES: Final = {"raw": "raw", "calibrated": "calibrated", "variance": "variance", "robust": "robust"}
+WIDTH: Final = 12
+
+
+def localization_text(found: list[Localization], summary: Summary, settings: Settings) -> str:
+    """Return the table that `calib localize` prints, a row a body, and what it rests on."""
+    filters = list(summary.rmse_m)
+    lines = [f"{'RMSE of the position (m)':34s}" + "".join(f"{NAMES[name]:>{WIDTH}s}" for name in filters)]
+    for one in found:
+        figures = "".join(f"{one.rmse_m[name].mean():{WIDTH}.3f}" for name in filters)
+        lines.append(f"{one.source + ' ' + one.body:34s}{figures}")
+    lines.append(f"{'mean':34s}" + "".join(f"{summary.rmse_m[name]:{WIDTH}.3f}" for name in filters))
+    if settings.seeds > 1:
+        spread = "".join(f"{summary.spread_m[name]:{WIDTH}.3f}" for name in filters)
+        lines.append(f"{f'its spread over {settings.seeds} seeds':34s}{spread}")
+    less = "".join(f"{-100 * summary.reduction[name]:+{WIDTH - 2}.0f} %" for name in filters[1:])
+    lines.append(f"{'':{34 + WIDTH}s}{less}")
+    return "\n".join([*lines, *_rests_on(found, settings), _consistent(summary)])
+
+
+def _rests_on(found: list[Localization], settings: Settings) -> list[str]:
+    fixed = found[0].fixed
+    paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())
+    what = "simulated flights" if all(one.simulated for one in found) else "other flights"
+    return [
+        f"process noise: velocity with {settings.velocity_std_mps:g} m/s an axis at {settings.velocity_rate_hz:g} Hz "
+        "(a choice, that of a small drone's optical flow; gains depend on it)",
+        f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
+        f"{fixed.std_m['calibrated']:.3f} m",
+        f"ICRA 2023 has {paper} m for real flights of its own and another filter's noise; these are {what}: metres do "
+        "not compare",
+    ]
+
+
+def _consistent(summary: Summary) -> str:
+    return (
+        f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
+        f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
+        f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate"
+    )
+
+
+def localization_json(found: list[Localization]) -> dict[str, Any]:
+    """Return what `calib localize --json` prints: RMSE by body, filter and seed in metres, and the summary."""
+    rows = [
+        {
+            "recording": one.source,
+            "body": one.body,
+            "rmse_m": {name: float(rmse.mean()) for name, rmse in one.rmse_m.items()},
+            "rmse_by_seed_m": {name: rmse.tolist() for name, rmse in one.rmse_m.items()},
+            "fixed_std_m": one.fixed.std_m,
+            "fixed_std_source": one.fixed.source,
+            "simulated": one.simulated,
+        }
+        for one in found
+    ]
+    summary = asdict(summarize(found))
+    summary["spread_m"] = {k: None if v != v else v for k, v in summary["spread_m"].items()}
+    return {"scenarios": rows, "summary": summary}
+
+
+def write_tum(found: list[Localization], folder: Path, *, force: bool = False) -> None:
+    """Write the trajectory of each body and filter, and the true one, into a folder, which is made if it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in found:
+        texts = {stage: as_tum(track) for stage, track in one.tracks.items()}
+        texts["truth"] = as_tum(one.tracks["raw"], truth=True)
+        for stage, text in texts.items():
+            name = "".join(c if c.isalnum() or c in "-_" else "_" for c in f"{one.source}-{one.body}-{stage}")
+            write_text(folder / f"{name}.tum", text, force=force)
+
+
+def as_tum(track: Track, *, truth: bool = False) -> str:
+    """Return an estimated trajectory in TUM form, or the true one, with the attitude that was the filter's input."""
+    rows = [
+        f"{time * 1e-9:.9f} {x:.6f} {y:.6f} {z:.6f} {qx:.6f} {qy:.6f} {qz:.6f} {qw:.6f}"
+        for time, (x, y, z), (qx, qy, qz, qw) in zip(
+            track.time_ns.tolist(),
+            (track.truth_m if truth else track.estimate_m).tolist(),
+            track.attitude.tolist(),
+            strict=True,
+        )
+    ]
+    return "# time x y z qx qy qz qw\n" + "\n".join(rows) + "\n"

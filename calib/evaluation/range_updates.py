@@ -1,0 +1,82 @@
+"""What a range tells a filter, for many filters at once: by a gate, or by what its error may be made of.
+
+Filters differ in what they take for the noise of a range. All of them update along the line of sight; what differs is
+what is expected of the noise in an innovation, its mean and variance, from which mean and covariance of the state
+follow exactly (Gaussian noise and state, moments of the posterior).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from uwblink.arrays import Bools, Floats
+
+ROOT_2: Final = float(np.sqrt(2))
+ROOT_2PI: Final = float(np.sqrt(2 * np.pi))
+FARTHEST: Final = 30.0
+"""Sigmas beyond which the noise in a detour no longer depends on the innovation."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeErrors:
+    """What the errors of one range are made of: reflected with `share`, by a least detour and an exponential one.
+
+    Metres and shares of 1. `outlier` are of any size, about `outlier_m`.
+    """
+
+    share: float
+    least_m: float
+    detour_m: float
+    outlier: float
+    outlier_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Heard:
+    """What filters make of a range: mean and variance of the noise in an innovation, and whether they believe it."""
+
+    noise_m: Floats
+    variance_m2: Floats
+    believed: Bools
+
+
+def gated(innovation_m: Floats, variance_m2: Floats, gate: float) -> Heard:
+    """Take an innovation for noise where its square over its variance is below the gate, else learn nothing."""
+    believed = innovation_m**2 < gate * variance_m2
+    return Heard(
+        noise_m=np.where(believed, innovation_m, 0.0),
+        variance_m2=np.where(believed, 0.0, variance_m2),
+        believed=believed,
+    )
+
+
+def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> Heard:
+    """Weigh noise, reflection and outlier by how likely each made an innovation of such noise.
+
+    The noise in a reflected range is normal, cut off above (docs/theory.md): with u = (e - a)/s - s/m its mean is
+    s (s/m - phi(u)/Phi(u)). An outlier says nothing.
+    """
+    from scipy.special import erfcx
+
+    s = np.sqrt(variance_m2)
+    z, away, ratio = innovation_m / s, (innovation_m - errors.least_m) / s, s / errors.detour_m
+    u = away - ratio
+    scaled = erfcx(np.minimum(u, FARTHEST) / -ROOT_2)
+    hazard = (2 / ROOT_2PI) / scaled
+    inside = 1 - errors.outlier
+    core = np.exp(-0.5 * z * z) * (inside * (1 - errors.share)) / (s * ROOT_2PI)
+    near = 0.5 * np.exp(-0.5 * away * away) * scaled
+    tail = np.where(u < 5, near, np.exp(np.minimum(ratio * (0.5 * ratio - away), 50.0)))
+    tail = tail * (inside * errors.share / errors.detour_m)
+    wide = np.hypot(errors.outlier_m, s)
+    wild = errors.outlier * np.exp(-0.5 * (innovation_m / wide) ** 2) / (wide * ROOT_2PI) + 1e-300
+    total = core + tail + wild
+    core, tail, wild = core / total, tail / total, wild / total
+    of_tail = s * (ratio - hazard)
+    spread = variance_m2 * np.maximum(1 - u * hazard - hazard**2, 0.0)
+    mean = core * innovation_m + tail * of_tail
+    square = core * innovation_m**2 + tail * (of_tail**2 + spread) + wild * variance_m2
+    return Heard(noise_m=mean, variance_m2=np.maximum(square - mean**2, 0.0), believed=wild < 0.5)
