@@ -42,7 +42,7 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
     from uwbsim.scenario.loading import load as load_scenario
     from uwbsim.simulation.run import simulate, write
 
-    settings = [f"run.seed={seed}", f"radio.multipath.probability={share}"]
+    settings = [f"run.seed={seed}", f"radio.multipath.share={share}"]
     settings += [f"run.duration_s={duration_s}"] if duration_s else []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "flight.uwb"

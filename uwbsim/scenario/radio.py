@@ -202,6 +202,9 @@ class Radio(Section):
     of MILUV; `sensitivity_dbm` a little below the weakest first path seen there (-104.2 dBm); frame settings those of
     the firmware. `capture_db` and `dynamic_range_db` are typical of the chip's correlator, and not measured here.
 
+    First-path powers that boards read, and what goes by them, saturate at `saturation_dbm`: the chip's readings fall
+    behind above -85 dBm (DW1000 User Manual, 4.7.2), and those of the ICRA 2023 flights end at -80.
+
     A board reads `carrier_sign` times the rate of its clock less that of the sender's, plus `skew_bias_ppm`, which
     grows by `skew_bias_ppm_per_db` above -90 dBm of first-path power: 1 is the boards' convention, -1 that of firmwares
     which print by how much the sender is ahead. `group_delay` is that of the antennas of all tags that have none of
@@ -213,6 +216,7 @@ class Radio(Section):
     antenna: Literal["isotropic", "dipole"] | AntennaTable = "isotropic"
     shadowing_db: NotNegative = 0.0
     power_noise_db: NotNegative = 0.0
+    saturation_dbm: float | None = None
     sensitivity_dbm: float = -105.0
     tx_noise_ps: NotNegative = 0.0
     rx_noise_ps: NotNegative = 116.0

@@ -18,7 +18,13 @@ from uwbsim.scenario.radio import Radio
 from uwbsim.units import PPM_PER_ONE
 from uwbsim.world.clocks import Clocks
 from uwbsim.world.propagation import Link
-from uwbsim.world.radio import printed_power_dbm, printed_skew_ppm, reception_bias_s, reception_noise_s
+from uwbsim.world.radio import (
+    printed_power_dbm,
+    printed_skew_ppm,
+    reception_bias_s,
+    reception_noise_s,
+    reported_dbm,
+)
 from uwbsim.world.temperature import AntennaDelays
 from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 
@@ -42,10 +48,11 @@ class Arrival:
 
 def arrive(radio: Radio, link: Link) -> Arrival:
     """Return what a link does to the stamps of frames that take it."""
+    seen_dbm = reported_dbm(radio, link.power_dbm)
     return Arrival(
         flight_s=(link.distance_m + link.excess_m) / SPEED_OF_LIGHT,
-        bias_s=reception_bias_s(radio, link.power_dbm, link.total_dbm),
-        std_s=reception_noise_s(radio, link.power_dbm),
+        bias_s=reception_bias_s(radio, seen_dbm, link.total_dbm),
+        std_s=reception_noise_s(radio, seen_dbm),
     )
 
 

@@ -149,7 +149,7 @@ STILL = [
     ("fault", "settings"),
     [
         ("skew in single-sided ranges", ["ranging.protocol=ss", "run.duration_s=30"]),
-        ("reflections", ["radio.multipath.probability=0.5", "run.duration_s=30"]),
+        ("reflections", ["radio.multipath.share=0.5", "run.duration_s=30"]),
         ("static data", ["run.duration_s=20", *STILL]),
         (
             "power confounded with distance",

@@ -190,3 +190,16 @@ def test_event_loop_and_monte_carlo_agree_on_all_of_it(protocol):
     columns = range_errors_m(PROTOCOLS[protocol], conditions_of(world), 3, 20_000)
     assert np.mean(flight) == pytest.approx(np.mean(columns), abs=0.003)
     assert abs(np.mean(columns)) > 0.01, "there is something to agree on"
+
+
+def test_readings_of_power_saturate():
+    """Inverses of lifted powers, to the power of 1.5, add up with the highest's: weak ones stay, strong ones end."""
+    found = []
+    for at_1m_dbm in (-100.0, -68.0, -40.0):
+        radio = {"quantize": False, "first_path_at_1m_dbm": at_1m_dbm, "sensitivity_dbm": -120.0}
+        flight = uwbsim.simulate(scenario(radio=radio | {"saturation_dbm": -80.0}))
+        found.append(flight.exchanges.fpp1_dbm[0])
+    at_80 = -68 - 20 * np.log10(4)
+    middle = -80 - 10 / 1.5 * np.log10(1 + 10 ** (-0.15 * (at_80 + 80)))
+    np.testing.assert_allclose(found, [-100 - 20 * np.log10(4), middle, -80.0], atol=2e-3)
+    assert middle == pytest.approx(-82.0, abs=0.05), "as strong as the highest: 2 dB below it"
