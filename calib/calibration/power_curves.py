@@ -13,7 +13,6 @@ from uwblink.arrays import Bools, Floats, Ints
 
 ALPHA_DBM: Final = -82.0
 DEGREE: Final = 3
-BIAS_SEGMENTS: Final = 14
 SIGMA_SEGMENTS: Final = 4
 SIGMA_BINS: Final = 30
 SIGMA_FLOOR_M: Final = 0.002

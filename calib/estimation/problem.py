@@ -9,14 +9,12 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import (
-    BIAS_SEGMENTS,
     DEGREE,
     SIGMA_BINS,
     Bins,
     basis,
     curvature,
     equal_bins,
-    knots_for,
     lifted_power,
     populated,
 )
@@ -30,6 +28,10 @@ from uwblink.arrays import Floats, Ints
 FEWEST: Final = 100
 SPANNED: Final = 1e-4
 """Delays can make up for a constant of a curve if no more than this of it is left, in squares."""
+
+SEGMENTS_A_FOLD: Final = 4.5
+SEGMENTS: Final = (10, 28)
+"""Pieces of a bias curve: so many where lifted power grows e-fold, and bounds of their number."""
 
 ROWS_AT_ONCE: Final = 4096
 
@@ -137,7 +139,7 @@ def build_problem(
     if not minimum_norm:
         require_determined(free)
     known = matrix[:, ~unpinned] @ np.array([fixed[tag] for tag in everyone if tag in fixed])
-    knots = knots_for(ordered, BIAS_SEGMENTS, (low, high))
+    knots = _knots(ordered, low, high)
     # The integral of a B-spline is its coefficients times a quarter of each one's span.
     averages = (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (high - low)
     delays = matrix[:, unpinned] @ directions
@@ -161,6 +163,20 @@ def build_problem(
         shares=shares,
         free=free,
     )
+
+
+def _knots(ordered: Floats, low: float, high: float) -> Floats:
+    """Return clamped knots from `low` to `high`, halfway between equal counts and equal lengths, both of square roots.
+
+    Curves are steep where lifted power is small: there the roots lie dense, and few ranges do not spread them.
+    Powers over more decades take more knots.
+    """
+    segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *SEGMENTS))
+    counts = np.interp(np.linspace(0, len(ordered) - 1, segments + 1), np.arange(len(ordered)), ordered)
+    roots = np.sqrt(np.clip(counts, low, high)) + np.linspace(np.sqrt(low), np.sqrt(high), segments + 1)
+    inner = roots**2 / 4
+    inner[[0, -1]] = low, high
+    return np.concatenate([[low] * DEGREE, inner, [high] * DEGREE])
 
 
 def _bins(lifted: Floats, ordered: Floats) -> Bins:

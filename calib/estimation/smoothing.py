@@ -52,5 +52,20 @@ def reml_penalty(near: QuadraticModel, x: Floats, penalties: list[Floats]) -> tu
     return ridge, np.asarray(np.linalg.pinv(near.curvature + ridge, rcond=1e-13) @ aim)
 
 
+def unsure(covariance: Floats, x: Floats, penalties: list[Floats]) -> Floats:
+    """Return the covariance (m, m) that not knowing the smoothness adds to that of parameters x (m,).
+
+    `penalties` (m, m) are weighted, as parts of the inverse of `covariance` (m, m). A penalty pulls the parameters by
+    covariance times penalty times x for each unit of its logarithm, which is known to 2 over what it leaves free, as a
+    variance of so many values is (the first-order correction of Kass and Steffey 1989).
+    """
+    found = np.zeros_like(covariance)
+    for penalty in penalties:
+        pull = covariance @ (penalty @ x)
+        free = int(np.linalg.matrix_rank(penalty, hermitian=True)) - float(np.sum(covariance * penalty))
+        found += np.outer(pull, pull) * (2 / max(free, 1.0))
+    return found
+
+
 def _sum(weights: list[float], penalties: list[Floats]) -> Floats:
     return np.asarray(sum(w * p for w, p in zip(weights, penalties, strict=True)))

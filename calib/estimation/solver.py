@@ -15,7 +15,7 @@ from calib.estimation.persistence import Persistence
 from calib.estimation.problem import Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of
 from calib.estimation.scores import Scores, inverse_of
-from calib.estimation.smoothing import reml_penalty
+from calib.estimation.smoothing import reml_penalty, unsure
 from uwblink.arrays import Floats
 
 PILOT: Final = 6000
@@ -79,9 +79,12 @@ def solve(
     delays = problem.directions @ stated[: problem.rank]
     blocks, seconds = blocks_of(problem.ranges.time_ns)
     known = intervals(scores, inverse, prior, delays, problem.rank, blocks=blocks, seconds=seconds)
+    columns = len(parameters)
+    shares = [_of_curve(prior[:columns, :columns], curve) for _, curve in problem.curves()]
+    covariance = known.covariance + unsure(inverse[:columns, :columns], parameters, shares)
     return Solved(
         parameters=stated @ parameters,
-        covariance=stated @ known.covariance @ stated.T,
+        covariance=stated @ covariance @ stated.T,
         residuals=problem.error + problem.design @ parameters,
         scale=width,
         steps=steps,
@@ -92,6 +95,13 @@ def solve(
         lasting=known.lasting,
         mixture=mixture,
     )
+
+
+def _of_curve(prior: Floats, columns: slice) -> Floats:
+    """Return what of a prior precision (m, m) is that of a curve."""
+    found = np.zeros_like(prior)
+    found[columns, columns] = prior[columns, columns]
+    return found
 
 
 def _errors(problem: Problem) -> Errors:
