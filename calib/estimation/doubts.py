@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.calibration.power_curves import DEGREE, Curve, basis
 from calib.estimation.intervals import blocks_of
-from calib.estimation.misfit import MATTERS, SMALLEST_M, Finding, examine, families, told
+from calib.estimation.misfit import CLEARLY, MATTERS, SMALLEST_M, SMALLEST_NS, Finding, examine, families, told
 from calib.estimation.persistence import FEWEST_STRETCHES
 from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
@@ -61,9 +61,14 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
         shape_m=_of_another_shape(problem, found),
     )
     covariance = plain + judged.widening_ns2
-    matter = [finding for finding in judged.findings if _matters(finding, covariance)]
-    for finding in matter:
-        covariance = covariance + np.outer(finding.effect_ns, finding.effect_ns)
+    matter, plain = [], covariance
+    for finding in judged.findings:
+        moved = _moved(finding, plain)
+        if moved > MATTERS:
+            covariance = covariance + np.outer(finding.effect_ns, finding.effect_ns)
+        large = abs(finding.offset_m) > SMALLEST_M
+        if moved > MATTERS and (large or (moved > CLEARLY and np.max(np.abs(finding.effect_ns)) > SMALLEST_NS)):
+            matter.append(finding)
     # A tag that was moved stands out in more than one span of time: once is enough.
     once = {(finding.kind, finding.names): finding for finding in reversed(matter)}
     sentences = [told(finding) for finding in matter if once[finding.kind, finding.names] is finding]
@@ -71,14 +76,15 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
     return Doubts(covariance_ns2=covariance, sentences=sentences)
 
 
-def _matters(finding: Finding, covariance: Floats) -> bool:
+def _moved(finding: Finding, covariance: Floats) -> float:
+    """Return by how many of its standard errors a finding moves some delay."""
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     moved = float(np.max(np.abs(finding.effect_ns) / std))
     if finding.kind == "time":
         # A delay that was another one for a while is wrong by as much, then or at other times. The printed interval has
         # grown with it already: what does not return looks like an error that lasts.
         moved = 2e9 * abs(finding.offset_m) / SPEED_OF_LIGHT / float(np.median(std))
-    return moved > MATTERS and abs(finding.offset_m) > SMALLEST_M
+    return moved
 
 
 def _of_a_decibel(problem: Problem, found: Solved) -> Floats:

@@ -36,7 +36,11 @@ MATTERS: Final = 1.0
 """An offset matters that moves some delay by so many of its printed standard errors."""
 
 SMALLEST_M: Final = 0.01
-"""An offset of less is nobody's fault: it widens intervals, and is not named."""
+"""An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly."""
+
+CLEARLY: Final = 4.0
+SMALLEST_NS: Final = 0.02
+"""So many standard errors of a delay, and so much of it."""
 
 FEWEST: Final = 30
 SAME: Final = 0.95
