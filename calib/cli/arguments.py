@@ -15,8 +15,8 @@ Force = Annotated[bool, typer.Option(help="Replace files that are there already.
 Loss = Annotated[
     str | None,
     typer.Option(
-        help="mixture (the default: a likelihood with reflections by pair), cauchy (that of --sequential), huber, "
-        "soft_l1, l2 (least squares) or a registered one."
+        help="mixture (the default: a likelihood with reflections by pair), cauchy (that of --sequential, and of less "
+        "than 15 ranges a pair), huber, soft_l1, l2 (least squares) or a registered one."
     ),
 ]
 ReferencePower = Annotated[

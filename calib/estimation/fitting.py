@@ -27,6 +27,7 @@ from calib.estimation.doubts import doubts
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.error_model import error_model
 from calib.estimation.losses import MIXTURE
+from calib.estimation.pairs import pairs_of
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.result import FitResult
@@ -40,7 +41,10 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 INLIER_SIGMAS: Final = 3.0
 SEQUENTIAL_LOSS: Final = "cauchy"
-"""The loss of ICRA 2023."""
+"""The loss of ICRA 2023, which asks less of the data than the likelihood does."""
+
+FEWEST_A_PAIR: Final = 15
+"""Of fewer ranges a pair on average the likelihood's intervals are too narrow, and its delays no better."""
 
 
 def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its default
@@ -60,8 +64,8 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
 
     `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `loss` is
     "mixture" (the default), the likelihood of core, reflections and outliers with a share of reflections by pair, or a
-    robust loss of residuals: "cauchy" (the default of a sequential fit), "huber", "soft_l1", "l2", one that
-    `register_loss` added.
+    robust loss of residuals: "cauchy" (the default of a sequential fit, and of recordings with so few ranges a pair
+    that they do not tell what a pair's errors are made of), "huber", "soft_l1", "l2", one that `register_loss` added.
 
     `scale_ns` is the scale of the robust loss in time of flight, estimated from the data by default; `fixed_ns` are
     delays that are known; `groups` name tags that share a curve (by default all do). `sequential` is the recipe of ICRA
@@ -79,9 +83,8 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     '0.41 ns, planted 0.40 ns'
     """
     fixed, groups = dict(fixed_ns or {}), dict(groups or {})
-    loss = loss or (SEQUENTIAL_LOSS if sequential else MIXTURE)
     check_fit(
-        loss=loss,
+        loss=loss or (SEQUENTIAL_LOSS if sequential else MIXTURE),
         scale_ns=scale_ns,
         lift=lift,
         alpha_dbm=alpha_dbm,
@@ -94,6 +97,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
     ranges = load_ranges(data)
     refuse_impossible(ranges)
+    loss = loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)
     # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
     # SciPy brings a linear algebra of its own, which is held to one thread only if it is there by now.
     import_module("scipy.linalg")
@@ -142,6 +146,12 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
             warnings=warnings,
         )
+
+
+def _too_few(ranges: Ranges) -> bool:
+    """Return whether ranges are too few to tell what the errors of their pairs are made of."""
+    pairs = pairs_of(ranges.initiator, ranges.target, ranges.tags())
+    return len(ranges) < FEWEST_A_PAIR * len(pairs.ends)
 
 
 def _reference(power_dbm: float | None, alpha_dbm: float, *, sequential: bool) -> float | None:
