@@ -13,9 +13,8 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.error_model import ErrorModel, PairErrors
-from calib.estimation.intervals import blocks_of
 from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
-from calib.estimation.persistence import persistence
+from calib.estimation.persistence import lasting_in_pairs
 from calib.estimation.problem import Problem
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
@@ -101,7 +100,7 @@ def _of_pairs(mixture: PairMixture, time_ns: Ints, pair: Ints) -> _PairsPredicte
     """Draw pairs to what they have in common, by what they know where reflections last."""
     by_share = mixture.slope("share")
     pairs = mixture.layout.pairs
-    factor = _lasting(by_share, pair, pairs, time_ns)
+    factor = lasting_in_pairs(by_share, pair, time_ns)
     reflected = np.bincount(pair, minlength=pairs) * mixture.tail_share
     # One wall has one detour: a mean is known from as many reflections as there were, not from as many ranges.
     unknown = [factor / np.maximum(known, 1e-6) for known in (np.bincount(pair, by_share**2, pairs), reflected)]
@@ -115,15 +114,6 @@ def _of_pairs(mixture: PairMixture, time_ns: Ints, pair: Ints) -> _PairsPredicte
         detour=np.exp(mean + mean_var / 2 - any_mean - any_mean_var / 2),
         common_detour_m=common,
     )
-
-
-def _lasting(slope: Floats, pair: Ints, pairs: int, time_ns: Ints) -> float:
-    """Return by how much more sums of slopes (n,) vary than those of independent ranges would."""
-    blocks, seconds = blocks_of(time_ns)
-    count = int(blocks[-1]) + 1
-    sums = np.asarray(np.bincount(blocks * pairs + pair, slope, count * pairs), float).reshape(count, pairs)
-    within = float(np.sum(sums**2) / max(np.sum(slope**2), 1e-300))
-    return max(within, 1.0) * max(persistence(sums, seconds, pairs).factor, 1.0)
 
 
 def _drawn(value: Floats, variance: Floats) -> tuple[Floats, Floats, float, float]:

@@ -123,9 +123,26 @@ class Errors:
 class Prior:
     """What is known beforehand: precision (D, D) and centre (D,) of the parameters, and variances between pairs."""
 
+    columns: int
     precision: Floats
     centre: Floats
     variances: dict[str, float]
+    lasting: float = 1.0
+
+    @property
+    def weighed(self) -> Floats:
+        """Return the precision (D, D) beside information that counts ranges for independent that are not."""
+        return self._times(self.lasting)
+
+    @property
+    def pull(self) -> Floats:
+        """Return the covariance (D, D) of what the prior pulls with, where it is right."""
+        return self._times(self.lasting**2)
+
+    def _times(self, factor: float) -> Floats:
+        found = self.precision.copy()
+        found[self.columns :, self.columns :] *= factor
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,25 +185,25 @@ class PairMixture:
         return np.exp(self.of("pair_noise"))
 
 
-def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats) -> PairMixture:
+def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats, lasting: float = 1.0) -> PairMixture:
     """Return the likeliest parameters, from a robust `start` (m,) of those of the design.
 
     `ridge` (m, m) is the inverse covariance of what is known of them beforehand, in 1/m^2.
     """
     layout = Layout(columns=errors.design.shape[1], pairs=errors.pairs)
-    theta, prior = _start(errors, layout, start, ridge)
+    theta, prior = _start(errors, layout, start, ridge, lasting)
     steps, success = 0, False
     for some in _levels(errors):
         nearly = NEARLY if some is errors else ROUGHLY
         theta, prior, taken, success = _climb(some, layout, theta, prior, nearly)
         steps += taken
     scores = _all_scores(errors, layout, theta)
-    covariance = inverse_of(scores.information() + prior.precision, layout.pairs, len(SPREADS))
+    covariance = inverse_of(scores.information() + prior.weighed, layout.pairs, len(SPREADS))
     return PairMixture(
         layout=layout,
         parameters=theta,
         covariance=covariance,
-        precision=prior.precision,
+        precision=prior.pull,
         scores=scores,
         steps=steps,
         success=success,
@@ -203,7 +220,7 @@ def _levels(errors: Errors) -> Iterator[Errors]:
     yield errors
 
 
-def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats) -> tuple[Floats, Prior]:
+def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats, lasting: float) -> tuple[Floats, Prior]:
     """Return first parameters, from robust spreads of the residuals, and what is known beforehand."""
     where = layout.slices()
     residual = errors.error + errors.design @ start
@@ -229,7 +246,12 @@ def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats) -> tupl
         _set(precision, where[name], 1 / variance)
     centre[: where["cell_noise"].start][-3:] = theta[where["mean"].start : where["cell_noise"].start]
     _set(precision, where["cell_noise"], 1e-6)
-    return theta, _between(theta, Prior(precision=precision, centre=centre, variances={}), layout, None)
+    return theta, _between(
+        theta,
+        Prior(columns=layout.columns, precision=precision, centre=centre, variances={}, lasting=lasting),
+        layout,
+        None,
+    )
 
 
 def _parts(values: Floats, place: Ints, count: int) -> list[Floats]:
@@ -257,12 +279,12 @@ def _between(theta: Floats, prior: Prior, layout: Layout, covariance: Floats | N
         square = float(np.sum((theta[rows] - centre[rows]) ** 2))
         used = float(layout.pairs)
         if covariance is not None:
-            used = max(used - float(np.trace(covariance[rows, rows])) / variances[name], 1e-2 * used)
+            used = max(used - prior.lasting * float(np.trace(covariance[rows, rows])) / variances[name], 1e-2 * used)
         else:
             square = max(square, 0.05 * used)
         variances[name] = min(max(square / used, low), high)
         _set(precision, rows, 1 / variances[name])
-    return Prior(precision=precision, centre=centre, variances=variances)
+    return replace(prior, precision=precision, centre=centre, variances=variances)
 
 
 def _climb(
@@ -274,14 +296,14 @@ def _climb(
     for steps in range(1, MAX_STEPS + 1):
         fresh = steps == 1 or gain > CHORD
         sums, likelihood = _sums(errors, layout, theta, squares=fresh)
-        value = likelihood - 0.5 * float((theta - prior.centre) @ prior.precision @ (theta - prior.centre))
+        value = likelihood - 0.5 * float((theta - prior.centre) @ prior.weighed @ (theta - prior.centre))
         if value < best - SETTLED and shorter < 6:
             step, shorter = 0.3 * step, shorter + 1
             theta = top + step
             continue
         information = sums.information() if fresh else information
-        covariance = inverse_of(information + prior.precision, layout.pairs, len(SPREADS))
-        slope = sums.gradient() - prior.precision @ (theta - prior.centre)
+        covariance = inverse_of(information + prior.weighed, layout.pairs, len(SPREADS))
+        slope = sums.gradient() - prior.weighed @ (theta - prior.centre)
         step, shorter = covariance @ slope, 0
         own = slice(0, layout.columns)
         still = abs(float(slope[own] @ step[own])) < SETTLED
@@ -293,7 +315,7 @@ def _climb(
         top, theta = theta, theta + step
         if steps <= FULL_STEPS:
             prior = _between(theta, prior, layout, covariance)
-        best = likelihood - 0.5 * float((top - prior.centre) @ prior.precision @ (top - prior.centre))
+        best = likelihood - 0.5 * float((top - prior.centre) @ prior.weighed @ (top - prior.centre))
     return theta, prior, steps, False
 
 

@@ -60,6 +60,15 @@ def short_blocks(time_ns: Ints) -> Ints:
     return np.cumsum(np.diff(spans, prepend=spans[0]) > 0)
 
 
+def lasting_in_pairs(slope: Floats, pair: Ints, time_ns: Ints) -> float:
+    """Return by how much more sums of slopes (n,) by pair (n,) vary than those of independent ranges would."""
+    blocks, pairs = short_blocks(time_ns), int(pair.max()) + 1
+    count, seconds = int(blocks[-1]) + 1, float(time_ns[-1] - time_ns[0]) * 1e-9
+    sums = np.asarray(np.bincount(blocks * pairs + pair, slope, count * pairs), float).reshape(count, pairs)
+    within = float(np.sum(sums**2) / max(np.sum(slope**2), 1e-300))
+    return max(within, 1.0) * max(persistence(sums, seconds, pairs).factor, 1.0)
+
+
 def persistence(slopes: Floats, seconds: float, independent: int) -> Persistence:
     """Return what persistence does to sums of slopes (blocks, k), of whose columns so many are independent."""
     blocks = len(slopes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -11,12 +11,15 @@ from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
 from calib.estimation.losses import LOSSES, MIXTURE
 from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
-from calib.estimation.persistence import Persistence
+from calib.estimation.persistence import Persistence, lasting_in_pairs
 from calib.estimation.problem import Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of
 from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import reml_penalty, unsure
 from uwblink.arrays import Floats
+
+LASTING: Final = 1.5
+"""Where reflections last so that sums of slopes vary by so many times more, pairs are told apart with less trust."""
 
 PILOT: Final = 6000
 """Rows of the sample on which a start is found; from there, a few Newton steps over all rows suffice."""
@@ -69,6 +72,10 @@ def solve(
     # Ranges without any error have no distribution to be likely under; the robust loss is exact there.
     if loss == MIXTURE and near.dispersion > 0:
         mixture = fit_pair_mixture(_errors(problem), start, ridge / near.dispersion)
+        lasting = lasting_in_pairs(mixture.slope("share"), problem.pairs.number, problem.ranges.time_ns)
+        if lasting > LASTING:
+            again = fit_pair_mixture(_errors(problem), start, ridge / near.dispersion, lasting)
+            mixture = replace(again if again.success else mixture, steps=mixture.steps + again.steps)
         parameters, success, steps = mixture.of("design"), mixture.success, steps + mixture.steps
         scores, inverse, prior = mixture.scores, mixture.covariance, mixture.precision
     else:
