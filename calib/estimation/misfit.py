@@ -9,7 +9,7 @@ as far as pairs close (quadruples of pairs over four tags); with three tags noth
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -47,6 +47,9 @@ SAME: Final = 0.95
 """Alternatives whose tests correlate by more than this cannot be told from each other."""
 
 MOST_NAMED: Final = 3
+SUGGESTED: Final = 2.5
+"""So many standard errors of decibels, beside certainty that a tag's errors go with power."""
+
 REACHED: Final = 1e-3
 """Share of an alternative's information that must be left beside the fitted parameters for it to be tested."""
 
@@ -160,16 +163,38 @@ def examine(
     """
     count = int(blocks[-1]) + 1
     own = scores.by_block(blocks, count)
-    found, several = [], sum(len(family.names) for family in tested)
+    found, several, results = [], sum(len(family.names) for family in tested), {}
     nowhere = np.zeros(len(shape_m), dtype=np.int64)
     effect = -delays @ (scores.with_groups(shape_m, nowhere, 1) @ inverse)[0, : delays.shape[1]]
     widening = np.outer(effect, effect)
     for family in tested:
         result = _test(family, scores, own, inverse, delays, blocks, seconds)
+        results[family.kind] = result
         if family.kind == "pair":
             widening += _spread_of_pairs(result)
         found += list(_findings(family, result, several))
+    found += list(_of_gain(found, tested, results))
     return Judgement(findings=sorted(found, key=lambda finding: -abs(finding.deviation)), widening_ns2=widening)
+
+
+def _of_gain(found: list[Finding], tested: list[Family], results: dict[str, Tested]) -> Iterator[Finding]:
+    """Yield wrong decibels of tags whose errors go with power in another way, where they suggest such.
+
+    How errors go with power says that a tag is not as the others, decibels what that does to its delay.
+    """
+    names = next((family.names for family in tested if family.kind == "decibels"), [])
+    certain = {name for finding in found if finding.kind == "decibels" for name in finding.names}
+    for finding in found:
+        name = finding.names[0]
+        if finding.kind != "power" or name not in names or name in certain:
+            continue
+        result, k = results["decibels"], names.index(name)
+        known = max(float(result.information[k, k]), 1e-300)
+        offset = float(result.total[k]) / known
+        if known > REACHED * result.whole and abs(offset) > SUGGESTED * np.sqrt(result.covariance[k, k]) / known:
+            yield replace(
+                finding, kind="decibels", names=(name,), offset_m=-offset, effect_ns=result.effects[:, k] * offset
+            )
 
 
 def _test(

@@ -39,10 +39,16 @@ MAX_STEPS: Final = 60
 PATIENCE: Final = 20
 """Steps after which it is enough that delays and curves stand still: a share of nothing may be any small number."""
 
-FULL_STEPS: Final = 10
-"""Steps after which variances between pairs stand, and steps are halved: squared slopes are not quite the curvature,
-and two points that lead to each other have their middle between them.
+ADAPTING: Final = 10
+"""Steps after which variances between pairs stand, and steps are halved at first: two points that lead to each other
+have their middle between them.
 """
+
+SHORT: Final = 0.8
+LONG: Final = 0.3
+LONGEST: Final = 8.0
+SHORTEST: Final = 0.25
+"""Shares of what was promised above which a step was short and below which it was long, and bounds of its length."""
 
 SETTLED: Final = 1e-2
 """A step that promises less log likelihood than this by delays and curves ends it: a tenth of a standard error."""
@@ -292,15 +298,19 @@ def _climb(
 ) -> tuple[Floats, Prior, int, bool]:
     """Climb to the top of the likelihood of some errors: parameters, prior, steps, and whether it is the top."""
     best, top, step, shorter = -np.inf, theta, np.zeros_like(theta), 0
-    information, gain = np.zeros((0, 0)), np.inf
+    information, gain, length, promised = np.zeros((0, 0)), np.inf, 1.0, 0.0
     for steps in range(1, MAX_STEPS + 1):
         fresh = steps == 1 or gain > CHORD
         sums, likelihood = _sums(errors, layout, theta, squares=fresh)
         value = likelihood - 0.5 * float((theta - prior.centre) @ prior.weighed @ (theta - prior.centre))
         if value < best - SETTLED and shorter < 6:
-            step, shorter = 0.3 * step, shorter + 1
+            step, shorter, promised = 0.3 * step, shorter + 1, 0.0
             theta = top + step
             continue
+        if steps == ADAPTING + 1:
+            length = 0.5
+        elif steps > ADAPTING and promised > 0:
+            length = _length(length, (value - best) / promised)
         information = sums.information() if fresh else information
         covariance = inverse_of(information + prior.weighed, layout.pairs, len(SPREADS))
         slope = sums.gradient() - prior.weighed @ (theta - prior.centre)
@@ -311,12 +321,23 @@ def _climb(
         if still and (gain < nearly or steps > PATIENCE):
             return theta, prior, steps, True
         longest = float(np.max(np.abs(step[layout.columns :])))
-        step *= min(1.0 if steps <= FULL_STEPS else 0.5, LONGEST_STEP / max(longest, 1e-12))
+        step *= min(length, LONGEST_STEP / max(longest, 1e-12))
+        promised = float(slope @ step)
         top, theta = theta, theta + step
-        if steps <= FULL_STEPS:
+        if steps <= ADAPTING:
             prior = _between(theta, prior, layout, covariance)
         best = likelihood - 0.5 * float((top - prior.centre) @ prior.weighed @ (top - prior.centre))
     return theta, prior, steps, False
+
+
+def _length(before: float, kept: float) -> float:
+    """Return how much of a step to take, by the share that the last one kept of what its slope promised.
+
+    Squared slopes are not quite the curvature: a step to the top keeps a half, one that keeps all was short.
+    """
+    if kept > SHORT:
+        return min(2 * before, LONGEST)
+    return max(before / 2, SHORTEST) if kept < LONG else before
 
 
 def _sums(errors: Errors, layout: Layout, theta: Floats, *, squares: bool) -> tuple[Sums, float]:

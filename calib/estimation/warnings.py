@@ -10,7 +10,7 @@ from calib.calibration.model import CorrectedRanges
 from calib.ranges import STATIC, Ranges
 
 MANY_MISSING: Final = 0.05
-MANY_OUTLIERS: Final = 0.3
+MANY_OUTLIERS: Final = 0.4
 SHORT_S: Final = 25.0
 
 

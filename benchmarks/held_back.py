@@ -1,0 +1,113 @@
+"""The paper's own samples, held back from the fit: how well the curve and the total uncertainty say what they are.
+
+The samples of `icra2023_bias_fpp.csv` have neither pair nor time, and their delays are corrected already. They are
+given to three tags at random, in a random order, so that what is fitted to them is a curve and what errors are made of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import calib
+from calib.ranges import Ranges
+
+Floats = NDArray[np.float64]
+Chosen = NDArray[np.bool_]
+
+PARTS: Final = 5
+"""Ranges of power of equal counts, left out in turn."""
+
+DEGREE: Final = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldBack:
+    """What a fit says of samples that it has not seen: z-scores by the total sigma, and errors beside a plain cubic's.
+
+    `z_std` should be 1, `inside_95` 0.95; `left_m` is the mean error less what the error model expects, `cubic_left_m`
+    the mean that a plain cubic by least squares leaves.
+    """
+
+    z_std: float
+    inside_95: float
+    rms_m: float
+    cubic_rms_m: float
+    mean_m: float
+    left_m: float
+    cubic_left_m: float
+
+
+def samples(path: Path) -> tuple[Floats, Floats]:
+    """Return lifted powers and biases in metres (n,)."""
+    lifted, bias = np.loadtxt(path, delimiter=",", skiprows=1).T
+    return lifted, bias
+
+
+def as_ranges(lifted: Floats, bias: Floats, seed: int) -> Ranges:
+    """Give samples to three tags, in a random order, a hundred a second."""
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(len(lifted))
+    pair = np.array([(1, 2), (2, 3), (1, 3)])[rng.integers(0, 3, len(order))]
+    truth, power = rng.uniform(1, 5, len(order)), -82 + 10 * np.log10(lifted[order])
+    return Ranges.from_arrays(
+        truth + bias[order],
+        truth_m=truth,
+        initiator=pair[:, 0],
+        target=pair[:, 1],
+        fpp1_dbm=power,
+        fpp2_dbm=power,
+        time_ns=np.arange(len(order)) * 10_000_000,
+    )
+
+
+def judged(lifted: Floats, bias: Floats, held: Chosen) -> HeldBack:
+    """Fit what is not `held` back, and judge what is."""
+    known = calib.fit(as_ranges(lifted[~held], bias[~held], 1)).calibration
+    others = as_ranges(lifted[held], bias[held], 2)
+    applied, overall = known.apply(others), calib.evaluate(others, known).overall
+    error = applied.corrected_m - others.truth_m
+    polynomial: Any = np.polynomial.polynomial
+    cubic = bias[held] - polynomial.polyval(lifted[held], polynomial.polyfit(lifted[~held], bias[~held], DEGREE))
+    return HeldBack(
+        z_std=overall.total_std,
+        inside_95=overall.inside_95,
+        rms_m=float(np.sqrt(np.mean(error**2))),
+        cubic_rms_m=float(np.sqrt(np.mean(cubic**2))),
+        mean_m=float(np.mean(error)),
+        left_m=float(np.mean(error - applied.mean_error_m)),
+        cubic_left_m=float(np.mean(cubic)),
+    )
+
+
+def every_second(lifted: Floats) -> Chosen:
+    """Hold every second sample back, of samples in order of power."""
+    return np.asarray(np.arange(len(lifted)) % 2 == 1)
+
+
+def parts(lifted: Floats) -> list[Chosen]:
+    """Hold whole ranges of power back, in turn."""
+    edges = np.quantile(lifted, np.linspace(0, 1, PARTS + 1))
+    return [(lifted >= low) & (lifted <= high) for low, high in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def rows(path: Path) -> list[str]:
+    """Return the rows of a table."""
+    lifted, bias = samples(path)
+    held = {"every second": every_second(lifted)}
+    for number, part in enumerate(parts(lifted), 1):
+        held[f"fifth {number} of powers" + (", beyond the fitted ones" if number in (1, PARTS) else "")] = part
+    found = {name: judged(lifted, bias, chosen) for name, chosen in held.items()}
+    return [
+        '| held back | z-std | "95 %" holds | rms | a plain cubic\'s rms | mean | mean, less what is expected of reflections |',
+        "|---|---|---|---|---|---|---|",
+        *(
+            f"| {name} | {one.z_std:.2f} | {100 * one.inside_95:.1f} % | {1e3 * one.rms_m:.1f} mm | "
+            f"{1e3 * one.cubic_rms_m:.1f} mm | {1e3 * one.mean_m:+.1f} mm | {1e3 * one.left_m:+.1f} mm |"
+            for name, one in found.items()
+        ),
+    ]
