@@ -7,6 +7,7 @@ given to three tags at random, in a random order, so that what is fitted to them
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -92,7 +93,7 @@ def every_second(lifted: Floats) -> Chosen:
 def parts(lifted: Floats) -> list[Chosen]:
     """Hold whole ranges of power back, in turn."""
     edges = np.quantile(lifted, np.linspace(0, 1, PARTS + 1))
-    return [(lifted >= low) & (lifted <= high) for low, high in zip(edges[:-1], edges[1:], strict=True)]
+    return [(lifted >= low) & (lifted <= high) for low, high in pairwise(edges)]
 
 
 def rows(path: Path) -> list[str]:
@@ -103,7 +104,7 @@ def rows(path: Path) -> list[str]:
         held[f"fifth {number} of powers" + (", beyond the fitted ones" if number in (1, PARTS) else "")] = part
     found = {name: judged(lifted, bias, chosen) for name, chosen in held.items()}
     return [
-        '| held back | z-std | "95 %" holds | rms | a plain cubic\'s rms | mean | mean, less what is expected of reflections |',
+        '| held back | z-std | "95 %" holds | rms | a plain cubic\'s rms | mean | mean, less what is expected |',
         "|---|---|---|---|---|---|---|",
         *(
             f"| {name} | {one.z_std:.2f} | {100 * one.inside_95:.1f} % | {1e3 * one.rms_m:.1f} mm | "
