@@ -155,7 +155,7 @@ class Calibration:
                 f"{ranges.source}: no delay for tag {', '.join(map(str, missing))} in the calibration, "
                 f"which knows {known}; fit one from a recording with all tags"
             )
-        size = max(ranges.tags()) + 1
+        size = max(ranges.tags(), default=0) + 1
         delay_s = np.array([self.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
         flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
         delays = ranges.raw_m + self.speed_of_light * flight

@@ -190,6 +190,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Run commands on damaged files.")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--cases", type=int, default=2000)
+    parser.add_argument("--only", help="kinds of files to damage, by the beginning of their names")
     parser.add_argument("--keep", type=Path, help="folder for the damaged files of cases that went wrong")
     options = parser.parse_args()
     found: Counter[str] = Counter()
@@ -200,6 +201,8 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         runner = Runner(seeds, folder)
         for number in range(options.first, options.first + options.cases):
+            if options.only and not random.Random(number).choice(KINDS).file.startswith(options.only):
+                continue
             wrong = runner.run(number)
             if wrong:
                 found[wrong.partition("   [")[0]] += 1

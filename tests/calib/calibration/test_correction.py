@@ -100,3 +100,11 @@ def test_a_corrected_recording_is_not_corrected_again(corrected):
 
 def test_all_columns_of_exchanges_are_compared():
     assert set(COLUMNS) == set(TABLES["exchanges"])
+
+
+def test_a_recording_without_exchanges_is_corrected_to_one_without(tmp_path):
+    flight = sample_flight(600)
+    with Recording.create(tmp_path / "f.uwb") as recording:
+        recording.append_tags(flight.tags)
+    done = calib.apply(tmp_path / "f.uwb", calib.fit(flight).calibration, tmp_path / "c.uwb")
+    assert (done.count, done.clamped) == (0, 0)
