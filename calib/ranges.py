@@ -11,15 +11,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import BadInputError, UnanswerableError
+from calib.single_sided import LeftSkew, left_skew, worst
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import TICK_S
-from uwblink.twr import Exchanges, delay_weights, intervals, raw_range
+from uwblink.twr import Exchanges, delay_weights, intervals, raw_range, without_stamps
 
 IN_MEMORY: Final = "memory"
 """The source of ranges that come from no file."""
+
+NO_STAMPS: Final = "range"
+"""What stands for the protocol of a range that came without stamps."""
 
 HALVES: Final = (0.5, 0.5)
 LONGEST_M: Final = 1e4
@@ -34,8 +38,9 @@ class Ranges:
 
     `raw_m` is the range recomputed from the stamps, `truth_m` the distance between the antennas;
     `weight_initiator` and `weight_target` are the derivatives of the calibrated time of flight with
-    respect to the two tags' antenna delays. `excluded` counts by reason what was left out; `planted`
-    is what a simulation put in, for display only.
+    respect to the two tags' antenna delays. `protocol` is "range" where a range came without stamps.
+    `excluded` counts by reason what was left out; `planted` is what a simulation put in, for display only;
+    `left_skew` says what clock skew may have left in single-sided ranges, None where there are none.
     """
 
     source: str
@@ -51,6 +56,7 @@ class Ranges:
     fpp2_dbm: Floats
     excluded: dict[str, int]
     planted: dict[str, Any] | None
+    left_skew: LeftSkew | None = None
 
     @classmethod
     def from_exchanges(
@@ -73,12 +79,13 @@ class Ranges:
         if given.shape != (len(exchanges),):
             raise BadInputError(f"has shape {given.shape}, expected ({len(exchanges)},)", parameter="truth_m")
         initiator, target = delay_weights(exchanges)
+        bare = without_stamps(exchanges)
         return cls(
             source=source,
             time_ns=exchanges.time_ns,
             initiator=exchanges.initiator,
             target=exchanges.target,
-            protocol=exchanges.protocol,
+            protocol=np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
             raw_m=raw_range(exchanges),
             truth_m=_truth(exchanges, given, poses, tags),
             weight_initiator=initiator,
@@ -87,6 +94,7 @@ class Ranges:
             fpp2_dbm=measured_powers(exchanges.fpp2_dbm),
             excluded={},
             planted=dict(planted) if planted else None,
+            left_skew=left_skew(exchanges),
         )
 
     @classmethod
@@ -136,7 +144,7 @@ class Ranges:
             raise BadInputError(f"arrays of ranges do not fit each other: {error}") from error
         if rows[0].ndim != 1:
             raise BadInputError(f"has shape {np.shape(range_m)}, expected one dimension", parameter="range_m")
-        filled = dict(zip([*columns, *ids], rows, strict=True))
+        filled: dict[str, Any] = dict(zip([*columns, *ids], rows, strict=True))
         if np.any(filled["initiator"] == filled["target"]):
             row = int(np.argmax(filled["initiator"] == filled["target"]))
             raise BadInputError(f"row {row} is of tag {filled['target'][row]} with itself", parameter="target")
@@ -162,16 +170,17 @@ class Ranges:
         counts = [np.bincount(ids) > 0 for ids in (self.initiator, self.target)]
         return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
 
-    def usable(self, why_no_truth: str = "") -> Ranges:
+    def usable(self, why_no_truth: str = "", *, need_power: bool = True) -> Ranges:
         """Leave out what has no true distance, no power at either end, or impossible stamps, and count it.
 
-        Raises `UnanswerableError` where nothing is left, with `why_no_truth` where that is the reason.
+        Without `need_power`, ranges without any stay. Raises `UnanswerableError` where nothing is left, with
+        `why_no_truth` where that is the reason.
         """
         if not len(self):
             raise UnanswerableError(f"{self.source}: holds no exchanges")
         reasons = {
             "no true distance": np.isfinite(self.truth_m),
-            "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm),
+            "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm) | (not need_power),
             "impossible stamps": np.isfinite(self.raw_m) & (np.abs(self.raw_m) < LONGEST_M),
         }
         keep = np.ones(len(self), dtype=bool)
@@ -183,15 +192,16 @@ class Ranges:
             return self
         if not keep.any():
             most = max(excluded, key=lambda reason: excluded[reason])
-            missing = f"; {why_no_truth or 'it needs poses and lever arms, or measured distances'}"
-            raise UnanswerableError(
-                f"{self.source}: none of its {len(self)} exchanges can be used: {most}"
-                + (missing if "true" in most else "")
-            )
+            hints = {
+                "no true distance": why_no_truth or "it needs poses and lever arms, or measured distances",
+                "no power": "`delays_only` needs none",
+            }
+            hint = f"; {hints[most]}" if most in hints else ""
+            raise UnanswerableError(f"{self.source}: none of its {len(self)} exchanges can be used: {most}{hint}")
         return replace(self[keep], excluded=self.excluded | {r: n for r, n in excluded.items() if n})
 
 
-COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted"})
+COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted", "left_skew"})
 
 
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
@@ -202,6 +212,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         source=", ".join(p.source for p in parts),
         excluded={r: sum(p.excluded.get(r, 0) for p in parts) for r in reasons},
         planted=parts[0].planted,
+        left_skew=worst([p.left_skew for p in parts]),
         **columns,
     )
 

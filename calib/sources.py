@@ -131,26 +131,26 @@ def _no_recording(data: object) -> BadInputError:
     )
 
 
-def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False) -> Ranges:
+def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> Ranges:
     """Return the ranges of one or more recordings with their true distances, without those that cannot be used.
 
     `data` is the path of a recording, an open `Recording`, `Exchanges` with their true distances, `Ranges`, any object
     with `exchanges`, `poses` and `tags` (a simulation in memory), or several of those. `trim_static` leaves out spans
-    of two seconds in which a pair's distance stays within two centimetres. Raises the errors of `Recording.open`, and
-    `UnanswerableError` where nothing can be used.
+    of two seconds in which a pair's distance stays within two centimetres. Ranges without any power are left out unless
+    `need_power` is False. Raises the errors of `Recording.open`, and `UnanswerableError` where nothing can be used.
 
     >>> import calib
     >>> own = calib.Ranges.from_arrays([3.1, 4.2], initiator=1, target=2, fpp1_dbm=-85.0, truth_m=[3.0, 4.0])
     >>> calib.load_ranges(own)
     <Ranges of memory: 2 of tags 1, 2>
     """
-    parts = load_each(data, trim_static=trim_static)
+    parts = load_each(data, trim_static=trim_static, need_power=need_power)
     return parts[0] if len(parts) == 1 else concatenate(parts)
 
 
-def load_each(data: Data | Iterable[Data], *, trim_static: bool = False) -> list[Ranges]:
+def load_each(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> list[Ranges]:
     """Return the ranges of each recording; raises what `load_ranges` raises."""
-    parts = [_load(one) for one in each(data)]
+    parts = [_load(one, need_power) for one in each(data)]
     return [without_static(part) for part in parts] if trim_static else parts
 
 
@@ -166,16 +166,16 @@ def each(data: Data | Iterable[Data]) -> list[Data]:
     return found
 
 
-def _load(data: Data) -> Ranges:
+def _load(data: Data, need_power: bool) -> Ranges:
     if isinstance(data, Ranges):
-        return data.usable()
+        return data.usable(need_power=need_power)
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
         complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
         poses, tags = (None, []) if complete else (source.poses, source.tags)
         planted = _planted(source)
     ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, planted=planted, source=name)
-    return ranges.usable(_why_no_truth(ranges, poses, tags))
+    return ranges.usable(_why_no_truth(ranges, poses, tags), need_power=need_power)
 
 
 def _planted(source: Source) -> Mapping[str, Any] | None:
@@ -213,7 +213,7 @@ class Flight:
         return [name for name in names if spans[name] > 0.1]
 
 
-def load_flight(data: Data) -> Flight:
+def load_flight(data: Data, *, need_power: bool = True) -> Flight:
     """Return a recording's ranges with its poses; raises what `load_ranges` raises."""
     with opened(data) as (_, source):
-        return Flight(load_ranges(data), source.poses, list(source.tags))
+        return Flight(load_ranges(data, need_power=need_power), source.poses, list(source.tags))

@@ -51,7 +51,7 @@ FLOORS = {
         ("cli",),
     ),
     "calib": (
-        ("errors", "samples", "spread"),
+        ("errors", "samples", "single_sided", "spread"),
         ("ranges",),
         ("calibration", "sources"),
         ("evaluation",),

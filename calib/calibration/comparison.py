@@ -90,6 +90,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     require_calibration(second, "second")
     from scipy.stats import chi2
 
+    if first.pair_offsets or second.pair_offsets:
+        raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
     known = [{t for t in c.delays_ns if np.isfinite(c.delays_std_ns.get(t, 0.0))} for c in (first, second)]
     common = sorted(known[0] & known[1])
     if len(common) < 2:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+
+from calib.calibration.pair_offsets import named
 
 if TYPE_CHECKING:
     from calib.calibration.model import Calibration, TagGroup
@@ -16,15 +18,21 @@ TWO_SIDED_95: Final = 1.959963984540054
 MOST_TAGS: Final = 40
 """Tags that are listed; of more, the first are."""
 
+HEAD: Final = ("tag", "delay (ns)", "95 % interval")
+PAIRS_HEAD: Final = ("pair", "constant (cm)", "95 % interval")
 POINTS: Final = 6
 """Lifted powers at which the curves are shown."""
 
 
 def as_text(calibration: Calibration) -> str:
     """Return the calibration as lines of text."""
-    lines = [_headline(calibration), f"  {'tag':>5}  {'delay (ns)':>11}  95 % interval"]
-    for tag, delay, interval in delay_rows(calibration):
-        lines.append(f"  {tag:>5}  {delay:>11}  {interval}")
+    lines = [_headline(calibration)]
+    apart = calibration.pair_offsets and not any(calibration.delays_ns.values())
+    for name, value, interval in () if apart else (HEAD, *delay_rows(calibration)):
+        lines.append(f"  {name:>5}  {value:>11}  {interval}")
+    if calibration.pair_offsets:
+        for name, value, interval in (PAIRS_HEAD, *pair_rows(calibration)):
+            lines.append(f"  {name:>9}  {value:>13}  {interval}")
     power, *curves = curve_rows(calibration)
     for name, *cells in (power, *curves):
         lines.append(f"  {name:18s}" + "".join(f"{cell:>9s}" for cell in cells))
@@ -33,13 +41,25 @@ def as_text(calibration: Calibration) -> str:
 
 def as_html(calibration: Calibration) -> str:
     """Return the calibration as HTML tables, for notebooks."""
-    delays = [("tag", "delay (ns)", "95 % interval"), *delay_rows(calibration)]
+    delays = [HEAD, *delay_rows(calibration)]
+    pairs = [PAIRS_HEAD, *pair_rows(calibration)] if calibration.pair_offsets else []
+    tables: list[Sequence[tuple[str, ...]]] = [delays, pairs, curve_rows(calibration)]
     return f"<p>{escape(_headline(calibration))}</p>" + "".join(
         "<table>"
         + "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>" for row in rows)
         + "</table>"
-        for rows in (delays, curve_rows(calibration))
+        for rows in tables
+        if rows
     )
+
+
+def pair_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield each pair, the constant of its ranges in cm, and its interval in words."""
+    rows = sorted(calibration.pair_offsets.items())
+    for pair, one in rows[:MOST_TAGS]:
+        yield named(pair), f"{100 * one.offset_m:+.2f}", f"± {100 * TWO_SIDED_95 * one.std_m:.2f}"
+    if len(rows) > MOST_TAGS:
+        yield "...", "", f"{len(rows) - MOST_TAGS} more"
 
 
 def delay_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:

@@ -202,6 +202,8 @@ def export(
     require_calibration(calibration)
     if to not in FORMATS:
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
+    if calibration.pair_offsets and to != "json":
+        raise BadInputError(f"{to} has no place for constants of pairs; export it as json", parameter="to")
     text = FORMATS[to](calibration, base)
     if path is not None:
         write_text(Path(path), text, force=force)

@@ -79,10 +79,10 @@ class Reader:
             raise self.wrong(key, f"{size} numbers a row")
         return rows
 
-    def numbers(self, key: str) -> tuple[float, ...]:
-        """Return a list of finite numbers."""
+    def numbers(self, key: str, least: int = 1) -> tuple[float, ...]:
+        """Return a list of finite numbers, `least` of them or more."""
         value = self._value(key)
-        if not isinstance(value, list) or not value:
+        if not isinstance(value, list) or len(value) < least:
             raise self.wrong(key, "a list of numbers")
         inner = Reader({str(k): v for k, v in enumerate(value)}, f"{self._where}: {key}")
         return tuple(inner.number(str(k)) for k in range(len(value)))

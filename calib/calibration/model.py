@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from calib.calibration.display import as_html, as_text
 from calib.calibration.error_model import ErrorModel, read_errors
 from calib.calibration.json_format import Matrix, Reader
+from calib.calibration.pair_offsets import PairOffset, offsets_from, offsets_m, table_of
 from calib.calibration.power_curves import LIFTS, Curve, basis, ends, lift, lifted_power
 from calib.calibration.runtime import CorrectedColumns, CorrectedRange, RangeCorrector
 from calib.errors import BadInputError, UnanswerableError
@@ -33,7 +34,10 @@ GROUPED_VERSION: Final = 2
 RECEPTION_VERSION: Final = 3
 """And one whose curve is meant for each reception: whoever takes it at the mean power is wrong by up to a decimetre."""
 
-VERSIONS: Final = (SCHEMA_VERSION, GROUPED_VERSION, RECEPTION_VERSION)
+PAIRS_VERSION: Final = 4
+"""And one with constants of pairs."""
+
+VERSIONS: Final = (SCHEMA_VERSION, GROUPED_VERSION, RECEPTION_VERSION, PAIRS_VERSION)
 POWER_AT: Final = ("exchange", "reception")
 OUTLIER: Final = 0.5
 """Probability above which a range of known error is marked as an outlier."""
@@ -108,7 +112,9 @@ class Calibration:
     taken: "exchange", at the lifted power of an exchange as `lift` makes it of two; or "reception", at each of the two
     powers, half of either in a range, as curves are published that correct single stamps. With `groups`, each has its
     own curves, and the plain ones are the groups' average, for a look only. `errors` says what the errors of corrected
-    ranges are made of, by pair and power; None where that is not known, as in older and in imported calibrations.
+    ranges are made of, by pair and power; None where that is not known, as in older and in imported calibrations. With
+    `pair_offsets`, by pair with the smaller id first, ranges of a pair read longer by its constant, beside what delays
+    and curves say, and a pair that has none cannot be corrected.
     """
 
     delays_ns: dict[int, float]
@@ -125,6 +131,7 @@ class Calibration:
     groups: dict[str, TagGroup] = field(default_factory=dict)
     power_at: str = "exchange"
     errors: ErrorModel | None = None
+    pair_offsets: dict[tuple[int, int], PairOffset] = field(default_factory=dict)
     _corrector: RangeCorrector | None = field(default=None, init=False, compare=False)
 
     def __repr__(self) -> str:
@@ -139,14 +146,23 @@ class Calibration:
         """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
         write_text(Path(path), self.to_json(), force=force)
 
+    @property
+    def needs_power(self) -> bool:
+        """Whether ranges without any power cannot be corrected whole."""
+        curves = [self.bias_curve, self.sigma_curve]
+        curves += [curve for group in self.groups.values() for curve in (group.bias_curve, group.sigma_curve)]
+        return not all(curve.flat for curve in curves)
+
     def lifted(self, ranges: Ranges) -> Floats:
         """Return the lifted power of each range, as this calibration defines it."""
-        return lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
+        lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
+        # Where nothing depends on power, a range without any is as good as another.
+        return lifted if self.needs_power else np.where(np.isfinite(lifted), lifted, self.bias_curve.range[0])
 
     def apply(self, ranges: Ranges) -> CorrectedRanges:
         """Correct ranges: c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section III), then the curve.
 
-        Raises `BadInputError` naming the tags that have no delay in this calibration.
+        Raises `BadInputError` naming the tags that have no delay in this calibration, or the pair that has no constant.
         """
         missing = [t for t in ranges.tags() if t not in self.delays_ns]
         if missing:
@@ -158,7 +174,7 @@ class Calibration:
         size = max(ranges.tags(), default=0) + 1
         delay_s = np.array([self.delays_ns.get(t, math.nan) for t in range(size)]) * 1e-9
         flight = ranges.weight_initiator * delay_s[ranges.initiator] + ranges.weight_target * delay_s[ranges.target]
-        delays = ranges.raw_m + self.speed_of_light * flight
+        delays = ranges.raw_m + self.speed_of_light * flight - offsets_m(self.pair_offsets, ranges)
         lifted = self.lifted(ranges)
         corrected = delays - self._bias_of(ranges, lifted)
         return CorrectedRanges(
@@ -339,11 +355,15 @@ class Calibration:
             }
         if self.errors:
             document["errors"] = self.errors.to_dict()
+        if self.pair_offsets:
+            document["pair_offsets"] = table_of(self.pair_offsets)
         if self.uncertainty:
             document["uncertainty"] = asdict(self.uncertainty)
         return _rows_on_lines(json.dumps(document, indent=1, allow_nan=False)) + "\n"
 
     def _version(self) -> int:
+        if self.pair_offsets:
+            return PAIRS_VERSION
         if self.power_at != "exchange":
             return RECEPTION_VERSION
         return GROUPED_VERSION if self.groups else SCHEMA_VERSION
@@ -384,6 +404,7 @@ class Calibration:
             groups=_groups(read),
             power_at=power_at,
             errors=read_errors(read.inside("errors")) if read.has("errors") else None,
+            pair_offsets=offsets_from(read) if read.has("pair_offsets") else {},
         )
 
 
@@ -438,7 +459,7 @@ def _uncertainty(read: Reader) -> Uncertainty | None:
     if not read.has("uncertainty"):
         return None
     inner = read.inside("uncertainty")
-    tags = tuple(int(tag) for tag in inner.numbers("tags"))
+    tags = tuple(int(tag) for tag in inner.numbers("tags", least=0))
     bias, sigma = (len(read.curve(name).coefficients) for name in ("bias_curve", "sigma_curve"))
     return Uncertainty(
         tags,

@@ -60,7 +60,10 @@ def ends(fpp1_dbm: Floats, fpp2_dbm: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A B-spline over lifted power, held constant outside `range`, where nothing was measured."""
+    """A B-spline over lifted power, held constant outside `range`, where nothing was measured.
+
+    A flat one has the same value at any power, also where none was measured.
+    """
 
     knots: tuple[float, ...]
     coefficients: tuple[float, ...]
@@ -69,11 +72,20 @@ class Curve:
 
     def __call__(self, lifted: Floats) -> Floats:
         """Return the curve at lifted powers (n,), in metres."""
+        if self.flat:
+            return np.full(np.shape(lifted), self.coefficients[0])
         knots, coefficients = np.array(self.knots), np.array(self.coefficients)
         return combination(np.clip(lifted, *self.range), knots, coefficients, self.degree)
 
+    @property
+    def flat(self) -> bool:
+        """Whether the curve does not depend on power."""
+        return min(self.coefficients) == max(self.coefficients)
+
     def inside(self, lifted: Floats) -> Bools:
-        """Return which lifted powers (n,) the curve was fitted at."""
+        """Return which lifted powers (n,) the curve was fitted at; a flat one holds at all, measured or not."""
+        if self.flat:
+            return np.ones(np.shape(lifted), dtype=bool)
         return (lifted >= self.range[0]) & (lifted <= self.range[1])
 
     def beyond(self, lifted: Floats) -> Floats:
@@ -87,6 +99,14 @@ class Curve:
         below, above = (ends[1] - ends[0]) / step, (ends[3] - ends[2]) / step
         away = np.abs(below) * np.maximum(low - lifted, 0.0) + np.abs(above) * np.maximum(lifted - high, 0.0)
         return np.asarray(away)
+
+
+def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:
+    """Return a curve of one value, said to be fitted between two lifted powers."""
+    low, high = span
+    if not high > low:
+        low, high = 0.999 * low, 1.001 * high
+    return Curve((low,) * (DEGREE + 1) + (high,) * (DEGREE + 1), (value_m,) * (DEGREE + 1), DEGREE, (low, high))
 
 
 def populated(ordered: Floats) -> tuple[float, float]:

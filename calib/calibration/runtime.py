@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from calib.calibration.error_model import ErrorsAtOnce
+from calib.calibration.pair_offsets import offset_of
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from calib.ranges import FAINTEST_DBM, LOUDEST_DBM
@@ -103,6 +104,8 @@ class RangeCorrector:
     def __init__(self, calibration: Calibration) -> None:
         """Prepare the curves of every group of tags."""
         self._metres = {tag: d * 1e-9 * calibration.speed_of_light for tag, d in calibration.delays_ns.items()}
+        self._offsets = calibration.pair_offsets
+        self._flat = not calibration.needs_power
         self._alpha = calibration.alpha_dbm
         self._of_mean = calibration.lift == "lift-of-mean"
         self._at_receptions = calibration.power_at == "reception"
@@ -128,11 +131,15 @@ class RangeCorrector:
             corrected = range_m + weights[0] * self._metres[initiator] + weights[1] * self._metres[target]
         except KeyError as error:
             raise self._unknown(error.args[0]) from None
+        if self._offsets:
+            corrected -= offset_of(self._offsets, initiator, target).offset_m
         lifted = self._lifted(fpp1_dbm, fpp2_dbm)
         if lifted != lifted:
-            return CorrectedRange(corrected, math.nan, True, math.nan, math.nan)
+            if not self._flat:
+                return CorrectedRange(corrected, math.nan, True, math.nan, math.nan)
+            lifted = self._plain[0].low
         bias, sigma = self._plain
-        clamped = not bias.low <= lifted <= bias.high
+        clamped = not (self._flat or bias.low <= lifted <= bias.high)
         errors = self._errors(lifted, initiator, target) if self._errors else (math.nan, math.nan)
         if not self._member:
             return CorrectedRange(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-from calib.cli import evaluating, files, fitting, reporting
+from calib.cli import evaluating, files, fitting, reporting, showing
 from calib.cli.flags import FLAGS
 from calib.errors import CalibError, UnanswerableError
 from uwblink.cli import shared
@@ -13,7 +13,7 @@ from uwblink.cli import shared
 app = shared.new_app(
     "Fit antenna delays and power curves to ultra-wideband ranges, apply them, and say how good they are."
 )
-for room in (fitting, evaluating, reporting, files):
+for room in (fitting, showing, evaluating, reporting, files):
     room.add_to(app)
 
 

@@ -41,6 +41,17 @@ GroupFile = Annotated[
     Path | None,
     typer.Option(help="Groups of tags that share curves (.toml with a table \\[groups]); by default all tags do."),
 ]
+DelaysOnly = Annotated[
+    bool,
+    typer.Option("--delays-only", help="Fit no curve: for ranges without power, or whose power follows distance."),
+]
+DelaysFrom = Annotated[
+    Path | None,
+    typer.Option(help="Calibration whose delays are taken over (.json); with those of all tags the curve is left."),
+]
+Constants = Annotated[
+    str, typer.Option(help="What a constant error belongs to: tag (antenna delays) or pair (each its own constant).")
+]
 Sequential = Annotated[
     bool,
     typer.Option("--sequential", help="Fit the delays first and then the curve to what they leave, as in ICRA 2023."),

@@ -36,7 +36,7 @@ def evaluate(
 
         check_output(report, force=force)
     known = calib.load_calibration(calibration)
-    parts = load_each(recordings)
+    parts = load_each(recordings, need_power=known.needs_power)
     evaluation = calib.evaluate(parts, known)
     if report:
         calib.write_report(report, parts, known, force=force)

@@ -13,6 +13,9 @@ import typer
 from calib.cli.arguments import (
     AsJson,
     CalibrationFile,
+    Constants,
+    DelaysFrom,
+    DelaysOnly,
     Fix,
     Force,
     GroupFile,
@@ -50,6 +53,9 @@ def fit(
     trim_static: TrimStatic = False,
     minimum_norm: MinimumNorm = False,
     reference_power: ReferencePower = None,
+    delays_only: DelaysOnly = False,
+    delays_from: DelaysFrom = None,
+    constants: Constants = "tag",
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -67,9 +73,12 @@ def fit(
         sequential=sequential,
         minimum_norm=minimum_norm,
         reference_power_dbm=reference_power,
+        delays_only=delays_only,
+        delays_from=delays_from,
+        constants=constants,
     )
     check_output(output, force=force)
-    ranges = calib.load_ranges(recordings, trim_static=trim_static)
+    ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not delays_only)
     try:
         result = calib.fit(ranges, **options)
     except calib.UnanswerableError as error:
@@ -91,7 +100,12 @@ def fit(
 
 
 def delay_lines(found: calib.Calibration) -> Iterator[str]:
-    """Yield a line a tag: the delay and its 95 % interval."""
+    """Yield a line a pair that has a constant and a line a tag: the constant or delay, and its 95 % interval."""
+    for pair, offset in sorted(found.pair_offsets.items()):
+        half = 196 * offset.std_m
+        yield f"  pair {pair[0]:3d} {pair[1]:3d}  ranges {100 * offset.offset_m:+.2f} cm too long  ± {half:.2f} (95 %)"
+    if found.pair_offsets and not any(found.delays_ns.values()):
+        return
     for tag, delay in sorted(found.delays_ns.items()):
         half = 1.96 * found.delays_std_ns[tag]
         if math.isinf(half):

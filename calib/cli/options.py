@@ -21,6 +21,9 @@ def fit_options(
     sequential: bool,
     minimum_norm: bool,
     reference_power_dbm: float | None = None,
+    delays_only: bool = False,
+    delays_from: Path | None = None,
+    constants: str = "tag",
 ) -> FitSettings:
     """Return what the options of a fit mean; raises `BadInputError` for what cannot be read."""
     return {
@@ -32,6 +35,9 @@ def fit_options(
         "sequential": sequential,
         "minimum_norm": minimum_norm,
         "reference_power_dbm": reference_power_dbm,
+        "delays_only": delays_only,
+        "delays_from": delays_from,
+        "constants": constants,
     }
 
 

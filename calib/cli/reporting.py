@@ -12,6 +12,9 @@ import typer
 
 from calib.cli.arguments import (
     AsJson,
+    Constants,
+    DelaysFrom,
+    DelaysOnly,
     Fix,
     Force,
     GroupFile,
@@ -66,6 +69,9 @@ def report(
     trim_static: TrimStatic = False,
     minimum_norm: MinimumNorm = False,
     reference_power: ReferencePower = None,
+    delays_only: DelaysOnly = False,
+    delays_from: DelaysFrom = None,
+    constants: Constants = "tag",
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -85,6 +91,9 @@ def report(
         sequential=sequential,
         minimum_norm=minimum_norm,
         reference_power_dbm=reference_power,
+        delays_only=delays_only,
+        delays_from=delays_from,
+        constants=constants,
     )
     check_places(output, pdf, figures, force=force)
     with Console(file=sys.stderr).status("loading") as status:

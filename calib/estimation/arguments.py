@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Mapping
 from typing import TypedDict
 
 import numpy as np
 
+from calib.calibration.model import Calibration
 from calib.calibration.power_curves import LIFTS
 from calib.errors import BadInputError
 from calib.estimation.losses import LOSSES, MIXTURE, known_losses
+from calib.estimation.unknowns import CONSTANTS
 
 HIGHEST_TAG = 65_535
 
@@ -27,9 +30,12 @@ class FitSettings(TypedDict, total=False):
     sequential: bool
     minimum_norm: bool
     reference_power_dbm: float | None
+    delays_only: bool
+    delays_from: Calibration | str | os.PathLike[str] | None
+    constants: str
 
 
-def check_fit(
+def check_fit(  # noqa: PLR0913 - one a setting of a fit
     *,
     loss: str,
     scale_ns: float | None,
@@ -39,10 +45,12 @@ def check_fit(
     groups: Mapping[str, Iterable[int]],
     sequential: bool,
     reference_power_dbm: float | None = None,
+    constants: str = "tag",
 ) -> None:
     """Raise `BadInputError` that names the parameter of `calib.fit` that cannot be used."""
     check_loss(loss)
     check_choice("lift", lift, LIFTS)
+    check_choice("constants", constants, CONSTANTS)
     if scale_ns is not None and not (_is_finite(scale_ns) and scale_ns > 0):
         raise BadInputError(f"found {scale_ns!r}, expected a positive number of ns", parameter="scale_ns")
     if not _is_finite(alpha_dbm):

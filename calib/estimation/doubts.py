@@ -79,7 +79,10 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
 def _moved(finding: Finding, covariance: Floats) -> float:
     """Return by how many of its standard errors a finding moves some delay."""
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-    moved = float(np.max(np.abs(finding.effect_ns) / std))
+    moved = float(np.max(np.abs(finding.effect_ns) / std, initial=0.0))
+    if not len(std):
+        # Without a delay in the fit the curve takes what an offset does.
+        return abs(finding.offset_m) > SMALLEST_M
     if finding.kind == "time":
         # A delay that was another one for a while is wrong by as much, then or at other times. The printed interval has
         # grown with it already: what does not return looks like an error that lasts.
@@ -89,6 +92,8 @@ def _moved(finding: Finding, covariance: Floats) -> float:
 
 def _of_a_decibel(problem: Problem, found: Solved) -> Floats:
     """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
+    if not problem.unknowns.curve:
+        return np.zeros(len(problem.error))
     mean = np.mean([found.parameters[columns] for _, columns in problem.curves()], axis=0)
     curve = Curve(tuple(problem.knots.tolist()), tuple(mean.tolist()), DEGREE, problem.span)
     return curve(DECIBEL * problem.lifted) - curve(problem.lifted)
@@ -136,6 +141,8 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
     is held against the band that is printed.
     """
     columns = slice(problem.rank, problem.design.shape[1])
+    if not problem.unknowns.curve:
+        return []
     if problem.design.shape[1] != found.scores.design.shape[1] or not np.ptp(problem.ranges.truth_m) > 0:
         return []
     far = problem.ranges.truth_m - np.median(problem.ranges.truth_m)
@@ -151,7 +158,8 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
         return []
     return [
         f"power and distance are confounded: true distances {100 * SCALE:.0f} % off would pass for {1e3 * more:.0f} mm "
-        f"of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while recording"
+        f"of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while recording, or fit with "
+        "`delays_only`"
     ]
 
 

@@ -9,6 +9,7 @@ returned (`calib.estimation.doubts`, `plausibility`).
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib import import_module
@@ -20,19 +21,23 @@ from threadpoolctl import threadpool_limits
 import uwblink
 from calib.calibration.json_format import Matrix
 from calib.calibration.model import Calibration, TagGroup, Uncertainty
+from calib.calibration.pair_offsets import PairOffset
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve
 from calib.calibration.power_curves import lift as lift_power
 from calib.estimation.arguments import check_fit
 from calib.estimation.doubts import doubts
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.error_model import error_model
+from calib.estimation.flat import no_bias, sigma_of
+from calib.estimation.known_delays import imported, std_taken_over, taken_over
+from calib.estimation.limits import limits
 from calib.estimation.losses import MIXTURE
 from calib.estimation.pairs import pairs_of
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.result import FitResult
-from calib.estimation.sigma_curve import fit_sigma
 from calib.estimation.solver import Solved, solve
+from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
 from calib.ranges import Ranges
 from calib.sources import Data, load_ranges
@@ -59,6 +64,9 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     sequential: bool = False,
     minimum_norm: bool = False,
     reference_power_dbm: float | None = None,
+    delays_only: bool = False,
+    delays_from: Calibration | str | os.PathLike[str] | None = None,
+    constants: str = "tag",
 ) -> FitResult:
     """Fit antenna delays and the curves of bias and standard deviation to ranges with known truth.
 
@@ -72,9 +80,15 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     2023, sections III and IV: delays first, then the curve on what they leave. `reference_power_dbm` is the power at
     which the curve is zero, `alpha_dbm` by default (a sequential fit keeps the recipe's own constant, unless one is
     given). `minimum_norm` fits even where the pairs leave delays free, with the smallest ones that agree with the data.
-    Raises `UnanswerableError` when there are too few ranges, their power does not vary, or the pairs do not determine
-    the delays, and `BadInputError` for pinned tags or groups that are not in the data, and for a parameter that cannot
-    be used.
+
+    Not everything can be had from all data, and `warnings` begin with what a fit of the chosen kind cannot know:
+    `delays_only` looks for no curve and needs no power; `delays_from` is a calibration, or its path, whose delays are
+    taken over as they are (with those of all tags, or all `fixed_ns`, only the curve is fitted, and keeps the
+    constant); `constants` "pair" gives each pair a constant of its own instead of each tag a delay. Where power never
+    changes the curve is flat.
+
+    Raises `UnanswerableError` when there are too few ranges or the pairs do not determine the delays, and
+    `BadInputError` for pinned tags or groups that are not in the data, and for a parameter that cannot be used.
 
     >>> import calib
     >>> result = calib.fit(calib.sample_flight())
@@ -82,6 +96,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     >>> f"{delays[2] - delays[1]:.2f} ns, planted 0.40 ns"
     '0.41 ns, planted 0.40 ns'
     """
+    source = imported(delays_from)
     fixed, groups = dict(fixed_ns or {}), dict(groups or {})
     check_fit(
         loss=loss or (SEQUENTIAL_LOSS if sequential else MIXTURE),
@@ -92,10 +107,12 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         groups=groups,
         sequential=sequential,
         reference_power_dbm=reference_power_dbm,
+        constants=constants,
     )
-    fixed = {int(tag): float(delay) for tag, delay in fixed.items()}
+    pinned = {int(tag): float(delay) for tag, delay in fixed.items()}
     groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
-    ranges = load_ranges(data)
+    ranges = load_ranges(data, need_power=not delays_only)
+    fixed = taken_over(source, ranges) | pinned
     refuse_impossible(ranges)
     loss = loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)
     # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
@@ -110,6 +127,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             groups=groups,
             minimum_norm=minimum_norm,
             sequential=sequential,
+            unknowns=Unknowns(curve=not delays_only, constants=constants),
         )
         reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
         found = solve(
@@ -121,10 +139,13 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         )
         doubted = doubts(problem, found)
         calibration = _calibration(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
+        stds = std_taken_over(source, set(fixed) - set(pinned))
+        calibration = replace(calibration, delays_std_ns=calibration.delays_std_ns | stds)
         applied = calibration.apply(ranges)
         residuals = applied.corrected_m - ranges.truth_m
         inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
         warnings = [
+            *limits(ranges, problem, residuals, fixed),
             *_stopped(found),
             *doubted.sentences,
             *one_way(ranges),
@@ -172,7 +193,7 @@ def _stopped(found: Solved) -> list[str]:
 
 def _beyond(reference: float | None, alpha_dbm: float, problem: Problem) -> list[str]:
     """Warn where the reference power is not among those recorded, so that the delays are stated at the nearest."""
-    if reference is None or all(gauge is None for gauge in problem.gauges):
+    if reference is None or not problem.unknowns.curve or all(gauge is None for gauge in problem.gauges):
         return []
     low, high = problem.span
     if low <= _lifted(reference, alpha_dbm) <= high:
@@ -196,14 +217,19 @@ def _calibration(
 ) -> Calibration:
     """Turn stated parameters into a calibration, and draw sigma about the centre of the core of the errors."""
     delays = problem.directions @ found.parameters[: problem.rank]
+    std = _standard_errors(problem, covariance)
+    if problem.unknowns.of_pairs:
+        offsets, tags = _offsets(problem, delays, std), []
+        fixed = dict.fromkeys(problem.ranges.tags(), 0.0) | fixed
+    else:
+        offsets, tags = {}, problem.tags
     biases = _bias_curves(problem, found)
     core = found.residuals
     mixture = fit_error_mixture(core, problem.bins.number, len(problem.bins.count))
-    sigma = fit_sigma(problem, core - mixture.location_m, mixture)
+    sigma = sigma_of(problem, core - mixture.location_m, mixture)
     return Calibration(
-        delays_ns=dict(zip(problem.tags, delays.tolist(), strict=True)) | fixed,
-        delays_std_ns=dict(zip(problem.tags, _standard_errors(problem, covariance), strict=True))
-        | dict.fromkeys(fixed, 0.0),
+        delays_ns=dict(zip(tags, delays.tolist(), strict=not offsets)) | fixed,
+        delays_std_ns=dict(zip(tags, std, strict=not offsets)) | dict.fromkeys(fixed, 0.0),
         loss=loss,
         scale_ns=found.scale / SPEED_OF_LIGHT * 1e9,
         lift=lift,
@@ -212,14 +238,27 @@ def _calibration(
         bias_curve=_average(list(biases.values())),
         sigma_curve=_average(list(sigma.curves.values())),
         uncertainty=Uncertainty(
-            tuple(problem.tags), _rows(covariance), _rows(_bias_covariance(problem, found)), _rows(sigma.covariance)
+            tuple(tags),
+            () if offsets else _rows(covariance),
+            _rows(_bias_covariance(problem, found)),
+            _rows(sigma.covariance),
         ),
+        pair_offsets=offsets,
         groups={name: TagGroup(tuple(tags), biases[name], sigma.curves[name]) for name, tags in groups.items()},
         errors=error_model(problem, found.residuals, found.mixture),
     )
 
 
+def _offsets(problem: Problem, delays: Floats, std: list[float]) -> dict[tuple[int, int], PairOffset]:
+    """Return the constants of pairs: what is added to their ranges, in ns, is what they are too short by."""
+    metres = SPEED_OF_LIGHT * 1e-9
+    values = zip(problem.pairs.ends.tolist(), delays.tolist(), std, strict=True)
+    return {(low, high): PairOffset(-metres * delay, metres * error) for (low, high), delay, error in values}
+
+
 def _bias_curves(problem: Problem, found: Solved) -> dict[str, Curve]:
+    if not problem.unknowns.curve:
+        return no_bias(problem)
     knots = tuple(problem.knots.tolist())
     return {
         name: Curve(knots, tuple(found.parameters[columns].tolist()), DEGREE, problem.span)
@@ -237,6 +276,8 @@ def _standard_errors(problem: Problem, covariance: Floats) -> list[float]:
 def _bias_covariance(problem: Problem, found: Solved) -> Floats:
     """Covariance of the coefficients of the plain curve, which is the groups' average."""
     each = problem.centres.shape[1]
+    if not each:
+        return np.zeros((DEGREE + 1,) * 2)
     average = np.zeros((each, len(found.parameters)))
     for _, columns in problem.curves():
         average[:, columns] = np.eye(each) / len(problem.groups)
@@ -277,6 +318,7 @@ def _provenance(
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,
         "recipe": "sequential" if sequential else "joint",
+        "fitted": problem.unknowns.told(len(problem.tags)),
         "converged": found.success,
         "standard_errors": f"sandwich over {found.lasting.stretches:.0f} independent stretches of time",
         "warnings": warnings,
@@ -286,8 +328,11 @@ def _provenance(
 
 def _gauge(problem: Problem, reference: float | None) -> str:
     """Say which of the delays that fit equally well were chosen."""
+    carrier = "constants of pairs" if problem.unknowns.of_pairs else "delays"
+    if not problem.unknowns.curve:
+        return f"no curve; the {carrier} carry the constant"
     if all(gauge is None for gauge in problem.gauges):
         return "pinned delays; the curve carries the constant"
     if reference is None:
         return "that of the recipe: delays as fitted without a curve, which carries the constant"
-    return f"the bias curve is zero at {reference:g} dBm; the delays carry the constant"
+    return f"the bias curve is zero at {reference:g} dBm; the {carrier} carry the constant"

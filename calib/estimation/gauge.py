@@ -21,6 +21,8 @@ def stating(problem: Problem, reference: float | None) -> Floats:
     coefficients of the curves themselves. Where pinned delays fix a curve's constant it stays as it is.
     """
     found = np.eye(problem.design.shape[1])
+    if not problem.unknowns.curve:
+        return found
     row = None if reference is None else basis(np.array([reference]), problem.knots)[0]
     for (_, columns), centre, gauge in zip(problem.curves(), problem.centres, problem.gauges, strict=True):
         if row is None or gauge is None:

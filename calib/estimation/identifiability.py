@@ -41,7 +41,7 @@ def require_determined(groups: list[list[int]]) -> None:
     raise UnanswerableError(
         f"the pairs do not determine the antenna delays of tags {named}: some can grow as "
         "others shrink without changing any range; record three tags that all range with each other, or pin a known "
-        "delay with `fixed_ns` (`minimum_norm` fits regardless, and says so)",
+        "delay with `fixed_ns` (`minimum_norm` fits regardless, and says so; `constants` pair gives each pair its own)",
         undetermined=groups,
     )
 

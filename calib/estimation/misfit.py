@@ -111,9 +111,9 @@ class Tested:
 def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Family]:
     """Yield the alternatives: offsets of a pair, of a tag for a while or as its power changes, and those of arithmetic.
 
-    `louder_m` (n,) is what a decibel more would do to each range. The last two are an error that grows with the
-    distance, and one of the opposite sign with the other tag initiating, as a clock leaves it whose skew is not
-    corrected.
+    `louder_m` (n,) is what a decibel more would do to each range. Where no curve is fitted, errors of all tags may
+    change with power alike, which is no tag's fault. The last two are an error that grows with the distance, and one of
+    the opposite sign with the other tag initiating, as a clock leaves it whose skew is not corrected.
     """
     tags, truth_m, bins = problem.ranges.tags(), problem.ranges.truth_m, problem.bins
     first, second = places_of(tags, problem.ranges.initiator, problem.ranges.target)
@@ -130,7 +130,8 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
         second=second * count + when,
     )
     rank = np.linspace(-1, 1, len(bins.count))[bins.number]
-    yield Family(kind="power", names=names, weight=rank, place=first, second=second)
+    if problem.unknowns.curve:
+        yield Family(kind="power", names=names, weight=rank, place=first, second=second)
     size = float(np.sqrt(np.mean(louder_m**2)))
     if size > 0:
         yield Family(kind="decibels", names=names, weight=louder_m / size, place=first, second=second)
@@ -294,7 +295,7 @@ def told(finding: Finding) -> str:
     """Return a finding as a sentence."""
     whose = " or ".join(finding.names)
     size = f"{100 * abs(finding.offset_m):.1f} cm"
-    worst = f"delays by up to {1e3 * float(np.max(np.abs(finding.effect_ns))):.0f} ps"
+    worst = f"delays by up to {1e3 * float(np.max(np.abs(finding.effect_ns), initial=0.0)):.0f} ps"
     way = "long" if finding.offset_m > 0 else "short"
     sentences = {
         "pair": f"{whose}: ranges read {size} too {way} for the other pairs, which moves {worst}; record it anew",

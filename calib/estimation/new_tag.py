@@ -36,7 +36,9 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     """
     check_tag(tag)
     check_choice("loss", loss, LOSSES)
-    ranges = load_ranges(data)
+    if calibration.pair_offsets:
+        raise BadInputError("has constants of pairs, which say nothing of a tag; fit anew", parameter="calibration")
+    ranges = load_ranges(data, need_power=calibration.needs_power)
     if tag in calibration.delays_ns:
         raise BadInputError(f"tag {tag} has a delay in the calibration already; fit anew to change it", parameter="tag")
     if tag not in ranges.tags():

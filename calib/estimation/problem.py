@@ -22,8 +22,10 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.identifiability import identifiable_directions, require_determined
 from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.robust import design
+from calib.estimation.unknowns import Unknowns
 from calib.ranges import Ranges
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.ticks import SPEED_OF_LIGHT
 
 FEWEST: Final = 100
 SPANNED: Final = 1e-4
@@ -32,6 +34,9 @@ SPANNED: Final = 1e-4
 SEGMENTS_A_FOLD: Final = 4.5
 SEGMENTS: Final = (10, 28)
 """Pieces of a bias curve: so many where lifted power grows e-fold, and bounds of their number."""
+
+SAME_POWER: Final = 1e-6
+"""Lifted powers that differ by no more are one."""
 
 ROWS_AT_ONCE: Final = 4096
 
@@ -47,6 +52,9 @@ class Problem:
     in a range, None for all of it. What pinned tags add is in `error` already. `bins` hold the rows of the whole
     problem, `span` is the range of power with data. Rows are in order of time. `free` are the groups of tags that
     nothing determines.
+
+    `unknowns` say what is looked for. Without a curve there are no splines, and `powered` (n,) says which ranges have a
+    power. Where constants belong to pairs, `tags` are the numbers of `pairs` instead.
     """
 
     ranges: Ranges
@@ -64,6 +72,8 @@ class Problem:
     groups: tuple[str, ...]
     shares: list[Floats | None]
     free: list[list[int]]
+    unknowns: Unknowns
+    powered: Bools
 
     def share(self, group: int) -> Floats:
         """Return how much of a group's curve is in each range (n,): a half for each end."""
@@ -77,14 +87,16 @@ class Problem:
 
     def sample(self, rows: Ints) -> Problem:
         """Return the problem of some rows only."""
-        chosen = ("error", "design", "lifted")
+        chosen = ("error", "design", "lifted", "powered")
         pairs = replace(self.pairs, number=self.pairs.number[rows])
         return replace(
             self, ranges=self.ranges[rows], pairs=pairs, **{name: getattr(self, name)[rows] for name in chosen}
         )
 
     def penalties(self) -> list[Floats]:
-        """Return the roughness of each group's curve as a matrix over all parameters."""
+        """Return the roughness of each group's curve as a matrix over all parameters; none where none is fitted."""
+        if not self.unknowns.curve:
+            return []
         rough, found = curvature(self.knots), []
         for _, columns in self.curves():
             penalty = np.zeros((self.design.shape[1],) * 2)
@@ -108,10 +120,12 @@ def build_problem(
     groups: Mapping[str, tuple[int, ...]],
     minimum_norm: bool,
     sequential: bool = False,
+    unknowns: Unknowns | None = None,
 ) -> Problem:
     """Put a fit into columns; raises what `calib.estimation.fitting.fit` raises.
 
-    In a `sequential` one the curves keep their constants, and ranges of all powers stay, for the delays.
+    In a `sequential` one the curves keep their constants, and ranges of all powers stay, for the delays; so do they
+    without a curve. Where power never changes no curve is looked for.
     """
     if len(ranges) < FEWEST:
         raise UnanswerableError(
@@ -120,29 +134,35 @@ def build_problem(
     if np.any(np.diff(ranges.time_ns) < 0):
         ranges = ranges[np.argsort(ranges.time_ns, kind="stable")]
     lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
+    powered = np.isfinite(lifted)
+    # What has no power stands at the middle of the others, where it bends nothing.
+    lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
     low, high = populated(np.sort(lifted))
-    if not high - low > 1e-6:
-        raise UnanswerableError(
-            f"{ranges.source}: the first-path power never changes, so no curve over power can be fitted"
-        )
+    unknowns = (unknowns or Unknowns()).at_powers(varied=high - low > SAME_POWER)
     # Beyond the populated powers a curve is held constant: what it is there is not for these ranges to say.
-    if not sequential:
+    if not sequential and unknowns.curve:
         inside = (lifted >= low) & (lifted <= high)
-        ranges, lifted = ranges[inside], lifted[inside]
+        ranges, lifted, powered = ranges[inside], lifted[inside], powered[inside]
     ordered = np.sort(lifted)
     everyone = ranges.tags()
-    tags = _free_tags(everyone, fixed)
     shares = _shares(ranges, groups, everyone)
     matrix = design(ranges, everyone)
-    unpinned = np.array([tag not in fixed for tag in everyone])
-    directions, free = identifiable_directions(matrix[:, unpinned], tags, ranges.initiator, ranges.target)
+    _known_tags(everyone, fixed)
+    pinned = np.array([tag in fixed or unknowns.of_pairs for tag in everyone])
+    known = matrix[:, pinned] @ np.array([fixed.get(tag, 0.0) for tag in np.array(everyone)[pinned].tolist()])
+    tags: list[int] = np.array(everyone)[~pinned].tolist()
+    pairs = pairs_of(ranges.initiator, ranges.target, everyone)
+    apart = _by_pairs(pairs) if unknowns.of_pairs else matrix[:, ~pinned]
+    directions, free = np.eye(apart.shape[1]), list[list[int]]()
+    if unknowns.of_pairs:
+        tags = list(range(len(pairs.ends)))
+    elif tags:
+        directions, free = identifiable_directions(apart, tags, ranges.initiator, ranges.target)
+    delays = apart @ directions
+    _something_left(unknowns, tags)
     if not minimum_norm:
         require_determined(free)
-    known = matrix[:, ~unpinned] @ np.array([fixed[tag] for tag in everyone if tag in fixed])
-    knots = _knots(ordered, low, high)
-    # The integral of a B-spline is its coefficients times a quarter of each one's span.
-    averages = (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (high - low)
-    delays = matrix[:, unpinned] @ directions
+    knots, averages = _splines(ordered, (low, high), unknowns)
     gauges = tuple(_making_up(delays, share) for share in shares)
     centred = [gauge is not None and not sequential for gauge in gauges]
     centres = np.outer(np.array(centred, dtype=float), averages)
@@ -153,7 +173,7 @@ def build_problem(
         error=ranges.raw_m - ranges.truth_m + known,
         design=_columns(delays, lifted, knots, centres, shares),
         lifted=lifted,
-        pairs=pairs_of(ranges.initiator, ranges.target, everyone),
+        pairs=pairs,
         bins=_bins(lifted, ordered),
         span=(low, high),
         knots=knots,
@@ -162,6 +182,8 @@ def build_problem(
         groups=tuple(groups) or ("",),
         shares=shares,
         free=free,
+        unknowns=unknowns,
+        powered=powered,
     )
 
 
@@ -191,24 +213,45 @@ def _bins(lifted: Floats, ordered: Floats) -> Bins:
     return Bins(number, ordered[(edges[1:] + edges[:-1]) // 2], counts)
 
 
+def _splines(ordered: Floats, span: tuple[float, float], unknowns: Unknowns) -> tuple[Floats, Floats]:
+    """Return the knots of curves and each spline's average over their span; none where no curve is fitted."""
+    if not unknowns.curve:
+        return np.zeros(0), np.zeros(0)
+    knots = _knots(ordered, *span)
+    # The integral of a B-spline is its coefficients times a quarter of each one's span.
+    return knots, (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (span[1] - span[0])
+
+
+def _by_pairs(pairs: Pairs) -> Floats:
+    """Return the derivative of ranges by a constant in ns of each pair (n, pairs)."""
+    matrix = np.zeros((len(pairs.number), len(pairs.ends)))
+    matrix[np.arange(len(matrix)), pairs.number] = SPEED_OF_LIGHT * 1e-9
+    return matrix
+
+
 def _making_up(delays: Floats, share: Floats | None) -> Floats | None:
     """Return the parameters that make up for a constant in a curve with a `share` in ranges (n,), None if none do."""
+    if not delays.shape[1]:
+        return None
     aim = np.ones(len(delays)) if share is None else share
     pull = delays.T @ aim
     found = np.linalg.lstsq(delays.T @ delays, pull, rcond=1e-12)[0]
     return np.asarray(found) if float(aim @ aim - pull @ found) < SPANNED * float(aim @ aim) else None
 
 
-def _free_tags(everyone: list[int], fixed: Mapping[int, float]) -> list[int]:
+def _known_tags(everyone: list[int], fixed: Mapping[int, float]) -> None:
     unknown = sorted(set(fixed) - set(everyone))
     if unknown:
         raise BadInputError(
             f"found tag {unknown[0]}, the tags are {', '.join(map(str, everyone))}", parameter="fixed_ns"
         )
-    tags = [tag for tag in everyone if tag not in fixed]
-    if not tags:
-        raise BadInputError("every tag is pinned, so no delay is left to fit", parameter="fixed_ns")
-    return tags
+
+
+def _something_left(unknowns: Unknowns, tags: list[int]) -> None:
+    if not tags and not unknowns.curve:
+        raise BadInputError(
+            "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
+        )
 
 
 def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]], everyone: list[int]) -> list[Floats | None]:
@@ -230,6 +273,8 @@ def _columns(delays: Floats, lifted: Floats, knots: Floats, centres: Floats, sha
     rank, each = delays.shape[1], centres.shape[1]
     columns = np.empty((len(lifted), rank + each * len(shares)))
     columns[:, :rank] = delays
+    if not each:
+        return columns
     for begin in range(0, len(lifted), ROWS_AT_ONCE):
         rows = slice(begin, begin + ROWS_AT_ONCE)
         splines = basis(lifted[rows], knots)

@@ -81,6 +81,8 @@ def robust_fit(
     `near` says that `start` is so near the optimum that Newton's steps may begin at
     once.
     """
+    if not matrix.shape[1]:
+        return Solution(np.zeros(0), np.zeros((0, 0)), error.copy(), scale or scale_of(error), 0, True)
     ridge = np.zeros((matrix.shape[1],) * 2) if penalty is None else penalty
     x = start if start is not None else _absolute_start(matrix, error, ridge)
     function = LOSSES[loss]

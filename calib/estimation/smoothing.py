@@ -30,8 +30,10 @@ HOLD: Final = 1e-9
 def reml_penalty(near: QuadraticModel, x: Floats, penalties: list[Floats]) -> tuple[Floats, Floats]:
     """Return the weighted sum of `penalties` (m, m) that the data ask for, plus the hold, and the optimum under it.
 
-    `near` is the loss near parameters x (m,).
+    `near` is the loss near parameters x (m,). Without penalties there is nothing to weigh, and x is left as it is.
     """
+    if not penalties:
+        return np.zeros((len(x),) * 2), x
     hold = HOLD * float(np.trace(near.curvature)) / len(x) * np.any(np.sum(penalties, axis=0) != 0, axis=1)
     aim = near.curvature @ x + near.pull
     ranks = [int(np.linalg.matrix_rank(penalty)) for penalty in penalties]

@@ -60,7 +60,8 @@ def solve(
     the loss, unless given, comes from the residuals of that start, the smoothness of the curves from the data. Delays
     are stated for curves that are zero at the lifted power `reference`.
     """
-    if sequential:
+    # Without a curve, or without a delay, there is nothing to come after the other.
+    if sequential and 0 < problem.rank < problem.design.shape[1]:
         return _one_after_the_other(problem, loss, scale_m, reference)
     robust = "cauchy" if loss == MIXTURE else loss
     start, steps = _pilot(problem, robust, scale_m)

@@ -22,11 +22,6 @@ def warnings_of(ranges: Ranges, applied: CorrectedRanges, inliers: float, free: 
         found.append(
             f"the data leave the delays of tags {groups} free; those written are the smallest that agree with the data"
         )
-    if np.any(ranges.protocol == "ss"):
-        found.append(
-            "single-sided ranges: uncorrected clock skew looks like an antenna delay; "
-            "'calib doctor' says whether it is there"
-        )
     everything = len(ranges) + sum(ranges.excluded.values())
     for reason, count in ranges.excluded.items():
         if reason != STATIC and count > MANY_MISSING * everything:

@@ -149,7 +149,7 @@ def localize(
     """
     require_calibration(calibration)
     chosen = settings or Settings()
-    flight = data if isinstance(data, Flight) else load_flight(data)
+    flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
     fixed = fixed_std(calibration, chosen, training)
     applied = calibration.apply(flight.ranges)
     found = []

@@ -137,7 +137,7 @@ def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluatio
     '4.0 cm raw, 3.0 cm corrected'
     """
     require_calibration(calibration)
-    ranges = load_ranges(data)
+    ranges = load_ranges(data, need_power=calibration.needs_power)
     applied = calibration.apply(ranges)
     everything = np.ones(len(ranges), dtype=bool)
     inside = _between_quantiles(ranges, applied, calibration)

@@ -148,7 +148,9 @@ def run_campaign(
     recordings = each(training)
     judged = each(tests) if tests else []
     progress("loading")
-    fitted, testing = load_each(recordings, trim_static=trim_static), load_each(judged) if judged else []
+    need_power = not settings.get("delays_only", False)
+    fitted = load_each(recordings, trim_static=trim_static, need_power=need_power)
+    testing = load_each(judged, need_power=need_power) if judged else []
     progress("fitting")
     found = fit(concatenate(fitted), **settings)
     refits = _refits(concatenate(fitted), found.calibration, settings)

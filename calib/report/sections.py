@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from calib.calibration.display import pair_rows as offset_rows
 from calib.calibration.model import Calibration, CorrectedRanges
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.passive_listeners import OverheardDelay
@@ -100,6 +101,8 @@ def delays(
             row += [f"{heard[tag].delay_ns:+.4f}", f"{heard[tag].std_ns:.4f}"] if tag in heard else ["", ""]
         rows.append(row)
     shift = planted.shift_ns if planted else 0.0
+    if calibration.pair_offsets:
+        return [Table(["pair", "ranges too long by (cm)", "95 %"], [list(row) for row in offset_rows(calibration)])]
     blocks: list[Block] = [
         Table(header, rows),
         Picture(

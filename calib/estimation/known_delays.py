@@ -1,0 +1,35 @@
+"""Delays that a fit takes over from a calibration, as they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+from calib.calibration.model import Calibration, load_calibration, require_calibration
+from calib.errors import BadInputError
+from calib.ranges import Ranges
+
+
+def imported(delays_from: Calibration | str | os.PathLike[str] | None) -> Calibration | None:
+    """Return the calibration whose delays are taken over."""
+    if delays_from is None:
+        return None
+    known = load_calibration(delays_from) if isinstance(delays_from, str | os.PathLike) else delays_from
+    require_calibration(known, "delays_from")
+    return known
+
+
+def taken_over(known: Calibration | None, ranges: Ranges) -> dict[int, float]:
+    """Return the delays that a calibration has for tags of these ranges; raises `BadInputError` where it has none."""
+    if known is None:
+        return {}
+    found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
+    if not found:
+        there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))
+        raise BadInputError(f"its tags are {there}, those of the ranges {here}", parameter="delays_from")
+    return found
+
+
+def std_taken_over(known: Calibration | None, tags: Iterable[int]) -> dict[int, float]:
+    """Return the standard errors that a calibration has for delays that were taken over from it."""
+    return {} if known is None else {tag: known.delays_std_ns.get(tag, 0.0) for tag in tags}

@@ -1,0 +1,53 @@
+"""A table of ranges with power and places, no stamps, robots and anchors: import, curve, localization, by commands."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
+
+BIN = Path(sys.executable).parent
+
+
+def run(*words):
+    done = subprocess.run([str(BIN / words[0]), *map(str, words[1:])], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("ranges")
+    write(place / "ranges.csv", Plan(bias=bias_m))
+    run("uwblink", "import", "csv", place / "ranges.csv", "-o", place / "ranges.uwb")
+    return place
+
+
+def test_import_curve_localization(folder):
+    done = run("calib", "fit", folder / "ranges.uwb", "-o", folder / "c.json")
+    assert "ranges without stamps" in done.stderr
+    written = json.loads((folder / "c.json").read_text())
+    middle = sum(written["delays_ns"][str(tag)] - delay for tag, delay in DELAYS_NS.items()) / len(DELAYS_NS)
+    for tag, delay in DELAYS_NS.items():
+        # Delays are stated for a curve that is zero at -82 dBm, so all are moved alike.
+        assert written["delays_ns"][str(tag)] - middle == pytest.approx(delay, abs=0.05)
+    assert any("ranges without stamps" in warning for warning in written["provenance"]["warnings"])
+    assert "ranges without stamps" in run("calib", "show", folder / "c.json").stdout
+    run("calib", "localize", folder / "ranges.uwb", "-c", folder / "c.json")
+    judged = json.loads(run("calib", "evaluate", folder / "ranges.uwb", "-c", folder / "c.json", "--json").stdout)
+    # The planted noise is 4 cm.
+    assert judged["overall"]["full"]["robust_std_m"] == pytest.approx(0.041, abs=0.004)
+
+
+def test_constants_of_pairs_by_commands(folder):
+    done = run("calib", "fit", folder / "ranges.uwb", "-o", folder / "p.json", "--constants", "pair", "--delays-only")
+    assert "pair   1  11" in done.stdout
+    assert "delays only" in done.stderr
+    assert "constants of 12 pairs" in run("calib", "show", folder / "p.json").stdout
+    run("calib", "fit", folder / "ranges.uwb", "-o", folder / "q.json", "--delays-from", folder / "c.json")
+    shown = run("calib", "show", folder / "q.json").stdout
+    assert "fitted: curve only" in shown
+    assert "warning: curve only" in shown

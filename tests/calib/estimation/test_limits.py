@@ -1,0 +1,185 @@
+"""Fits for what people have: each finds what was planted, and says what it cannot know."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import calib
+from calib.errors import BadInputError, UnanswerableError
+from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, pair_constant_m, rows
+
+NS_M = 0.299702547
+
+
+def ranges(plan, *, power=True):
+    table = np.array(list(rows(plan)), dtype=float)
+    dbm = table[:, 4] if power else np.full(len(table), math.nan)
+    return calib.Ranges.from_arrays(
+        table[:, 3], initiator=table[:, 1].astype(int), target=table[:, 2].astype(int), fpp1_dbm=dbm, fpp2_dbm=dbm,
+        truth_m=np.linalg.norm(table[:, 5:8] - table[:, 8:], axis=1), time_ns=(table[:, 0] * 1e9).astype(int),
+    )  # fmt: skip
+
+
+def told(result, fragment):
+    (found,) = [text for text in result.warnings if fragment in text]
+    return found
+
+
+def near_planted(calibration, *, but=0.0):
+    # 500 ranges a tag at 4 cm leave 12 ps of a delay, and the intervals are held elsewhere: four of those.
+    errors = {tag: calibration.delays_ns[tag] - DELAYS_NS[tag] - but for tag in calibration.delays_ns}
+    assert max(map(abs, errors.values())) < 0.05, errors
+
+
+def test_delays_alone_need_no_power():
+    known = ranges(Plan(), power=False)
+    with pytest.raises(UnanswerableError, match="no power; `delays_only` needs none"):
+        calib.fit(known)
+    result = calib.fit(known, delays_only=True)
+    near_planted(result.calibration)
+    assert result.calibration.bias_curve.flat
+    assert not result.calibration.needs_power
+    assert "how ranges change with power cannot be seen" in told(result, "delays only")
+    # And its calibration corrects ranges without a power, in columns and one by one, with a sigma.
+    one = result.calibration.correct(3.0, math.nan, math.nan, 1, 2)
+    expected = 3.0 + NS_M * (result.calibration.delays_ns[1] + result.calibration.delays_ns[2]) / 2
+    assert one.range_m == pytest.approx(expected)
+    assert one.sigma_m == pytest.approx(0.04, rel=0.1)
+    assert not one.clamped
+    both = result.calibration.correct(np.array([3.0]), math.nan, math.nan, 1, 2)
+    assert both.range_m[0] == pytest.approx(one.range_m)
+    assert both.sigma_m[0] == pytest.approx(one.sigma_m)
+    assert np.std(result.residuals_m[result.inliers]) < 0.045
+
+
+@pytest.mark.parametrize("settings", [{}, {"loss": "cauchy"}, {"sequential": True}])
+def test_delays_alone_say_how_much_power_would_have_changed(settings):
+    result = calib.fit(ranges(Plan(bias=bias_m)), delays_only=True, **settings)
+    reach = bias_m(-94.35) - bias_m(-82.65)
+    said = told(result, "delays only")
+    # The curve's reach between the powers that 5 % and 95 % stay below, within the scatter of medians of a bin.
+    assert float(said.split("here ")[1].split(" cm")[0]) == pytest.approx(100 * reach, abs=1.6)
+    middle = float(np.mean([bias_m(p) for p in np.linspace(-95, -82, 200)]))
+    near_planted(result.calibration, but=-middle / NS_M)
+
+
+def test_the_curve_alone_carries_the_constant():
+    given = {tag: delay + 0.1 for tag, delay in DELAYS_NS.items()}
+    result = calib.fit(ranges(Plan(count=6000, bias=bias_m)), fixed_ns=given)
+    found = result.calibration
+    assert found.delays_ns == given
+    assert set(found.delays_std_ns.values()) == {0.0}
+    power = np.array([-93.0, -90.0, -88.0, -86.0])
+    wanted = [bias_m(p) + 0.1 * NS_M for p in power]
+    np.testing.assert_allclose(found.bias_curve(10 ** ((power + 82) / 10)), wanted, atol=0.008)
+    assert "in common that is wrong is in the curve" in told(result, "curve only")
+    assert calib.Calibration.from_json(found.to_json()) == found
+
+
+def test_delays_are_taken_over_from_a_calibration(tmp_path):
+    first = calib.fit(ranges(Plan(), power=False), delays_only=True)
+    first.save(tmp_path / "first.json")
+    again = ranges(Plan(seed=2, bias=bias_m))
+    from_file = calib.fit(again, delays_from=tmp_path / "first.json").calibration
+    assert from_file.delays_ns == first.calibration.delays_ns
+    assert from_file.delays_std_ns == first.calibration.delays_std_ns
+    two = replace(first.calibration, delays_ns={1: -0.35, 2: 0.12})
+    some = calib.fit(again, delays_from=two, fixed_ns={2: 0.2}).calibration
+    assert (some.delays_ns[1], some.delays_ns[2]) == (-0.35, 0.2)
+    assert some.delays_std_ns[2] == 0
+    assert some.delays_std_ns[11] > 0
+    with pytest.raises(BadInputError, match="its tags are 77"):
+        calib.fit(again, delays_from=replace(two, delays_ns={77: 0.0}))
+    with pytest.raises(BadInputError, match="nothing is left to fit"):
+        calib.fit(again, delays_from=first.calibration, delays_only=True)
+
+
+def test_pairs_have_constants_of_their_own_where_delays_cannot_explain_them():
+    plan = Plan(count=6000, pair_m={(1, 11): 0.3, (2, 3): -0.1})
+    result = calib.fit(ranges(plan), constants="pair", delays_only=True)
+    found = result.calibration
+    for (a, b), one in found.pair_offsets.items():
+        wanted = pair_constant_m(a, b) + plan.pair_m.get((a, b), 0.0)
+        # 500 ranges a pair at 4 cm: 1.8 mm of standard error; the tail of reflections doubles it.
+        assert one.offset_m == pytest.approx(wanted, abs=0.012)
+        assert 0.001 < one.std_m < 0.008
+    assert len(found.pair_offsets) == 12
+    assert "antenna delays stay unknown" in told(result, "constants of 12 pairs")
+    assert calib.Calibration.from_json(found.to_json()) == found
+    assert '"schema_version": 4' in found.to_json()
+    assert abs(np.median(result.residuals_m)) < 0.005
+    with pytest.raises(BadInputError, match="no constant for pair 11-12"):
+        found.correct(3.0, -85.0, -85.0, 12, 11)
+    with pytest.raises(BadInputError, match="no constant for pair 11-12"):
+        found.correct(np.array([3.0]), -85.0, -85.0, 12, 11)
+    assert found.correct(3.0, -85.0, -85.0, 11, 1).range_m == pytest.approx(3 - found.pair_offsets[1, 11].offset_m)
+    with pytest.raises(BadInputError, match="no place for constants of pairs"):
+        calib.export(found, "c-header")
+
+
+def test_pairs_are_fitted_where_they_do_not_determine_delays():
+    plan = Plan(robots=(1,))
+    with pytest.raises(UnanswerableError, match="do not determine"):
+        calib.fit(ranges(plan))
+    found = calib.fit(ranges(plan), constants="pair").calibration
+    assert sorted(found.pair_offsets) == [(1, 11), (1, 12), (1, 13)]
+
+
+def test_one_power_makes_a_flat_curve_and_says_so():
+    result = calib.fit(ranges(Plan(bias=bias_m, power_dbm=lambda _: -91.0)))
+    near_planted(result.calibration, but=-bias_m(-91.0) / NS_M)
+    assert result.calibration.bias_curve.flat
+    assert "never changes (-91.0 dBm): the curve is flat" in told(result, "never changes")
+
+
+def test_real_ranges_whose_power_follows_their_distance(tmp_path):
+    """Two boards on tripods, 2 to 60 m apart: no delays, no curve to trust, and it is said; one constant can be had."""
+    from tests.shared_data import ROOT, shared
+    from uwblink.importers import import_recording
+
+    table = shared("hanyang_sstwr.csv.gz")
+    import_recording(table, tmp_path / "h.uwb", map_file=ROOT / "docs" / "maps" / "hanyang.toml")
+    known = calib.load_ranges(tmp_path / "h.uwb")
+    with pytest.raises(UnanswerableError, match="do not determine"):
+        calib.fit(known)
+    curved = calib.fit(known, constants="pair")
+    assert 0.7 < float(told(curved, "belongs to distance").split()[2]) / 100 < 0.85
+    result = calib.fit(known, constants="pair", delays_only=True)
+    assert "without carrier readings" in told(result, "single-sided")
+    ((pair, one),) = result.calibration.pair_offsets.items()
+    # The mode of the errors, from a histogram of 5 cm.
+    counts, edges = np.histogram(known.raw_m - known.truth_m, np.arange(-1, 3, 0.05))
+    assert pair == (1, 12)
+    assert one.offset_m == pytest.approx(edges[np.argmax(counts)] + 0.025, abs=0.15)
+
+
+def test_constants_belong_to_tags_or_pairs():
+    with pytest.raises(BadInputError, match="tag, pair"):
+        calib.fit(ranges(Plan(count=300)), constants="board")
+
+
+def test_skew_of_single_sided_ranges_is_bounded_by_their_reply():
+    from uwblink.twr import Exchanges
+
+    count = 400
+    ids = np.tile([[1, 2], [2, 3], [3, 1]], (count, 1))[:count]
+    reply = 19_200_000  # ticks of 15.65 ps: 300.5 us
+    base: Any = {"tx1": np.zeros(count, int), "rx1": 5, "tx2": 5 + reply, "rx2": reply + 1300 + np.arange(count) % 7}
+    powers: Any = {
+        "fpp1_dbm": np.linspace(-95, -82, count),
+        "fpp2_dbm": -85.0,
+        "truth_m": 3.0 + np.arange(count) % 5 * 0.01,
+    }
+    plain = Exchanges.from_arrays(ids[:, 0], ids[:, 1], **base, **powers, time_ns=np.arange(count) * 10**7)
+    left = calib.load_ranges(plain).left_skew
+    # c/2 x 40 ppm x 300.5 us, by hand.
+    assert left.bound_m == pytest.approx(0.5 * 299_702_547 * 40e-6 * 300.5e-6, rel=1e-3)
+    assert math.isnan(left.told_m)
+    assert "1.8 m (c/2 x 40 ppm x 300 us of reply)" in told(calib.fit(plain, delays_only=True), "without carrier")
+    read = replace(plain, skew2_ppm=np.full(count, 2.0))
+    assert calib.load_ranges(read).left_skew.told_m == pytest.approx(0.5 * 299_702_547 * 2e-6 * 300.5e-6, rel=1e-3)
+    assert "read as protocol ss-cfo" in told(calib.fit(read, delays_only=True), "clock skew in them")
+    assert calib.load_ranges(replace(read, protocol=np.full(count, "ss-cfo"))).left_skew is None
