@@ -67,6 +67,9 @@ bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 bench-stream: setup ## measure how late streamed ranges are (15 s)
 	$(BIN)/python -m benchmarks.streaming
 
+bench-import: setup ## measure how long tables and poses take to come in (2 minutes, 1 GB)
+	$(BIN)/python -m benchmarks.importing
+
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy
 

@@ -122,19 +122,21 @@ def _from_stamps(
         if not rows.has(name):
             raise missing(rows, name)
     scale = rows.column_map.ticks_per_unit
-    ticks = {name: rows.cells[name] * scale for name in stamps_of(chosen)}
+    ticks = {name: rows.cells[name] if scale == 1.0 else rows.cells[name] * scale for name in stamps_of(chosen)}
     bits, counter = how_counted(ticks, rows.column_map.bits, rows.column_map.counter)
     good = _ends(rows, bad) & _time(rows, bad)
     for name, column in ticks.items():
         good &= _stamp(rows, name, column, bits, counter, bad, good)
     _half(source, bad, total)
-    rows = take(rows, np.flatnonzero(good))
+    del ticks
+    rows = rows if good.all() else take(rows, np.flatnonzero(good))
     if counter != "wrapped":
         notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
     reading = _reading(rows, Reading(chosen, bits), stated, notes)
     exchanges = _exchanges(rows, reading)
     reported = _optional(rows, "range_m")
-    exchanges.range_m[:] = np.where(np.isfinite(reported), reported, raw_range(exchanges))
+    known = np.isfinite(reported)
+    exchanges.range_m[:] = reported if known.all() else np.where(known, reported, raw_range(exchanges))
     return exchanges, rows
 
 
@@ -262,7 +264,10 @@ def _half(source: Rows, bad: list[Bad], total: int) -> None:
 
 def _optional(rows: Rows, name: str) -> Floats:
     column = rows.cells.get(name)
-    return np.full(len(rows), np.nan) if column is None else np.where(np.isfinite(column), column, np.nan)
+    if column is None:
+        return np.full(len(rows), np.nan)
+    finite = np.isfinite(column)
+    return column if finite.all() else np.where(finite, column, np.nan)
 
 
 def _truth(rows: Rows) -> Floats:

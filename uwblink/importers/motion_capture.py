@@ -81,6 +81,8 @@ def add_poses(
 
 def _joined(parts: list[Poses]) -> Poses:
     """Return poses in order of time; those that stand still are given the time of the first that do not."""
+    if len(parts) == 1:
+        return parts[0]
     first = min((int(part.time_ns.min()) for part in parts if len(part) > 1), default=0)
     times = [part.time_ns if len(part) > 1 else np.full(len(part), first) for part in parts]
     order = np.argsort(np.concatenate(times), kind="stable")

@@ -17,10 +17,10 @@ import numpy as np
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.pose_bags import Row, read_bag
+from uwblink.importers.pose_columns import LATEST_NS, NUMBERS, poses_of_lines, poses_of_table
 from uwblink.recording.schema import Poses
 
-NUMBERS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
-LATEST_NS: Final = 2**62
+Reader = Callable[[Path, str | None], Iterable[Row]]
 
 
 def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | None = None) -> Poses:
@@ -38,10 +38,26 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
         )
     if topics and reader is not _bag:
         raise ImportTableError(f"{path}: has no topics; only bags have")
-    poses = _as_poses(path, read_bag(path, topics) if topics else reader(path, body))
+    poses = None if topics else _at_once(path, reader, body)
+    if poses is None:
+        poses = _as_poses(path, read_bag(path, topics) if topics else reader(path, body))
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
     return poses
+
+
+def _at_once(path: Path, reader: Reader, body: str | None) -> Poses | None:
+    """Return the poses of a file in which every cell is as it should be; None for all others, and for bags."""
+    if reader is _bag:
+        return None
+    if reader is _csv and not _is_euroc(path):
+        return poses_of_table(path, body)
+    return None if body is None else poses_of_lines(path, body, euroc=reader is _csv)
+
+
+def _is_euroc(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.readline().removeprefix(b"\xef\xbb\xbf").lower().startswith(EUROC.encode())
 
 
 EUROC: Final = "#timestamp"
@@ -109,7 +125,7 @@ def _bag(path: Path, _body: str | None) -> Iterable[Row]:
     return read_bag(path)
 
 
-_READERS: Final[dict[str, Callable[[Path, str | None], Iterable[Row]]]] = {
+_READERS: Final[dict[str, Reader]] = {
     "csv": _csv,
     "tum": _tum,
     "txt": _tum,

@@ -18,12 +18,16 @@ MANY: Final = 0.01
 """Share of rows beyond a counter's width from which on they are how the counter is written, not faults."""
 
 ENOUGH_ROWS: Final = 20
+STAMP_UNIT_TICKS: Final = 1.0
+"""Ticks in the unit of stamps that are ticks; these are whole numbers, and each is taken as it is."""
 
 
 def whole(values: Floats) -> Ints:
     """Return numbers rounded to whole ones, `NEVER` where there is none."""
     with np.errstate(invalid="ignore"):
         good = np.abs(values) < 2.0**62
+    if good.all():
+        return np.rint(values).astype(np.int64)
     return np.where(good, np.rint(np.where(good, values, 0.0)), NEVER).astype(np.int64)
 
 
@@ -49,6 +53,11 @@ def to_ticks(
     """
     found: dict[str, Ints] = {}
     mask = np.int64((1 << bits) - 1)
+    if ticks_per_unit == STAMP_UNIT_TICKS:
+        for name in (name for names in by_clock for name in names):
+            ticks = whole(cells[name])
+            found[name] = np.where(ticks == NEVER, NEVER, ticks & mask)
+        return found
     for first, *others in by_clock:
         start = cells[first]
         ticks = whole(start * ticks_per_unit)
@@ -66,12 +75,13 @@ def how_counted(ticks: Mapping[str, Floats], bits: int | None, counter: str | No
     Numbers that fit 32 bits are taken for 32, larger ones for 40, and those that fit neither for unwrapped; negative
     ones for signed where they fit. Less than `MANY` of the rows do not count: they are faults.
     """
-    joined = np.concatenate([column[np.isfinite(column)] for column in ticks.values()])
-    if len(joined) < ENOUGH_ROWS:
+    count = sum(np.count_nonzero(np.isfinite(column)) for column in ticks.values())
+    if count < ENOUGH_ROWS:
         return bits or 32, counter or "wrapped"
 
     def fit(low: float, high: float) -> bool:
-        return float(np.mean((joined < low) | (joined >= high))) <= MANY
+        inside = sum(np.count_nonzero((column >= low) & (column < high)) for column in ticks.values())
+        return bool(count - inside <= MANY * count)
 
     for width in (bits,) if bits else (32, 40):
         if counter in (None, "wrapped") and fit(0, 2.0**width):

@@ -94,7 +94,7 @@ class Table:
         cells = [(name, self._number(self._place(name))) for name in wanted]
         cells += [(name, self._word(self._place(name))) for name in texts]
         found = self._read(cells)
-        columns = [np.ma.filled(column.astype(np.float64), np.nan) for column in found[: len(wanted)]]
+        columns = [np.ma.filled(column.astype(np.float64, copy=False), np.nan) for column in found[: len(wanted)]]
         text = [np.ma.filled(column, "").astype(np.str_) for column in found[len(wanted) :]]
         return dict(zip(wanted, columns, strict=True)), dict(zip(texts, text, strict=True))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,8 +118,8 @@ def read_rows(paths: Sequence[Path], column_map: ColumnMap) -> Rows:
             raise ImportTableError(f"{part.path}: has other columns than {first.path}, so they are not one table")
     if not sum(part.count for part in parts):
         raise ImportTableError(f"{first.path}: a header and no rows")
-    cells = {name: np.concatenate([part.cells[name] for part in parts]) for name in first.cells}
-    words = {name: np.concatenate([part.words[name] for part in parts]) for name in first.words}
+    cells = {name: _joined([part.cells[name] for part in parts]) for name in first.cells}
+    words = {name: _joined([part.words[name] for part in parts]) for name in first.words}
     ids, names = _numbered(paths[0], column_map, cells, words)
     times = [part.time_ns for part in parts if part.time_ns is not None]
     return Rows(
@@ -127,13 +127,18 @@ def read_rows(paths: Sequence[Path], column_map: ColumnMap) -> Rows:
         column_map=column_map,
         cells={name: column for name, column in cells.items() if name not in IDS},
         ids=ids,
-        time_ns=np.concatenate(times) if times else None,
+        time_ns=_joined(times) if times else None,
         file=np.repeat(np.arange(len(parts)), [part.count for part in parts]),
         row=np.concatenate([np.arange(part.count) for part in parts]),
         origin=np.arange(sum(part.count for part in parts)),
         names=names,
         too_long={k: part.too_long for k, part in enumerate(parts) if part.too_long},
     )
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Return arrays as one, without a copy of one alone."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 @dataclass(frozen=True, slots=True)

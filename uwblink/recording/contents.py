@@ -21,6 +21,8 @@ from uwblink.twr import Exchanges
 
 Pairs = Iterable[tuple[int, int]]
 LONGEST_S: Final = 2**62 * 1e-9
+ROWS_AT_A_TIME: Final = 500_000
+"""Exchanges that are written at once: DuckDB holds what it has not committed in memory."""
 
 
 def _no_poses() -> Poses:
@@ -95,7 +97,8 @@ class Contents:
         with Recording.create(path, meta=meta, force=force) as recording:
             recording.append_tags(self.tags)
             recording.append_poses(self.poses)
-            recording.append_exchanges(self.exchanges)
+            for start in range(0, len(self.exchanges), ROWS_AT_A_TIME):
+                recording.append_exchanges(self.exchanges[start : start + ROWS_AT_A_TIME])
             for table in _COLUMNS:
                 recording.append_columns(table, getattr(self, table))
             recording.append_cirs(self.cirs)

@@ -9,7 +9,7 @@ import pytest
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.motion_capture import add_poses
-from uwblink.importers.poses import read_poses
+from uwblink.importers.poses import _READERS, _as_poses, _at_once, read_poses
 from uwblink.recording.file import Recording
 from uwbsim.boards.live_poses import LivePoses
 from uwbsim.scenario.loading import load
@@ -31,8 +31,37 @@ def test_csv_and_tum_say_the_same(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "head", "line"),
+    [
+        ("a.csv", HEADER, "{s},b{k},{p},{q}"),
+        ("a.csv", "note,body,time_ns,qw,qz,qy,qx,z,y,x\n", 'a "b",é,{ns},{r},{p}'),
+        ("a.tum", "# time x y z qx qy qz qw\n", "{s} {p} {q}"),
+        ("a.csv", "#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, v_x\n", "{ns},{p},{r},7"),
+    ],
+)
+def test_the_quick_way_and_the_careful_one_read_the_same(tmp_path, name, head, line):
+    random = np.random.default_rng(2)
+    rows = []
+    for k in random.permutation(50).tolist():
+        turned = random.normal(size=4)
+        numbers = [f"{v:.7g}" for v in [*random.normal(size=3), *turned / np.linalg.norm(turned)]]
+        mark = " " if name.endswith("tum") else ","
+        p, q, r = (mark.join(part) for part in (numbers[:3], numbers[3:], [numbers[6], *numbers[3:6]]))
+        time_ns = SHIFT_NS + k * 10_000_001
+        rows.append(line.format(s=f"{time_ns // 10**9}.{time_ns % 10**9:09d}", ns=time_ns, k=k % 3, p=p, q=q, r=r))
+    (tmp_path / name).write_text(head + "\n".join(rows) + "\n")
+    body = None if "{k}" in line or "é" in line else "drone"
+    quick = _at_once(tmp_path / name, _READERS[name[2:]], body)
+    careful = _as_poses(tmp_path / name, _READERS[name[2:]](tmp_path / name, body))
+    assert quick is not None
+    for column in ("time_ns", "body", "position_m", "quaternion"):
+        np.testing.assert_array_equal(getattr(quick, column), getattr(careful, column))
+
+
+@pytest.mark.parametrize(
     ("name", "text", "fragment"),
     [
+        ("a.csv", HEADER + "0,b,1,2,3,0,0,0,1\n0,,1,2,3,0,0,0,1\n", "row 3: column 'body' is empty"),
         ("a.csv", HEADER + "0,b,1,2,x,0,0,0,1\n", "row 2: column 'z': found 'x'"),
         ("a.csv", HEADER + "0,b,1,2,nan,0,0,0,1\n", "row 2: column 'z'"),
         ("a.csv", HEADER.replace("body,", "") + "0,1,2,3,0,0,0,1\n", "column 'body' is missing"),

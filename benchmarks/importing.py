@@ -1,0 +1,64 @@
+"""How long tables and poses take to come in, beside what DuckDB alone takes to parse the table.
+
+`python -m benchmarks.importing [ROWS]`: processor time and largest memory, each in a process of its own.
+"""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROWS = 3_800_000
+POSES = 864_000
+FEW = 40_000
+
+TABLE = """
+import duckdb, sys
+duckdb.connect().execute(f'''COPY (SELECT 10 + i * 0.001 AS time_s, 1 + i % 3 AS from_id, 1 + (i + 1) % 3 AS to_id,
+    a AS tx1, (b + 600) % 4294967296 AS rx1, (b + 30000600) % 4294967296 AS tx2, (a + 30001200) % 4294967296 AS rx2,
+    (b + 115000600) % 4294967296 AS tx3, (a + 115001200) % 4294967296 AS rx3, round(-80 - 20 * random(), 4) AS fpp1,
+    round(-80 - 20 * random(), 4) AS fpp2, round(random(), 4) AS skew1, round(random(), 4) AS skew2,
+    round(2.8 + random() / 100, 4) AS range_m, 2.8 AS gt_range_m
+    FROM (SELECT i, (random() * 4294967295)::BIGINT AS a, (random() * 4294967295)::BIGINT AS b
+    FROM range({sys.argv[1]}) t(i)))
+    TO 'table.csv' (HEADER)''')
+"""
+POSE_TABLE = """
+import duckdb, sys
+duckdb.connect().execute(f'''COPY (SELECT 10 + (i // 6) * 0.01 AS time_s, 'tag' || (1 + i % 3) AS body, random() AS x,
+    random() AS y, random() AS z, 0.0 AS qx, 0.6 AS qy, 0.0 AS qz, 0.8 AS qw FROM range({sys.argv[1]}) t(i))
+    TO 'poses.csv' (HEADER)''')
+"""
+PARSE = "import duckdb\nduckdb.connect().execute('SELECT * FROM read_csv(?)', ['table.csv']).fetchnumpy()"
+IMPORT = "import uwblink\nuwblink.import_recording('table.csv', 'table.uwb', force=True)"
+ADD = (
+    "from pathlib import Path\nfrom uwblink.importers import add_poses\nadd_poses(Path('table.uwb'), Path('poses.csv'))"
+)
+MEASURE = """
+import resource
+used = resource.getrusage(resource.RUSAGE_SELF)
+print(f"\\n{used.ru_utime + used.ru_stime:7.2f} s {used.ru_maxrss / 1024:7.0f} MB")
+"""
+
+
+def main(rows: int = ROWS) -> int:
+    """Print a line a task."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, code, argument in (
+            ("", TABLE, rows),
+            ("", POSE_TABLE, POSES),
+            (f"DuckDB's parse of {rows} rows", PARSE + MEASURE, 0),
+            (f"import of {rows} rows", IMPORT + MEASURE, 0),
+            ("", TABLE, FEW),
+            ("", IMPORT, 0),
+            (f"{POSES} poses into {FEW} exchanges", ADD + MEASURE, 0),
+        ):
+            words = [sys.executable, "-c", code, str(argument)]
+            done = subprocess.run(words, cwd=Path(folder), check=True, capture_output=True, text=True)
+            if name:
+                print(f"{name:40s}{done.stdout.splitlines()[-1]}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else ROWS))
