@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from uwblink.cli.shared import interrupts
+from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
     from uwblink import RangingPlan, StreamedRange
@@ -36,6 +36,10 @@ def stream(
     foxglove: Annotated[
         str | None, typer.Option(help="\\[HOST:]PORT to serve a WebSocket for Foxglove at (its own: 8765).")
     ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Recording of the boards to write as well (.uwb).")
+    ] = None,
+    force: Force = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print no ranges.")] = False,
 ) -> None:
     """Print ranges as they come, a line of JSON each, corrected where a calibration is given, and send them on."""
@@ -46,14 +50,18 @@ def stream(
     with ExitStack() as stack:
         stop = stack.enter_context(interrupts())
         senders += _senders(stack, udp, foxglove)
-        ranges = _begin(source, calibration, _plan(source, plan, rate), duration, speed, stop, seen)
-        stack.callback(ranges.close)
-        count = _hand_on(ranges, senders)
+        chosen = _plan(source, plan, rate, output)
+        if output and chosen:
+            count = _record(source, output, chosen, calibration, duration, stop, [seen], senders, force=force)
+        else:
+            ranges = _begin(source, calibration, chosen, duration, speed, stop, seen)
+            stack.callback(ranges.close)
+            count = _hand_on(ranges, senders)
     faults = ", ".join(f"{kind} {number}" for kind, number in sorted(seen.faults.items()))
     typer.echo(f"{count} ranges" + (f"; faults: {faults}" if faults else ""), err=True)
 
 
-def _plan(source: list[str], path: Path | None, rate: float | None) -> RangingPlan | None:
+def _plan(source: list[str], path: Path | None, rate: float | None, output: Path | None) -> RangingPlan | None:
     from dataclasses import replace
 
     from uwblink import RangingPlan
@@ -61,8 +69,8 @@ def _plan(source: list[str], path: Path | None, rate: float | None) -> RangingPl
     from uwblink.errors import PlanError
 
     if _is_recording(source):
-        if path or rate:
-            raise PlanError(f"{source[0]}: a recording is streamed as it is; --plan and --rate are for boards")
+        if path or rate or output:
+            raise PlanError(f"{source[0]}: it is streamed as it is; --plan, --rate and --output are for boards")
         return None
     chosen = load_plan(path) if path else RangingPlan()
     return replace(chosen, rate_hz=rate) if rate else chosen
@@ -106,6 +114,43 @@ def _senders(stack: ExitStack, udp: str | None, foxglove: str | None) -> Iterato
         yield server.send
 
 
+def _record(
+    ports: list[str],
+    output: Path,
+    plan: RangingPlan,
+    calibration: Path | None,
+    duration: float | None,
+    stop: Callable[[], bool],
+    listeners: list[Any],
+    senders: list[Callable[[StreamedRange], object]],
+    *,
+    force: bool,
+) -> int:
+    """Record boards and send their ranges on; returns how many. What was recorded is kept, whoever goes away."""
+    import uwblink
+    from uwblink.streaming import RangeListener
+
+    count = 0
+
+    def send_on(found: StreamedRange) -> None:
+        nonlocal count
+        count += 1
+        for send in senders:
+            send(found)
+
+    told = [*listeners, RangeListener(send_on, calibration)]
+    try:
+        uwblink.record(ports, output, plan, duration_s=duration or math.inf, stop=stop, listeners=told, force=force)
+    except BrokenPipeError:
+        _nobody_reads()
+    return count
+
+
+def _nobody_reads() -> None:
+    """Have Python not try to write what is left when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _hand_on(ranges: Iterator[StreamedRange], senders: list[Callable[[StreamedRange], object]]) -> int:
     """Send all ranges on; returns how many. Whoever reads the lines may go away: that ends the stream."""
     count = 0
@@ -114,8 +159,7 @@ def _hand_on(ranges: Iterator[StreamedRange], senders: list[Callable[[StreamedRa
             for send in senders:
                 send(found)
     except BrokenPipeError:
-        # So that Python does not try to write what is left when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _nobody_reads()
     return count
 
 

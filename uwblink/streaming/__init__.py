@@ -7,11 +7,12 @@ from uwblink.lazy import offer
 if TYPE_CHECKING:
     from uwblink.streaming.foxglove_server import FoxgloveServer
     from uwblink.streaming.ranges import StreamedRange
-    from uwblink.streaming.sources import stream
+    from uwblink.streaming.sources import RangeListener, stream
     from uwblink.streaming.udp import UdpSender
 
 __all__ = [
     "FoxgloveServer",
+    "RangeListener",
     "StreamedRange",
     "UdpSender",
     "stream",
@@ -19,6 +20,7 @@ __all__ = [
 
 _HOMES: Final = {
     "FoxgloveServer": "uwblink.streaming.foxglove_server",
+    "RangeListener": "uwblink.streaming.sources",
     "StreamedRange": "uwblink.streaming.ranges",
     "UdpSender": "uwblink.streaming.udp",
     "stream": "uwblink.streaming.sources",

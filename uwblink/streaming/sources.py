@@ -70,8 +70,7 @@ def stream(
     """
     _positive("duration_s", duration_s)
     _positive("speed", speed)
-    path = calibration if callable(calibration) or calibration is None else Path(calibration)
-    correct = load_correction(path) if isinstance(path, Path) else path
+    correct = _correction(calibration)
     if isinstance(source, str | os.PathLike):
         return _play(_exchanges(Path(source), correct), correct, duration_s, speed, stop)
     chosen, told, ports = plan or RangingPlan(), as_listeners(listeners), using or SerialPorts()
@@ -84,42 +83,74 @@ def stream(
     return _live(begin, correct, duration_s, stop)
 
 
+def _correction(calibration: str | os.PathLike[str] | Correction | None) -> Correction | None:
+    return load_correction(Path(calibration)) if isinstance(calibration, str | os.PathLike) else calibration
+
+
 def _positive(name: str, value: float) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
         raise ArgumentError(f"found {value!r:.40}, expected a number above 0", parameter=name)
 
 
-class _Ranges(Listener):
-    """Collects the ranges of turns, with the times that a recording gives them: those of their polls."""
+class RangeListener(Listener):
+    """A listener of a recorder that calls a function with each range: to record and stream at once.
 
-    def __init__(self, correct: Correction | None) -> None:
-        self._correct = correct
+    >>> import uwblink, uwbsim
+    >>> from uwblink.streaming import RangeListener
+    >>> ports = uwbsim.VirtualPorts(
+    ...     uwbsim.load(
+    ...         '''
+    ...         run = { duration_s = 10.0 }
+    ...         ranging = { rate_hz = 50 }
+    ...         bodies = [
+    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
+    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
+    ...         ]
+    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
+    ...         '''
+    ...     )
+    ... )
+    >>> ranges = []
+    >>> plan, told = uwblink.RangingPlan(rate_hz=20.0), [RangeListener(ranges.append)]
+    >>> done = uwblink.record(ports.names.values(), "f.uwb", plan, duration_s=1.0, using=ports, listeners=told)
+    >>> len(ranges) == done.exchanges
+    True
+    """
+
+    def __init__(
+        self,
+        callback: Callable[[StreamedRange], object],
+        calibration: str | os.PathLike[str] | Correction | None = None,
+    ) -> None:
+        """Call `callback` in the recorder's own loop, so it must be quick; raises what `load_correction` raises."""
+        self._callback, self._correct = callback, _correction(calibration)
         self._came_ns: dict[int, int] = {}
-        self.found: deque[StreamedRange] = deque()
 
     def on_message(self, heard: Heard) -> None:
+        """Note when a report came."""
         if isinstance(heard.message, RangeReport):
             self._came_ns[heard.board] = heard.time_ns
 
     def on_turn(self, turn: Turn) -> None:
+        """Call the function with the range of a turn, whose time is that of its poll, as in recordings."""
         if turn.report is not None:
             initiator = turn.pair[0]
             came_ns = self._came_ns.get(initiator, turn.time_ns)
             (time_ns,) = exchanges_of([(came_ns, initiator, turn.report)]).time_ns.tolist()
-            self.found.append(streamed(time_ns, initiator, turn.report, self._correct))
+            self._callback(streamed(time_ns, initiator, turn.report, self._correct))
 
 
 def _live(
     begin: Callable[[Listener], Recorder], correct: Correction | None, duration_s: float, stop: Callable[[], bool]
 ) -> Stream:
-    ranges = _Ranges(correct)
-    recorder = begin(ranges)
+    found: deque[StreamedRange] = deque()
+    recorder = begin(RangeListener(found.append, correct))
     try:
         for _ in recorder.steps(duration_s, stop):
-            while ranges.found:
-                yield ranges.found.popleft()
+            while found:
+                yield found.popleft()
         recorder.finish()
-        yield from ranges.found
+        yield from found
     finally:
         recorder.close()
 

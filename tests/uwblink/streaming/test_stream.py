@@ -1,5 +1,6 @@
 """Streams: what comes out of boards and recordings, in virtual time and in this one."""
 
+import doctest
 import json
 import math
 import subprocess
@@ -14,6 +15,7 @@ import uwblink
 from tests.boards import bench_scenario, served
 from uwblink.boards import Progress
 from uwblink.errors import ArgumentError, PlanError, PortError
+from uwblink.streaming import RangeListener
 from uwbsim.boards.virtual_port import VirtualPorts
 
 BIN = Path(sys.executable).parent
@@ -145,6 +147,7 @@ def test_mistakes_are_one_line(tmp_path):
         (["--udp", "no.such.host.invalid:9870"], "no such host"),
         (["--foxglove", "x:y"], "--foxglove"),
         (["--rate", "5"], "for boards"),
+        (["-o", tmp_path / "g.uwb"], "for boards"),
     ):
         done = run("stream", tmp_path / "f.uwb", *words)
         assert (done.returncode, done.stdout) == (2, "")
@@ -153,11 +156,33 @@ def test_mistakes_are_one_line(tmp_path):
         assert named in done.stderr
 
 
-def test_boards_are_streamed_by_the_command_until_the_time_is_over():
+def test_boards_are_streamed_and_recorded_by_the_command_until_the_time_is_over(tmp_path):
     with served() as server:
-        done = run("stream", *server.names.values(), "--rate", "50", "--duration", "1")
+        out = tmp_path / "f.uwb"
+        done = run("stream", *server.names.values(), "--rate", "50", "--duration", "1", "-o", out)
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(rows) > 10
     assert {(row["initiator"], row["target"]) for row in rows} == {(1, 2), (1, 3), (2, 3)}
     assert f"{len(rows)} ranges" in done.stderr
+    recorded = uwblink.load(out).exchanges
+    assert [row["time_ns"] for row in rows] == recorded.time_ns.tolist()
+    assert [row["range_m"] for row in rows] == recorded.range_m.tolist()
+
+
+def test_ranges_are_called_back_while_boards_are_recorded(tmp_path):
+    found: list[uwblink.StreamedRange] = []
+    expected = flight(tmp_path / "f.uwb", listeners=[RangeListener(found.append, lambda *_: {"corrected_m": 7.0})])
+    assert [one.time_ns for one in found] == expected.time_ns.tolist()
+    assert {one.corrected_m for one in found} == {7.0}
+    with pytest.raises(PlanError, match=r"none\.json"):
+        RangeListener(print, tmp_path / "none.json")
+
+
+def test_the_example_of_the_listener_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runner = doctest.DocTestRunner(verbose=False)
+    for example in doctest.DocTestFinder().find(RangeListener, "RangeListener", globs={}):
+        runner.run(example)
+    assert runner.failures == 0
+    assert (tmp_path / "f.uwb").exists()
