@@ -31,7 +31,7 @@ def test_the_script_simulates_fits_corrects_and_judges(tmp_path):
     assert (tmp_path / "bias.png").stat().st_size > 5000
     assert (tmp_path / "calibration.json").exists()
     one = re.search(rf"3.21 m corrected: {NUMBER} m, standard deviation {NUMBER} m", done.stdout)
-    (first, *_) = re.search(r"^\[(\S+) (\S+) (\S+)\]$", done.stdout, flags=re.MULTILINE).groups()
+    (first, *_) = re.search(r"^\[ *(\S+) +(\S+) +(\S+) *\]$", done.stdout, flags=re.MULTILINE).groups()
     # The first of the array has the same range, and both powers where the one has its first: some millimetres apart.
     assert abs(float(first) - float(one[1])) < 0.03
     assert 0.03 < float(one[2]) < 0.15
