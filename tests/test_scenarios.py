@@ -18,7 +18,19 @@ def test_the_scenarios_that_the_readme_promises_are_there():
     expected |= {"anchors_and_tag/anchors_and_tag.toml", "anchors_and_tag/bipartite.toml", "new_tag/new_tag.toml"}
     expected |= {"day30/train.toml", "collisions/aloha.toml", "nlos_office/office.toml", "wrap/wrap.toml"}
     expected |= {"two_boards_on_a_bench/bench.toml", "lasting_reflections/hall.toml"}
+    expected |= {
+        "warm_up/warm_up.toml",
+        "bench/bench.toml",
+        *(f"mounted_differently/{n}.toml" for n in ("before", "after")),
+    }
     assert expected <= names
+
+
+@pytest.mark.parametrize("name", ["warm_up", "bench", "mounted_differently", "lasting_reflections"])
+def test_scenarios_that_bite_say_what_they_test(name):
+    for path in (ROOT / "scenarios" / name).glob("*.toml"):
+        head = "".join(line[2:] for line in path.read_text().splitlines(keepends=True) if line.startswith("# "))
+        assert "Tests " in head, path
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda p: p.relative_to(ROOT).as_posix())
