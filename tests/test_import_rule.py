@@ -46,7 +46,7 @@ FLOORS = {
         ("output", "scenario", "tables"),
         ("world",),
         ("simulation",),
-        ("boards", "protocols"),
+        ("boards", "protocols", "twins"),
         ("pages", "sweep"),
         ("cli",),
     ),

@@ -2,7 +2,7 @@
 
 >>> import uwbsim
 >>> uwbsim.__all__[-3:]
-['show', 'simulate', 'through_wire']
+['simulate', 'through_wire', 'twin']
 """
 
 from typing import TYPE_CHECKING, Final
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from uwbsim.simulation.through_wire import through_wire
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
+    from uwbsim.twins.fitting import Twin, twin
     from uwbsim.world.channel import register_channel_effect
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "Server",
     "Simulated",
     "State",
+    "Twin",
     "UwbsimError",
     "VirtualPorts",
     "compare",
@@ -50,6 +52,7 @@ __all__ = [
     "show",
     "simulate",
     "through_wire",
+    "twin",
 ]
 
 _HOMES: Final = {
@@ -61,6 +64,7 @@ _HOMES: Final = {
     "Server": "uwbsim.boards.server",
     "Simulated": "uwbsim.simulation.run",
     "State": "uwbsim.protocols.single_state",
+    "Twin": "uwbsim.twins.fitting",
     "UwbsimError": "uwbsim.errors",
     "VirtualPorts": "uwbsim.boards.virtual_port",
     "compare": "uwbsim.protocols.comparison",
@@ -75,6 +79,7 @@ _HOMES: Final = {
     "show": "uwbsim.pages.scenario_page",
     "simulate": "uwbsim.simulation.run",
     "through_wire": "uwbsim.simulation.through_wire",
+    "twin": "uwbsim.twins.fitting",
 }
 
 if not TYPE_CHECKING:

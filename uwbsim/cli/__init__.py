@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Final, NoReturn
 
 from uwblink.cli import shared
-from uwbsim.cli import flights, workbench
+from uwbsim.cli import flights, twins, workbench
 from uwbsim.errors import UwbsimError
 
 app = shared.new_app("Simulate tags that range with ultra-wideband radios.")
-for room in (flights, workbench):
+for room in (flights, workbench, twins):
     room.add_to(app)
 
 FLAGS: Final = {"count": "-n/--ranges", "overhead_s": "--overhead-us", "overrides": "--set", "evaluate": "evaluate"}

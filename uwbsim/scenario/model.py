@@ -28,8 +28,8 @@ MEDIAN_REPLY_S: Final = 305e-6
 
 PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
 
-PATTERN_SIZES: Final = (0, 3, 8, 15, 24)
-"""How many spherical harmonics there are up to a degree, without the one that is the same everywhere."""
+PATTERN_SIZES: Final = (0, 1, 4, 9, 16, 25)
+"""How many spherical harmonics there are up to a degree."""
 
 UUS_S: Final = 512 / 499.2e6
 WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
@@ -188,8 +188,8 @@ class Tag(Section):
     much faster it runs at first, by a transient that decays by e in every `warm_up_s`. A `passive` tag records
     the exchanges that it overhears. `tx_power_db` is how much stronger than others it sends, `power_offset_db` how much
     too high it reads powers. `pattern_db` is what its own antenna adds to `radio.antenna` by direction in its body's
-    frame: coefficients of real spherical harmonics of degree 1, 2 and so on, whose root mean square over all directions
-    is one (m from -l to l; 3, 8, 15 or 24 of them).
+    frame: coefficients of real spherical harmonics of degree 0, 1 and so on, whose root mean square over all directions
+    is one (m from -l to l; 1, 4, 9, 16 or 25 of them).
     `temperature_c` and `supply_v` are its own, or those of its body; what they do to it is in `Devices`, and
     `range_mm_per_k`, `range_cm_per_v`, `skew_ppm_per_k` take the place of what is said there.
     """

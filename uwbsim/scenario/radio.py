@@ -155,11 +155,20 @@ class Fading(Section):
     """Power that comes and goes with the place, alike in both directions of a pair of tags.
 
     At random instants, `life_s` apart on average, it is drawn anew, with the standard deviation `std_db`; so its
-    autocorrelation is exp(-dt/life).
+    autocorrelation is exp(-dt/life). With `levels_db` it has these quantiles instead, from 0 to 1 in equal steps.
     """
 
-    std_db: NotNegative
+    std_db: NotNegative = 0.0
+    levels_db: tuple[float, ...] = ()
     life_s: Annotated[float, Field(ge=0.01)] = 0.5
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.levels_db) == 1 or list(self.levels_db) != sorted(self.levels_db):
+            raise ValueError("levels_db: give two or more, which do not decrease")
+        if self.levels_db and self.std_db:
+            raise ValueError("levels_db: give either levels_db or std_db")
+        return self
 
 
 class Outages(Section):

@@ -13,6 +13,7 @@ import numpy as np
 from uwblink.arrays import Floats, Ints
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.radio import Fading
 
 MARGIN_S: Final = 60.0
 """So long after the end of a run links are still asked for at most; later on the last level lasts."""
@@ -69,8 +70,7 @@ class PairLevels:
         """Draw fading and outages over a run; None where the scenario asks for neither."""
         fading, outages, parts = scenario.radio.fading, scenario.radio.outages, []
         if fading is not None:
-            std = fading.std_db
-            parts.append(Redrawn.of(scenario, "fading", fading.life_s, lambda rng, n: std * rng.standard_normal(n)))
+            parts.append(Redrawn.of(scenario, "fading", fading.life_s, _fades(fading)))
         if outages is not None:
             share = outages.share
             out = Redrawn.of(
@@ -82,6 +82,13 @@ class PairLevels:
     def at_db(self, places: tuple[Ints, Ints], time_s: Floats) -> Floats:
         """Return what is added to powers between tags at places (n,) at true times (n,), in dB."""
         return np.asarray(sum(part.at_db(places, time_s) for part in self.parts))
+
+
+def _fades(fading: Fading) -> Levels:
+    if not fading.levels_db:
+        return lambda rng, n: fading.std_db * rng.standard_normal(n)
+    at = np.linspace(0, 1, len(fading.levels_db))
+    return lambda rng, n: np.interp(rng.random(n), at, fading.levels_db)
 
 
 def _instants(rng: np.random.Generator, life_s: float, span_s: float) -> Floats:

@@ -12,7 +12,7 @@ from uwblink.arrays import Floats
 
 
 def harmonics(direction: Floats, degree: int) -> Floats:
-    """Return the real spherical harmonics of degree 1 to `degree` at unit vectors (n, 3), (n, (degree + 1)^2 - 1).
+    """Return the real spherical harmonics of degree 0 to `degree` at unit vectors (n, 3), (n, (degree + 1)^2).
 
     In order of degree l, and in each of m from -l to l: the sine of azimuth for negative ones. Their root mean square
     over all directions is one.
@@ -20,7 +20,7 @@ def harmonics(direction: Floats, degree: int) -> Floats:
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     height = np.clip(direction[:, 2], -1, 1)
     columns = []
-    for l in range(1, degree + 1):  # noqa: E741 - the letter that everybody writes
+    for l in range(degree + 1):  # noqa: E741 - the letter that everybody writes
         for m in range(-l, l + 1):
             scale = sqrt((2 * l + 1) * factorial(l - abs(m)) / factorial(l + abs(m)) * (2 if m else 1))
             # lpmv has the sign of Condon and Shortley, which is taken out again.
@@ -31,4 +31,4 @@ def harmonics(direction: Floats, degree: int) -> Floats:
 
 def pattern_gain_db(coefficients: Sequence[float], direction: Floats) -> Floats:
     """Return the gain in dB that coefficients stand for at unit vectors (n, 3) in the body's frame, (n,)."""
-    return np.asarray(harmonics(direction, isqrt(len(coefficients) + 1) - 1) @ np.array(coefficients))
+    return np.asarray(harmonics(direction, isqrt(len(coefficients)) - 1) @ np.array(coefficients))

@@ -52,19 +52,19 @@ def test_outages_lose_a_share_of_exchanges_in_bursts_and_change_no_power():
 
 
 def test_a_tag_has_an_antenna_of_its_own():
-    coefficients = (0.0, 0.0, 2.0)  # along x, by sqrt(3) times the cosine
+    coefficients = (0.5, 0.0, 0.0, 2.0)  # everywhere, and along x by sqrt(3) times the cosine
     x = flight({}, {"pattern_db": coefficients}, duration_s=0.1).exchanges
     bare = flight({}, duration_s=0.1).exchanges
     # From the second tag the first is in the direction (-0.6, -0.8, 0).
-    assert x.fpp1_dbm - bare.fpp1_dbm == pytest.approx(-0.6 * 2 * np.sqrt(3))
-    assert x.fpp2_dbm - bare.fpp2_dbm == pytest.approx(-0.6 * 2 * np.sqrt(3))
+    assert x.fpp1_dbm - bare.fpp1_dbm == pytest.approx(0.5 - 0.6 * 2 * np.sqrt(3))
+    assert x.fpp2_dbm - bare.fpp2_dbm == pytest.approx(0.5 - 0.6 * 2 * np.sqrt(3))
 
 
 def test_a_pattern_of_another_size_is_refused():
     with pytest.raises(
-        uwbsim.ScenarioError, match=r"tags\[1\].pattern_db: found 4 coefficients, expected 3, 8, 15, 24"
+        uwbsim.ScenarioError, match=r"tags\[1\].pattern_db: found 5 coefficients, expected 1, 4, 9, 16, 25"
     ):
-        flight({}, {"pattern_db": [1.0] * 4})
+        flight({}, {"pattern_db": [1.0] * 5})
 
 
 def test_replies_follow_the_quantiles_that_are_given():

@@ -1,0 +1,142 @@
+"""A twin of a simulated recording finds what was planted, can be saved, and refuses what has none."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import uwbsim
+from tests.uwbsim.twins.worlds import known, world
+from uwblink import Poses, UwblinkError, load
+from uwbsim.cli import app
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return uwbsim.simulate(world(), contention=False)
+
+
+@pytest.fixture(scope="module")
+def found(flight):
+    return uwbsim.twin(flight, known(world()))
+
+
+def centred(values):
+    return np.asarray(values) - np.mean(values)
+
+
+def test_rates_and_noises_are_found(found):
+    """2250 ratios with 0.12 ppm each tell a rate to some 4e-3 ppm, and noise to 1.5 %."""
+    planted = [tag["skew_ppm"] for tag in world()["tags"]]
+    assert centred([tag.skew_ppm for tag in found.scenario.tags]) == pytest.approx(centred(planted), abs=0.01)
+    # Whole ticks add their twelfth to the noise of stamps.
+    assert found.found["receive_noise_ps"] == pytest.approx(np.hypot(95.0, 15.65 / np.sqrt(12)), rel=0.05)
+    assert found.found["carrier_noise_ppm"] == pytest.approx(0.2, rel=0.05)
+    assert found.found["carrier_bias_ppm"] == pytest.approx(-0.13, abs=0.01)
+
+
+def test_reflections_are_found(found):
+    """Three pairs that are drawn anew every 0.25 s, 720 times in all, with a share of 0.2: 1.5 points of chance."""
+    assert found.found["reflected_share"] == pytest.approx(0.2, abs=0.03)
+    assert found.found["reflection_life_s"] == pytest.approx(0.25, rel=0.2)
+    assert found.found["mean_excess_m"] == pytest.approx(0.45, rel=0.2)
+    assert found.found["reflection_loss_db"] == pytest.approx(6.0, abs=0.5)
+
+
+def test_powers_are_found(found):
+    assert found.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.1)
+    assert found.found["fading_db"] < 0.3
+    assert [tag.tx_power_db for tag in found.scenario.tags] == pytest.approx([0.0] * 3, abs=0.3)
+
+
+def test_the_schedule_is_found(found):
+    ranging = found.scenario.ranging
+    assert ranging.plan == "round-robin"
+    assert ranging.rate_hz == pytest.approx(150.0, rel=1e-3)
+    assert ranging.response_delay_uus == 1500
+    assert list(ranging.pairs) == [(11, 12), (11, 13), (12, 13)]
+
+
+def test_a_saved_twin_flies_the_same_ways(found, flight, tmp_path):
+    found.save(tmp_path / "t.toml")
+    again = uwbsim.simulate(tmp_path / "t.toml", contention=False)
+    assert len(again.exchanges) == len(flight.exchanges)
+    # Poses of a motion capture at 100 Hz lie 1.5 cm apart; between them a cubic is followed.
+    assert np.max(np.abs(again.truth_m - flight.truth_m)) < 1e-3
+    with pytest.raises(UwblinkError, match="exists already"):
+        found.save(tmp_path / "t.toml")
+
+
+def test_a_twin_of_a_twin_is_alike(found):
+    compared = {one.name: one for one in found.compare(1)}
+    assert compared["sum of both carrier readings"].alike
+    assert compared["residual of calibrated ranges"].alike
+    assert compared["reply dt32"].to_dict()["probability"] > 0.01
+
+
+def test_the_command_writes_a_scenario_and_a_page(tmp_path):
+    uwbsim.simulate(world(4.0), contention=False).save(tmp_path / "f.uwb")
+    (tmp_path / "c.json").write_text(json.dumps(known(world())))
+    command = ["twin", str(tmp_path / "f.uwb"), "-c", str(tmp_path / "c.json"), "-o", str(tmp_path / "t.toml")]
+    done = CliRunner().invoke(app, [*command, "--seeds", "1"])
+    assert done.exit_code == 0, done.output
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html", "t.poses.uwb", "t.toml"]
+    page = (tmp_path / "t.html").read_text()
+    assert "What the recording cannot tell" in page
+    assert "residual of calibrated ranges" in page
+    assert uwbsim.load(tmp_path / "t.toml").run.name == "twin of f"
+
+
+WRONG = {
+    "poses": (lambda f: replace(f, poses=Poses.from_arrays([], "", (0.0, 0.0, 0.0))), "holds no poses"),
+    "powers": (
+        lambda f: replace(f, exchanges=replace(f.exchanges, fpp1_dbm=np.full(len(f.exchanges), np.nan))),
+        "no exchange has both first-path powers",
+    ),
+    "length": (lambda f: replace(f, exchanges=f.exchanges[:99]), "99 exchanges, a twin needs 100 or more"),
+    "tags": (lambda f: replace(f, tags=f.tags[:2]), "on which body tag 13 sits"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_recordings_without_a_twin(flight, what):
+    change, message = WRONG[what]
+    with pytest.raises(uwbsim.ScenarioError, match=message):
+        uwbsim.twin(change(flight), known(world()))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"delays_ns": {"11": 0.0}}, "calibration: no delay for tag 12, 13 of the recording; it knows 11"),
+        ({"delays_ns": {"x": 0.0}}, "calibration: delays_ns: found .*, expected a table with tag ids as keys"),
+        ({"delays_ns": {"11": None}}, "calibration: delays_ns: 11: found None, expected a finite number"),
+        ({"schema_version": 2}, "calibration: groups: its tags have curves by group"),
+        ({"schema_version": 9}, "calibration: schema version 9, this uwbcal reads 1 and 3"),
+        ({"schema_version": None}, "calibration: not a calibration"),
+        ({"lift": "none"}, "calibration: lift: found 'none', allowed: mean-of-lifted, lift-of-mean"),
+        ({"alpha_dbm": "x"}, "calibration: alpha_dbm: found 'x', expected a finite number"),
+        ({"speed_of_light": 1.0}, "calibration: speed_of_light: found 1"),
+        (
+            {"bias_curve": {"knots": [0, 1], "coefficients": [0], "degree": 3}},
+            "calibration: bias_curve: knots: found 2",
+        ),
+    ],
+)
+def test_calibrations_that_are_none(flight, change, message):
+    with pytest.raises(uwbsim.ScenarioError, match=message):
+        uwbsim.twin(flight, known(world()) | change)
+
+
+def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
+    flight.save(tmp_path / "f.uwb")
+    (tmp_path / "c.json").write_text("{}")
+    (tmp_path / "t.html").write_text("mine")
+    for output, message in (("t.toml", "exists already"), ("u.txt", "found .txt"), ("u.toml", "no schema_version")):
+        command = ["twin", str(tmp_path / "f.uwb"), "-c", str(tmp_path / "c.json"), "-o", str(tmp_path / output)]
+        done = CliRunner().invoke(app, command)
+        assert message in str(done.exception)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html"]
+    assert len(load(tmp_path / "f.uwb").poses) > 0

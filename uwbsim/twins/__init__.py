@@ -1,0 +1,21 @@
+"""Scenarios fitted to recordings, and how well they are."""
+
+from typing import TYPE_CHECKING, Final
+
+from uwblink.lazy import offer
+
+if TYPE_CHECKING:
+    from uwbsim.twins.comparison import LEVEL, Compared
+    from uwbsim.twins.fitting import Twin, check_name
+
+__all__ = ["LEVEL", "Compared", "Twin", "check_name"]
+
+_HOMES: Final = {
+    "LEVEL": "uwbsim.twins.comparison",
+    "Compared": "uwbsim.twins.comparison",
+    "Twin": "uwbsim.twins.fitting",
+    "check_name": "uwbsim.twins.fitting",
+}
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = offer(__name__, _HOMES)

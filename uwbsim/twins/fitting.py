@@ -1,0 +1,253 @@
+"""Makes the twin of a recording: a scenario fitted to it, and what is known of how well."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from uwblink.output import check_output, write_text
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Poses, Tag
+from uwbsim.errors import ScenarioError
+from uwbsim.scenario.model import Scenario
+from uwbsim.tables import write_csv
+from uwbsim.twins.calibration_file import CalibrationSource, KnownDevices, read_calibration
+from uwbsim.twins.clocks import fit_clocks
+from uwbsim.twins.comparison import Compared, compare_flights
+from uwbsim.twins.flight import Flight, RecordingSource, read_flight
+from uwbsim.twins.powers import fit_powers
+from uwbsim.twins.reflections import fit_reflections
+from uwbsim.twins.scenario_tables import Fitted, receive_noise, tables
+from uwbsim.twins.scenario_text import scenario_text
+from uwbsim.twins.schedules import fit_schedule
+from uwbsim.twins.unknowns import unknowns
+
+HEAD: Final = (
+    "The twin of {recording} with {calibration}: fitted to it by `uwbsim twin`, which also wrote what lies beside this "
+    "file. What nothing is said of here has its default."
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Twin:
+    """A scenario fitted to a recording.
+
+    `scenario` can be simulated as it is; `found` has what was fitted, JSON-ready; `unknown` says what the recording
+    cannot tell and so keeps its default, one sentence each. `compare` simulates it beside the recording, `save` writes
+    it as a file.
+
+    >>> import uwbsim
+    >>> still = [{"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0)]
+    >>> flight = uwbsim.simulate(
+    ...     {
+    ...         "run": {"duration_s": 4.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": name, "motion": motion} for name, motion in zip("ab", still)],
+    ...         "tags": [{"id": 1, "body": "a"}, {"id": 2, "body": "b"}],
+    ...     }
+    ... )
+    >>> curve = {"knots": [0, 0, 2, 2], "coefficients": [0, 0], "degree": 1, "range": [0, 2]}
+    >>> known = {"schema_version": 1, "delays_ns": {"1": 0, "2": 0}, "alpha_dbm": -82, "lift": "mean-of-lifted"}
+    >>> found = uwbsim.twin(flight, known | {"bias_curve": curve, "speed_of_light": 299702547})
+    >>> [one.name for one in found.compare(seeds=1)][:2]
+    ['reply dt32', 'first-path power at target']
+    """
+
+    scenario: Scenario
+    found: dict[str, Any]
+    unknown: tuple[str, ...]
+    recording: str
+    calibration: str
+    measured: Flight
+    known: KnownDevices
+    paths: dict[str, Poses]
+    table: dict[str, Any]
+
+    def compare(self, seeds: int | None = None, progress: Callable[[float], None] | None = None) -> list[Compared]:
+        """Simulate the twin with so many seeds, and compare it with the recording, distribution by distribution.
+
+        Without `seeds` there are as many as make the simulated exchanges some times the measured ones.
+        """
+        return compare_flights(self.measured, self.known, self.scenario, seeds, progress)
+
+    def files(self, output: str | os.PathLike[str]) -> tuple[Path, ...]:
+        """Return the names of what `save` writes: the scenario, and beside it its poses and its plan where needed."""
+        path = Path(output)
+        poses = (path.with_suffix(".poses.uwb"),) if self.paths else ()
+        plan = (path.with_suffix(".plan.csv"),) if isinstance(self.table["ranging"].get("plan"), dict) else ()
+        return (path, *poses, *plan)
+
+    def save(self, output: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write the scenario (.toml) and what it names; raises what `check_output` raises, with nothing written."""
+        path = Path(output)
+        check_name(path)
+        for file in self.files(path):
+            check_output(file, force=force)
+        table = _linked(self.table, path)
+        if self.paths:
+            self._save_poses(path.with_suffix(".poses.uwb"), force)
+        if isinstance(table["ranging"].get("plan"), dict):
+            rows = [dict(zip(("time_s", "initiator", "target"), r, strict=True)) for r in self._slots()]
+            write_csv(path.with_suffix(".plan.csv"), rows, force=force)
+        head = HEAD.format(recording=Path(self.recording).name, calibration=Path(self.calibration).name)
+        write_text(path, scenario_text(table, head), force=force)
+
+    def _slots(self) -> list[tuple[float, int, int]]:
+        return list(self.table["ranging"]["plan"]["slots"])
+
+    def _save_poses(self, path: Path, force: bool) -> None:
+        parts = list(self.paths.values())
+        poses = Poses(
+            np.concatenate([part.time_ns for part in parts]),
+            np.concatenate([part.body for part in parts]),
+            np.concatenate([part.position_m for part in parts]),
+            np.concatenate([part.quaternion for part in parts]),
+        )
+        with Recording.create(path, meta={"source": "uwbsim twin"}, force=force) as recording:
+            recording.append_tags([Tag(tag.id, tag.body, tag.lever_arm_m) for tag in self.scenario.tags])
+            recording.append_poses(poses[np.argsort(poses.time_ns, kind="stable")])
+
+    def __repr__(self) -> str:
+        """Return what was found, a line each."""
+        lines = [f"Twin of {self.recording}: {len(self.measured)} exchanges of {len(self.measured.pairs)} pairs"]
+        lines += [f"  {name}: {value:.4g}" for name, value in self.found.items() if isinstance(value, float)]
+        return "\n".join(lines)
+
+
+def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
+    """Fit a scenario to a recording, with what a calibration knows of the devices as their truth.
+
+    `recording` is a file (.uwb) or what one holds in memory (`uwblink.Contents`, a simulated flight); `calibration` its
+    file (.json), its JSON as nested tables, or an object with `to_json`. The recording needs poses, first-path powers
+    and some hundred exchanges. Raises `ScenarioError` where these lack or the calibration does not know all tags, and
+    what `Recording.open` raises.
+
+    >>> import uwbsim
+    >>> still = [{"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0)]
+    >>> flight = uwbsim.simulate(
+    ...     {
+    ...         "run": {"duration_s": 10.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": name, "motion": motion} for name, motion in zip("ab", still)],
+    ...         "tags": [{"id": 1, "body": "a", "skew_ppm": 3.0}, {"id": 2, "body": "b"}],
+    ...     }
+    ... )
+    >>> curve = {"knots": [0, 0, 2, 2], "coefficients": [0, 0], "degree": 1, "range": [0, 2]}
+    >>> known = {"schema_version": 1, "delays_ns": {"1": 0, "2": 0}, "alpha_dbm": -82, "lift": "mean-of-lifted"}
+    >>> found = uwbsim.twin(flight, known | {"bias_curve": curve, "speed_of_light": 299702547})
+    >>> one, two = found.scenario.tags
+    >>> round(one.skew_ppm - two.skew_ppm, 1)
+    3.0
+    """
+    known = read_calibration(calibration)
+    flown, where = read_flight(recording)
+    flight = Flight.of(flown, known, where)
+    fitted = _fit(flight, flown.faults)
+    name = f"twin of {Path(where).stem}"
+    table, paths = tables(flight, known, flown.poses, fitted, name)
+    try:
+        scenario = Scenario.model_validate(table)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise ScenarioError(f"{where}: its twin cannot be: {place}: {first['msg']}") from error
+    return Twin(
+        scenario=scenario,
+        found=summary(flight, fitted),
+        unknown=tuple(unknowns(flight, fitted)),
+        recording=where,
+        calibration=known.where,
+        measured=flight,
+        known=known,
+        paths=paths,
+        table=table,
+    )
+
+
+def _fit(flight: Flight, faults: list[Any]) -> Fitted:
+    clocks = fit_clocks(flight)
+    noise = receive_noise(flight, clocks)
+    std = np.sqrt(np.mean([noise.at(power) ** 2 for power in flight.power_dbm], axis=0))
+    reflections = fit_reflections(flight, std)
+    powers = fit_powers(flight, reflections.reflected)
+    return Fitted(
+        clocks=clocks,
+        noise=noise,
+        reflections=reflections,
+        powers=powers,
+        schedule=fit_schedule(flight, faults),
+    )
+
+
+def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
+    """Return what was fitted by name, numbers or None, and tables by tag and by pair."""
+    clocks, reflections, powers, schedule = fitted.clocks, fitted.reflections, fitted.powers, fitted.schedule
+    noise = fitted.noise.std_s
+    return {
+        "exchanges": len(flight),
+        "duration_s": float(flight.time_s[-1]),
+        "rate_hz": schedule.rate_hz,
+        "round_robin": schedule.regular,
+        "lost_share": schedule.lost_share,
+        "receive_noise_ps": float(np.mean(noise)) * 1e12 if len(noise) else None,
+        "carrier_noise_ppm": clocks.carrier_std_ppm,
+        "carrier_bias_ppm": clocks.carrier_bias_ppm,
+        "ratio_bias_ppm": clocks.ratio_bias_ppm,
+        "first_path_at_1m_dbm": powers.at_1m_dbm,
+        "path_loss_exponent": powers.exponent,
+        "power_noise_db": powers.noise_db,
+        "fading_db": powers.fading_db,
+        "fading_life_s": powers.fading_life_s,
+        "core_mean_m": reflections.core_mean_m,
+        "direct_std_m": reflections.direct_std_m,
+        "reflected_share": reflections.share,
+        "reflected_share_between_pairs": reflections.share_std,
+        "mean_excess_m": reflections.mean_excess_m,
+        "reflection_life_s": reflections.life_s,
+        "reflection_loss_db": powers.reflection_loss_db,
+        "tags": {
+            str(tag.tag): {
+                "skew_ppm": float(clocks.skew_ppm[k]),
+                "skew_error_ppm": float(clocks.skew_error_ppm[k]),
+                "walk_ppm_per_sqrt_s": float(clocks.walk_ppm_per_sqrt_s[k]),
+                "tx_power_db": float(powers.tx_db[k]),
+                "power_offset_db": float(powers.offset_db[k]),
+            }
+            for k, tag in enumerate(flight.tags)
+        },
+        "pairs": {
+            f"{a}-{b}": {
+                "exchanges": int(np.count_nonzero(flight.pair == k)),
+                "reflected_share": float(reflections.pair_share[k]),
+                "mean_excess_m": float(reflections.pair_excess_m[k]),
+                "life_s": None if reflections.life_s is None else float(reflections.pair_life_s[k]),
+            }
+            for k, (a, b) in enumerate(flight.pairs)
+        },
+    }
+
+
+def check_name(path: Path) -> None:
+    """Raise `ScenarioError` for an output that is no scenario file."""
+    if path.suffix.lower() != ".toml":
+        raise ScenarioError(f"{path}: found {path.suffix or 'no suffix'}, expected the name of a scenario file (.toml)")
+
+
+def _linked(table: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the tables with names of files in the place of what is in them."""
+    bodies = [
+        body | {"motion": {"model": "recorded", "file": path.with_suffix(".poses.uwb").name, "body": body["name"]}}
+        if body["motion"]["model"] == "recorded"
+        else body
+        for body in table["bodies"]
+    ]
+    ranging = dict(table["ranging"])
+    if isinstance(ranging.get("plan"), dict):
+        ranging["plan"] = {"file": path.with_suffix(".plan.csv").name}
+    return table | {"bodies": bodies, "ranging": ranging}

@@ -1,0 +1,282 @@
+"""A fitted flight as the tables of a scenario."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.stats import chi2
+
+from uwblink.arrays import Bools, Floats
+from uwblink.recording.schema import Poses
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwbsim.scenario.linked_files import MOST_POSES
+from uwbsim.scenario.radio import Radio, TwoStateMultipath
+from uwbsim.twins.calibration_file import KnownDevices
+from uwbsim.twins.clocks import ClockFit
+from uwbsim.twins.flight import Flight, attitude
+from uwbsim.twins.powers import PowerFit
+from uwbsim.twins.reflections import ReflectionFit
+from uwbsim.twins.schedules import SHORTEST_LIFE_S, ScheduleFit, plan_rows
+from uwbsim.units import NS, NS_PER_S
+from uwbsim.world.radio import lifted
+
+STILL_M: Final = 0.01
+LEVEL_RAD: Final = 0.01
+AFTER_S: Final = 0.2
+NOISE_BINS: Final = 6
+FEWEST_IN_A_BIN: Final = 200
+ALIKE: Final = 0.01
+LEAST_DB: Final = 0.1
+"""Of fading, below which there is none."""
+
+LEAST_SHARE: Final = 0.002
+OWN_LIFE: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fitted:
+    """Everything that was fitted to a flight."""
+
+    clocks: ClockFit
+    noise: ReceiveNoise
+    reflections: ReflectionFit
+    powers: PowerFit
+    schedule: ScheduleFit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReceiveNoise:
+    """The noise of receive stamps over first-path power in dBm, seconds: one value where powers are no different."""
+
+    power_dbm: Floats
+    std_s: Floats
+
+    def at(self, power_dbm: Floats) -> Floats:
+        """Return the noise at powers, linear in lifted power between those that are known."""
+        if not len(self.std_s):
+            return np.zeros_like(power_dbm)
+        return np.asarray(np.interp(lifted(power_dbm), lifted(self.power_dbm), self.std_s))
+
+
+def receive_noise(flight: Flight, clocks: ClockFit) -> ReceiveNoise:
+    """Return the noise of stamps that ratios show, by the power at their receiver, the initiator."""
+    noise, power = clocks.receive_noise_s(flight), flight.exchanges.fpp2_dbm
+    good = np.isfinite(noise)
+    if not good.any():
+        return ReceiveNoise(power_dbm=np.zeros(0), std_s=np.zeros(0))
+    noise, power = noise[good], power[good]
+    limit = 5 * 1.4826 * float(np.median(np.abs(noise)))
+    keep = np.abs(noise) < limit
+    noise, power = noise[keep], power[keep]
+    count = int(np.clip(len(noise) // FEWEST_IN_A_BIN, 1, NOISE_BINS))
+    parts = np.array_split(np.argsort(power, kind="stable"), count)
+    std = np.array([np.sqrt(np.mean(noise[rows] ** 2)) for rows in parts])
+    size = np.array([len(rows) for rows in parts])
+    together = float(np.sqrt(np.mean(noise**2)))
+    # The logarithm of a spread has the standard error 1/sqrt(2n).
+    misfit = float(np.sum(2 * size * np.log(std / together) ** 2))
+    if count == 1 or chi2.sf(misfit, count - 1) > ALIKE:
+        return ReceiveNoise(power_dbm=np.array([np.median(power)]), std_s=np.array([together]))
+    middle = np.array([np.median(power[rows]) for rows in parts])
+    distinct = np.append(True, np.diff(middle) > 1e-3)
+    return ReceiveNoise(power_dbm=middle[distinct], std_s=std[distinct])
+
+
+def tables(
+    flight: Flight, known: KnownDevices, poses: Poses, fitted: Fitted, name: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the scenario's tables, and the poses by body that its `recorded` motions stand for."""
+    duration = float(fitted.schedule.time_s[-1]) + AFTER_S
+    if fitted.schedule.regular:
+        duration = (len(fitted.schedule.time_s) + 0.3) / fitted.schedule.rate_hz
+    bodies, paths = _bodies(flight, poses, duration)
+    table = {
+        "run": {"name": name, "seed": 1, "duration_s": duration},
+        "ranging": _ranging(flight, fitted.schedule),
+        "radio": _radio(flight, known, fitted),
+        "mocap": {"rate_hz": _pose_rate_hz(poses, flight)},
+        "bodies": bodies,
+        "tags": [_tag(flight, known, fitted, k) for k in range(len(flight.tags))],
+    }
+    return table, paths
+
+
+def _ranging(flight: Flight, schedule: ScheduleFit) -> dict[str, Any]:
+    ids = [tag.tag for tag in flight.tags]
+    found: dict[str, Any] = {
+        "protocol": flight.row.name,
+        "rate_hz": schedule.rate_hz,
+        "pairs": [[ids[i], ids[j]] for i, j in schedule.turns],
+    }
+    if schedule.delay_uus is not None:
+        found["response_delay_uus"] = schedule.delay_uus
+    if schedule.replies_us is not None:
+        found["reply"] = {"model": "quantiles", "delays_us": list(schedule.replies_us)}
+    if not schedule.regular:
+        rows = plan_rows(schedule, flight)
+        found["plan"] = {"file": "", "slots": [(r["time_s"], r["initiator"], r["target"]) for r in rows]}
+    return found
+
+
+def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any]:
+    powers, clocks, schedule = fitted.powers, fitted.clocks, fitted.schedule
+    found: dict[str, Any] = {
+        "first_path_at_1m_dbm": powers.at_1m_dbm,
+        "antenna": powers.antenna,
+        "power_noise_db": powers.noise_db,
+        "sensitivity_dbm": min(Radio().sensitivity_dbm, float(flight.power_dbm.min()) - 1),
+        "skew_noise_ppm": clocks.carrier_std_ppm,
+        "skew_bias_ppm": clocks.carrier_bias_ppm,
+    }
+    if powers.exponent is not None:
+        found["path_loss_exponent"] = max(powers.exponent, 0.0)
+    shift = fitted.reflections.core_mean_m
+    curve = known.bias.model_dump(mode="json")
+    found["bias"] = curve | {"coefficients": [value + shift for value in curve["coefficients"]]}
+    found |= _noise(fitted.noise)
+    multipath = _multipath(flight, fitted)
+    if multipath:
+        found["multipath"] = multipath
+    if powers.fading_db >= LEAST_DB:
+        found["fading"] = {"levels_db": [float(level) for level in powers.fading_levels_db]}
+        if powers.fading_life_s is not None:
+            found["fading"]["life_s"] = max(powers.fading_life_s, SHORTEST_LIFE_S)
+    if schedule.lost_share > 0:
+        found["outages"] = {"share": schedule.lost_share, "life_s": schedule.outage_life_s()}
+    return found
+
+
+def _noise(noise: ReceiveNoise) -> dict[str, Any]:
+    if not len(noise.std_s):
+        return {"rx_noise_ps": 0.0}
+    if len(noise.std_s) == 1:
+        return {"rx_noise_ps": float(noise.std_s[0]) * 1e12}
+    at = lifted(noise.power_dbm)
+    knots = [at[0], *at, at[-1]]
+    # A range whose reply takes no time has c s / sqrt(2).
+    spread = SPEED_OF_LIGHT * noise.std_s / np.sqrt(2)
+    sigma = {"knots": [float(k) for k in knots], "coefficients": [float(s) for s in spread], "degree": 1}
+    return {"rx_noise_ps": 0.0, "sigma": sigma}
+
+
+def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any]:
+    found, powers = fitted.reflections, fitted.powers
+    if found.share < LEAST_SHARE and found.direct_std_m == 0:
+        return {}
+    loss = powers.reflection_loss_db
+    default = TwoStateMultipath(model="two-state")
+    table: dict[str, Any] = {
+        "model": "two-state",
+        "share": found.share,
+        "share_std": min(found.share_std, 0.9 * float(np.sqrt(found.share * (1 - found.share)))),
+        "mean_excess_m": found.mean_excess_m,
+        "direct_std_m": found.direct_std_m,
+        "life_s": default.life_s if found.life_s is None else max(found.life_s, SHORTEST_LIFE_S),
+        "life_spread": min(found.life_spread, 2.0),
+    }
+    shortest = shortest_interval_s(flight)
+    if found.life_s is None and shortest < default.life_s:
+        table["life_s"] = max(shortest / 3, SHORTEST_LIFE_S)
+    if loss is not None:
+        table["first_path_loss_db"] = loss
+        table["loss_std_db"] = powers.reflection_loss_std_db
+        table["total_loss_db"] = min(default.total_loss_db, loss)
+    pairs = []
+    for k, pair in enumerate(flight.pairs):
+        own: dict[str, Any] = {}
+        if found.share_std > 0:
+            own["share"] = float(np.clip(found.pair_share[k], 0, 1))
+        if found.life_s is not None and found.life_spread > OWN_LIFE:
+            own["life_s"] = max(float(found.pair_life_s[k]), SHORTEST_LIFE_S)
+        if np.ptp(found.pair_excess_m) > 0:
+            own["mean_excess_m"] = float(found.pair_excess_m[k])
+        if own:
+            pairs.append({"tags": list(pair)} | own)
+    return table | ({"pairs": pairs} if pairs else {})
+
+
+def shortest_interval_s(flight: Flight) -> float:
+    """Return how soon a pair mostly ranges again, in seconds."""
+    order = np.lexsort((flight.time_s, flight.pair))
+    same = np.diff(flight.pair[order]) == 0
+    apart = np.diff(flight.time_s[order])[same]
+    return float(np.median(apart)) if len(apart) else float("inf")
+
+
+def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[str, Any]:
+    tag, clocks, powers = flight.tags[k], fitted.clocks, fitted.powers
+    found: dict[str, Any] = {
+        "id": tag.tag,
+        "body": tag.body,
+        "lever_arm_m": list(tag.lever_arm_m),
+        "delay_ns": known.delays_ns[tag.tag],
+        "skew_ppm": float(np.clip(clocks.skew_ppm[k], -100, 100)),
+        "drift_ppm_per_sqrt_s": float(clocks.walk_ppm_per_sqrt_s[k]),
+        "tx_power_db": float(powers.tx_db[k]),
+        "power_offset_db": float(powers.offset_db[k]),
+    }
+    pattern = powers.pattern_db[k]
+    return found | ({"pattern_db": [float(value) for value in pattern]} if np.any(pattern) else {})
+
+
+def _pose_rate_hz(poses: Poses, flight: Flight) -> float:
+    for body in dict.fromkeys(tag.body for tag in flight.tags):
+        time = poses.time_ns[poses.body == body]
+        if len(time) > 2:
+            return round(NS_PER_S / float(np.median(np.diff(time))), 3)
+    return 100.0
+
+
+def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return the bodies' tables, and the poses of those that move, from the origin to a little after the end."""
+    found, paths = [], {}
+    for body in dict.fromkeys(tag.body for tag in flight.tags):
+        mine = poses[np.flatnonzero(poses.body == body)]
+        still = _still(mine)
+        if still is not None:
+            found.append({"name": body, "motion": {"model": "static"} | still})
+            continue
+        cut = _cut(mine, flight.origin_ns, duration_s)
+        paths[body] = cut
+        motion = {
+            "model": "recorded",
+            "file": "",
+            "body": body,
+            "times_s": ((cut.time_ns - cut.time_ns[0]) * NS).tolist(),
+            "positions_m": cut.position_m.tolist(),
+            "quaternions": cut.quaternion.tolist(),
+        }
+        found.append({"name": body, "motion": motion})
+    return found, paths
+
+
+def _still(mine: Poses) -> dict[str, Any] | None:
+    """Return place and heading of a body that stands level where it is, None for any other."""
+    middle = np.median(mine.position_m, axis=0)
+    if np.max(np.linalg.norm(mine.position_m - middle, axis=1)) > STILL_M:
+        return None
+    turns = attitude(mine, str(mine.body[0]), mine.time_ns)
+    yaw, pitch, roll = turns.as_euler("ZYX").T
+    heading = float(np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean()))
+    turning = np.abs(np.angle(np.exp(1j * (yaw - heading))))
+    if max(np.abs(pitch).max(), np.abs(roll).max(), turning.max()) > LEVEL_RAD:
+        return None
+    return {"position_m": [float(v) for v in middle], "yaw_deg": float(np.degrees(heading))}
+
+
+def _cut(mine: Poses, origin_ns: int, duration_s: float) -> Poses:
+    """Return poses from the origin on, as long as needed, with poses at both ends."""
+    first, last = origin_ns, origin_ns + int((duration_s + AFTER_S) * NS_PER_S)
+    times, rows = np.unique(mine.time_ns, return_index=True)
+    mine = mine[rows]
+    inside: Bools = (times > first) & (times < last)
+    wanted = np.concatenate([[first], times[inside], [last]])
+    wanted = wanted[:: max(len(wanted) // MOST_POSES + 1, 1)] if len(wanted) > MOST_POSES else wanted
+    if wanted[-1] != last:
+        wanted = np.append(wanted, last)
+    at = np.clip(wanted, times[0], times[-1]).astype(np.float64)
+    position = np.column_stack([np.interp(at, times.astype(np.float64), mine.position_m[:, k]) for k in range(3)])
+    turns = attitude(mine, str(mine.body[0]), wanted)
+    return Poses(wanted, np.full(len(wanted), str(mine.body[0])), position, turns.as_quat())
