@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array, hstack, vstack
 
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import TICK_S
@@ -23,10 +23,18 @@ UNKNOWNS: Final = 300
 
 SHORTEST_STEP_S: Final = 0.5
 ROUNDS: Final = 40
+WARM_UPS_S: Final = (7.0, 14.0, 28.0, 56.0, 112.0)
+WARM_UP_PPM: Final = 5.0
+"""How much faster clocks are thought to run at first before anything is seen."""
+
+LONG_WALK_PPM: Final = 0.15
+"""Over a flight; who walks that far may be warming up."""
+
+NEEDED: Final = 3.0
 SAMPLED: Final = 6000
 """Readings of which the noise is taken in each round, at least."""
 
-PRIOR_STEPS: Final = 10.0
+PRIOR_STEPS: Final = 1.0
 """How many steps of an average clock each clock's walk is taken together with: a short flight has few of its own."""
 
 OUTLIER: Final = 5.0
@@ -41,7 +49,8 @@ KINDS: Final = 2
 class ClockFit:
     """What clocks did: rates in ppm at the start by tag's place, their walks in ppm a root of a second, (tags,) each.
 
-    The mean of all rates at the start is zero by choice, as nothing in a recording says what true time is.
+    Clocks ran faster by `warm_up_ppm` (tags,) at first, which went away by e in every `warm_up_s`, None where none did.
+    The mean of all rates at the start, without that, is zero by choice: nothing in a recording says what true time is.
     `carrier_std_ppm` and `carrier_bias_ppm` are of a reading, `ratio_bias_ppm` of a ratio; `ratio_left_ppm` (n,) is
     what the rates leave of ratios, with as much spread as their noise has, NaN where there is no ratio.
     """
@@ -49,6 +58,8 @@ class ClockFit:
     skew_ppm: Floats
     skew_error_ppm: Floats
     walk_ppm_per_sqrt_s: Floats
+    warm_up_ppm: Floats
+    warm_up_s: float | None
     carrier_std_ppm: float
     carrier_bias_ppm: float
     ratio_bias_ppm: float
@@ -72,49 +83,95 @@ class _Readings:
 
 
 def fit_clocks(flight: Flight) -> ClockFit:
-    """Fit the clocks of a flight."""
-    tags, span = len(flight.tags), max(float(flight.time_s[-1]), 1e-3)
-    knots = int(np.clip(min(UNKNOWNS // tags, span / SHORTEST_STEP_S), 2, 400))
-    step_s = span / (knots - 1)
-    readings = _readings(flight, knots, step_s)
-    noise, walk = _first_guess(flight), np.full(tags, 3e-3)
-    weight = np.ones(len(readings.value))
-    some = np.arange(0, len(weight), max(len(weight) // SAMPLED, 1))
-    stiffness = _walk_precision(knots)
-    for _ in range(ROUNDS):
-        before = np.append(noise, walk)
-        found, covariance = _solve(readings, weight, noise, stiffness, walk**2 * step_s)
-        left = readings.value - readings.design @ found
-        scatter = left[some] ** 2 + _own_variance(readings.design[some], covariance)
-        weight = (np.abs(left) < OUTLIER * noise[readings.kind]).astype(np.float64)
-        noise = np.array([_spread(scatter, weight[some], readings.kind[some] == k, noise[k]) for k in (0, 1)])
-        walk = _walks(found, covariance, knots, step_s)
-        if np.max(np.abs(np.log(np.append(noise, walk) / before))) < SETTLED:
-            break
-    scatter = left**2 + np.concatenate(
-        [_own_variance(readings.design[k : k + SAMPLED], covariance) for k in range(0, len(left), SAMPLED)]
-    )
-    noise = np.array([_spread(scatter, weight, readings.kind == k, noise[k]) for k in (0, 1)])
-    rates = found[:-KINDS].reshape(tags, knots)
-    error = np.sqrt(np.diag(covariance)[:-KINDS].reshape(tags, knots)[:, 0])
-    ratio = np.full(len(flight), np.nan)
-    rows = readings.kind == 0
-    # The rates follow the ratios a little; what is left is scaled to the noise that makes the data most likely.
-    kept = left[rows]
-    if rows.any():
-        ratio[np.isfinite(flight.ratio_ppm)] = kept * noise[0] / _rms(kept[weight[rows] > 0])
-    return ClockFit(
-        skew_ppm=rates[:, 0],
-        skew_error_ppm=error,
-        walk_ppm_per_sqrt_s=walk,
-        carrier_std_ppm=float(noise[1]),
-        carrier_bias_ppm=float(found[-1]),
-        ratio_bias_ppm=float(found[-2]),
-        ratio_left_ppm=ratio,
-    )
+    """Fit the clocks of a flight; with warming up where walks would have to be long without."""
+    found = _Search(flight, None).run(ROUNDS)
+    span = float(flight.time_s[-1])
+    if np.max(found.walk) * np.sqrt(span) > LONG_WALK_PPM:
+        tries = [_Search(flight, decay).run(ROUNDS) for decay in WARM_UPS_S if decay < 2 * span]
+        best = min(tries, key=lambda one: float(np.sum(np.log(one.walk))), default=found)
+        # Each clock pays for its warming up with a walk that is shorter by more than one number explains.
+        if np.sum(np.log(found.walk / best.walk)) * (best.knots - 1) > NEEDED * len(flight.tags):
+            found = best
+    return found.result()
 
 
-def _readings(flight: Flight, knots: int, step_s: float) -> _Readings:
+class _Search:
+    """Rounds of expectation and maximization, with clocks that warm up by e in every `decay_s`, or do not."""
+
+    def __init__(self, flight: Flight, decay_s: float | None) -> None:
+        tags, span = len(flight.tags), max(float(flight.time_s[-1]), 1e-3)
+        self.flight, self.decay_s, self.tags = flight, decay_s, tags
+        self.knots = int(np.clip(min(UNKNOWNS // tags, span / SHORTEST_STEP_S), 2, 400))
+        self.step_s = span / (self.knots - 1)
+        self.readings = _readings(flight, self.knots, self.step_s, decay_s)
+        self.noise, self.walk = _first_guess(flight), np.full(tags, 3e-3)
+        self.weight = np.ones(len(self.readings.value))
+        self.some = np.arange(0, len(self.weight), max(len(self.weight) // SAMPLED, 1))
+        self.stiffness = _walk_precision(self.knots)
+
+    def run(self, rounds: int) -> _Search:
+        """Go on for so many rounds, or until nothing changes any more."""
+        readings, some = self.readings, self.some
+        for _ in range(rounds):
+            before = np.append(self.noise, self.walk)
+            self._solve()
+            scatter = self.left[some] ** 2 + _own_variance(readings.design[some], self.covariance)
+            self.weight = (np.abs(self.left) < OUTLIER * self.noise[readings.kind]).astype(np.float64)
+            self._set_noise(scatter, self.weight[some], readings.kind[some])
+            self.walk = _walks(self.found, self.covariance, self.tags, self.knots, self.step_s)
+            if np.max(np.abs(np.log(np.append(self.noise, self.walk) / before))) < SETTLED:
+                break
+        return self
+
+    def _solve(self) -> None:
+        """Find the most likely rates, warming up and biases, and their covariance."""
+        readings, knots, tags = self.readings, self.knots, self.tags
+        precision = self.weight / self.noise[readings.kind] ** 2
+        normal = (readings.design.T @ readings.design.multiply(precision[:, None])).toarray()
+        towards = readings.design.T @ (precision * readings.value)
+        for k, walk in enumerate(self.walk):
+            block = slice(k * knots, (k + 1) * knots)
+            normal[block, block] += self.stiffness / (walk**2 * self.step_s)
+        # The mean of the rates at the start is zero, tightly; and a bias that nothing tells is zero.
+        start = np.arange(tags) * knots
+        normal[np.ix_(start, start)] += 1e6
+        warm = np.arange(tags * knots, tags * (knots + 1))
+        normal[warm, warm] += 1e12 if self.decay_s is None else WARM_UP_PPM**-2
+        normal[range(-KINDS, 0), range(-KINDS, 0)] += 1e-6
+        self.covariance = np.linalg.inv(normal)
+        self.found = self.covariance @ towards
+        self.left = readings.value - readings.design @ self.found
+
+    def _set_noise(self, scatter: Floats, weight: Floats, kind: Ints) -> None:
+        self.noise = np.array([_spread(scatter, weight, kind == k, self.noise[k]) for k in range(KINDS)])
+
+    def result(self) -> ClockFit:
+        """Return what was found; the noise is taken of all readings."""
+        readings, found, count = self.readings, self.found, self.tags * self.knots
+        pieces = range(0, len(self.left), SAMPLED)
+        own = [_own_variance(readings.design[k : k + SAMPLED], self.covariance) for k in pieces]
+        self._set_noise(self.left**2 + np.concatenate(own), self.weight, readings.kind)
+        variance = np.diag(self.covariance)[:count].reshape(self.tags, self.knots)
+        ratio = np.full(len(self.flight), np.nan)
+        rows = readings.kind == 0
+        if rows.any():
+            # The rates follow the ratios a little; what is left is scaled to the noise that is most likely.
+            scale = self.noise[0] / _rms(self.left[rows & (self.weight > 0)])
+            ratio[np.isfinite(self.flight.ratio_ppm)] = self.left[rows] * scale
+        return ClockFit(
+            skew_ppm=found[:count].reshape(self.tags, self.knots)[:, 0],
+            skew_error_ppm=np.sqrt(variance[:, 0]),
+            walk_ppm_per_sqrt_s=self.walk,
+            warm_up_ppm=found[count : count + self.tags],
+            warm_up_s=self.decay_s,
+            carrier_std_ppm=float(self.noise[1]),
+            carrier_bias_ppm=float(found[-1]),
+            ratio_bias_ppm=float(found[-2]),
+            ratio_left_ppm=ratio,
+        )
+
+
+def _readings(flight: Flight, knots: int, step_s: float, decay_s: float | None) -> _Readings:
     """Line up ratios and carriers; those of the target's receiver are positive where the target is faster."""
     first, second = flight.ends
     x = flight.exchanges
@@ -122,26 +179,29 @@ def _readings(flight: Flight, knots: int, step_s: float) -> _Readings:
     designs, values, kinds = [], [], []
     for value, plus, minus, kind in parts:
         rows = np.flatnonzero(np.isfinite(value))
-        designs.append(_design(flight, rows, plus[rows], minus[rows], knots, step_s, kind))
+        designs.append(_design(flight, rows, plus[rows], minus[rows], knots, step_s, decay_s))
         values.append(value[rows])
         kinds.append(np.full(len(rows), kind))
-    return _Readings(csr_array(vstack(designs)), np.concatenate(values), np.concatenate(kinds))
+    which = np.concatenate(kinds)
+    biases = csr_array(np.eye(KINDS)[which])
+    return _Readings(csr_array(hstack([vstack(designs), biases])), np.concatenate(values), which)
 
 
-def _design(flight: Flight, rows: Ints, plus: Ints, minus: Ints, knots: int, step_s: float, kind: int) -> csr_array:
-    """Return rows of the difference of two rates, linear between knots, and in the last columns of the biases."""
+def _design(
+    flight: Flight, rows: Ints, plus: Ints, minus: Ints, knots: int, step_s: float, decay_s: float | None
+) -> csr_array:
+    """Return rows of the difference of two rates: linear between knots, and warming up."""
     at = flight.time_s[rows] / step_s
     knot = np.clip(at.astype(np.int64), 0, knots - 2)
-    into = at - knot
-    columns = np.concatenate(
-        [plus * knots + knot, plus * knots + knot + 1, minus * knots + knot, minus * knots + knot + 1]
-    )
-    values = np.concatenate([1 - into, into, into - 1, -into])
-    place = np.tile(np.arange(len(rows)), 4)
-    size = len(flight.tags) * knots
-    place, columns = np.append(place, np.arange(len(rows))), np.append(columns, np.full(len(rows), size + kind))
-    values = np.append(values, np.ones(len(rows)))
-    return csr_array((values, (place, columns)), shape=(len(rows), size + KINDS))
+    into, count = at - knot, len(flight.tags) * knots
+    warm = np.zeros(len(rows)) if decay_s is None else np.exp(-flight.time_s[rows] / decay_s)
+    columns, values = [], []
+    for tag, sign in ((plus, 1), (minus, -1)):
+        columns += [tag * knots + knot, tag * knots + knot + 1, count + tag]
+        values += [sign * (1 - into), sign * into, sign * warm]
+    place = np.tile(np.arange(len(rows)), len(columns))
+    shape = (len(rows), count + len(flight.tags))
+    return csr_array((np.concatenate(values), (place, np.concatenate(columns))), shape=shape)
 
 
 def _first_guess(flight: Flight) -> Floats:
@@ -161,26 +221,6 @@ def _robust(values: Floats) -> float:
     return float(1.4826 * np.median(np.abs(finite - np.median(finite))))
 
 
-def _solve(
-    readings: _Readings, weight: Floats, noise: Floats, stiffness: Floats, step_variance: Floats
-) -> tuple[Floats, Floats]:
-    """Return the most likely rates, and the biases, and their covariance."""
-    knots = len(stiffness)
-    precision = weight / noise[readings.kind] ** 2
-    design = readings.design
-    normal = (design.T @ design.multiply(precision[:, None])).toarray()
-    towards = design.T @ (precision * readings.value)
-    for k, variance in enumerate(step_variance):
-        block = slice(k * knots, (k + 1) * knots)
-        normal[block, block] += stiffness / variance
-    # The mean of the rates at the start is zero, tightly; and a bias that nothing tells is zero.
-    start = np.arange(len(step_variance)) * knots
-    normal[np.ix_(start, start)] += 1e6
-    normal[range(-KINDS, 0), range(-KINDS, 0)] += 1e-6
-    covariance = np.linalg.inv(normal)
-    return covariance @ towards, covariance
-
-
 def _walk_precision(knots: int) -> Floats:
     difference = np.diff(np.eye(knots), axis=0)
     return np.asarray(difference.T @ difference)
@@ -196,9 +236,8 @@ def _spread(scatter: Floats, weight: Floats, rows: Floats, before: float) -> flo
     return float(np.sqrt(np.sum((weight * scatter)[rows]) / total)) if total else before
 
 
-def _walks(found: Floats, covariance: Floats, knots: int, step_s: float) -> Floats:
+def _walks(found: Floats, covariance: Floats, tags: int, knots: int, step_s: float) -> Floats:
     """Return the deviations of the walks that expected steps have, each clock's with a little of the average."""
-    tags = (len(found) - KINDS) // knots
     variance = np.zeros(tags)
     for k in range(tags):
         block = slice(k * knots, (k + 1) * knots)

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from pydantic import ValidationError
+from threadpoolctl import threadpool_limits
 
 from uwblink.output import check_output, write_text
 from uwblink.recording.file import Recording
@@ -148,7 +149,9 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     known = read_calibration(calibration)
     flown, where = read_flight(recording)
     flight = Flight.of(flown, known, where)
-    fitted = _fit(flight, flown.faults)
+    # One thread: the same bytes on any machine, and small matrices are quicker so.
+    with threadpool_limits(limits=1, user_api="blas"):
+        fitted = _fit(flight, flown.faults)
     name = f"twin of {Path(where).stem}"
     table, paths = tables(flight, known, flown.poses, fitted, name)
     try:
@@ -198,6 +201,7 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
         "receive_noise_ps": float(np.mean(noise)) * 1e12 if len(noise) else None,
         "carrier_noise_ppm": clocks.carrier_std_ppm,
         "carrier_bias_ppm": clocks.carrier_bias_ppm,
+        "warm_up_s": clocks.warm_up_s,
         "ratio_bias_ppm": clocks.ratio_bias_ppm,
         "first_path_at_1m_dbm": powers.at_1m_dbm,
         "path_loss_exponent": powers.exponent,
@@ -215,6 +219,7 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
             str(tag.tag): {
                 "skew_ppm": float(clocks.skew_ppm[k]),
                 "skew_error_ppm": float(clocks.skew_error_ppm[k]),
+                "warm_up_ppm": float(clocks.warm_up_ppm[k]),
                 "walk_ppm_per_sqrt_s": float(clocks.walk_ppm_per_sqrt_s[k]),
                 "tx_power_db": float(powers.tx_db[k]),
                 "power_offset_db": float(powers.offset_db[k]),

@@ -15,7 +15,9 @@ from scipy.optimize import least_squares
 from uwblink.arrays import Floats, Ints
 
 BINS: Final = 24
-MOST_LAGS: Final = 400
+MOST_STEPS: Final = 80
+MOST_PRODUCTS: Final = 4_000_000
+SHORTEST_LAG_S: Final = 1e-3
 LONGEST_SHARE: Final = 0.25
 """Of a flight's length, up to which lags count."""
 
@@ -52,7 +54,7 @@ def autocovariance(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> 
         if len(rows) < 8:
             continue
         time, centred = time_s[rows], value[rows] - value[rows].mean()
-        for step in range(1, min(len(rows) - 1, MOST_LAGS)):
+        for step in _steps(len(rows), len(value)):
             apart = time[step:] - time[:-step]
             if apart.min() > LONGEST_SHARE * span_s:
                 break
@@ -64,9 +66,11 @@ def autocovariance(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> 
         nothing = np.zeros(0)
         return Autocovariance(lag_s=nothing, covariance=nothing, count=nothing, variance=variance, span_s=span_s)
     lag, product = np.concatenate(lags), np.concatenate(products)
-    near = (lag > 0) & (lag <= LONGEST_SHARE * span_s)
+    near = (lag >= SHORTEST_LAG_S) & (lag <= LONGEST_SHARE * span_s)
     lag, product = lag[near], product[near]
-    edges = np.geomspace(max(lag.min(), 1e-3) * 0.999, lag.max() * 1.001, BINS + 1)
+    if not len(lag):
+        lag, product = np.full(1, SHORTEST_LAG_S), np.zeros(1)
+    edges = np.geomspace(lag.min() * 0.999, lag.max() * 1.001, BINS + 1)
     which = np.digitize(lag, edges) - 1
     count = np.bincount(which, minlength=BINS)[:BINS]
     some = count > 20
@@ -78,6 +82,13 @@ def autocovariance(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> 
         variance=variance,
         span_s=span_s,
     )
+
+
+def _steps(count: int, total: int) -> list[int]:
+    """Return by how many values of a pair products lie apart, denser where they are few."""
+    most = int(np.clip(MOST_PRODUCTS // max(total, 1), 12, MOST_STEPS))
+    longest = max(int(count * LONGEST_SHARE), 2)
+    return sorted(set(np.rint(np.geomspace(1, longest, most)).astype(np.int64).tolist()))
 
 
 def lasting(found: Autocovariance) -> Lasting:

@@ -23,6 +23,9 @@ from uwbsim.twins.persistence import Lasting, autocovariance, effective_size, la
 LEAST_SHARE: Final = 1e-4
 SHORTEST_CORE_M: Final = 1e-3
 ROUNDS: Final = 50
+SAMPLED: Final = 15_000
+"""Ranges to which the core and the tail of all are fitted, at least."""
+
 TRIM_M: Final = 0.6
 """Nearer than this a residual may be of the core for certain; further below it is a mistake of some other kind."""
 
@@ -93,6 +96,8 @@ def range_noise_m(flight: Flight, receive_noise_s: Floats) -> Floats:
 
 def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
     """Return the core's mean, its spread beyond the white noise, the mean detour and the share of the tail."""
+    thin = slice(None, None, max(len(error) // SAMPLED, 1))
+    error, white = error[thin], white[thin]
     scale = max(1.4826 * float(np.median(np.abs(error - np.median(error)))), SHORTEST_CORE_M)
 
     def unpack(at: Floats) -> tuple[float, float, float, float]:

@@ -217,6 +217,8 @@ def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[st
         "tx_power_db": float(powers.tx_db[k]),
         "power_offset_db": float(powers.offset_db[k]),
     }
+    if clocks.warm_up_s is not None:
+        found |= {"warm_up_ppm": float(clocks.warm_up_ppm[k]), "warm_up_s": clocks.warm_up_s}
     pattern = powers.pattern_db[k]
     return found | ({"pattern_db": [float(value) for value in pattern]} if np.any(pattern) else {})
 
