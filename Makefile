@@ -79,6 +79,9 @@ worlds: setup ## fits in worlds that share nothing with the simulator, into docs
 bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
 	$(BIN)/python -m benchmarks.boards
 
+twins: setup ## how well twins of simulated recordings find what was planted, over six seeds (3 minutes)
+	$(BIN)/python -m benchmarks.twins --seeds 6
+
 fidelity: setup ## write docs/fidelity.md, simulated beside measured
 	$(BIN)/python -m benchmarks.fidelity
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
 from typing import Final
 
 import numpy as np
@@ -88,7 +89,9 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
         reflected = np.zeros(len(flight))
         solved = _solve(flight, reflected, antenna, REWEIGHTED)
     told = np.std(np.log10(flight.distance_m)) >= LEAST_SPREAD
-    level, own, tx, offset = _split(*solved.tags_db)
+    # Where a tag was seen from one side only, its antenna can take its offsets over; towards there they count together.
+    seen = _mean_gains(flight, solved.pattern_db)
+    level, own, tx, offset = _split(*(solved.tags_db + seen))
     fading, loss_std = _common(solved, reflected)
     both = solved.left_db.mean(axis=0)
     noise = _spread(solved.left_db[0] - solved.left_db[1]) / np.sqrt(2)
@@ -104,7 +107,7 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
         antenna=solved.antenna,
         tx_db=tx,
         offset_db=offset,
-        pattern_db=np.column_stack([own, solved.pattern_db]),
+        pattern_db=np.column_stack([own - seen, solved.pattern_db]),
         reflection_loss_db=max(solved.loss_db, 0.0) if enough else None,
         reflection_loss_std_db=min(loss_std, max(solved.loss_db, 0.0) / 2),
         fading_db=fading,
@@ -179,6 +182,18 @@ def _spread(values: Floats) -> float:
     """Return the standard deviation of the bulk of values."""
     low, high = np.quantile(values, [0.16, 0.84])
     return max(float(high - low) / 2, 1e-6)
+
+
+def _mean_gains(flight: Flight, pattern_db: Floats) -> Floats:
+    """Return the mean gain of each tag's pattern towards those that it ranged with, (tags,)."""
+    degree = isqrt(pattern_db.shape[1] + 1) - 1
+    gains = [
+        np.einsum("nk,nk->n", harmonics(way, degree)[:, 1:], pattern_db[end])
+        for end, way in zip(flight.ends, flight.towards, strict=True)
+    ]
+    ends, count = flight.ends.ravel(), len(flight.tags)
+    total = np.bincount(ends, np.concatenate(gains), minlength=count)
+    return np.asarray(total / np.maximum(np.bincount(ends, minlength=count), 1))
 
 
 def _split(sends_db: Floats, reads_db: Floats) -> tuple[float, Floats, Floats, Floats]:

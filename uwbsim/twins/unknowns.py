@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Final
 
-import numpy as np
-
 from uwbsim.twins.flight import Flight
 from uwbsim.twins.scenario_tables import LEAST_DB, Fitted, shortest_interval_s
 
@@ -27,12 +25,17 @@ ALWAYS: Final = (
     "when bodies take other ways.",
 )
 
+RATIO_BIAS_PPM: Final = 0.02
 Untold = Callable[[Flight, Fitted], bool]
 SOMETIMES: Final[tuple[tuple[Untold, str], ...]] = (
     (
         lambda flight, fitted: not len(fitted.noise.std_s),
         "Noise of stamps apart from that of ranges: only a third message from the target shows it. All noise of ranges "
         "is taken to last as long as a path (direct_std_m).",
+    ),
+    (
+        lambda flight, fitted: abs(fitted.clocks.ratio_bias_ppm) > RATIO_BIAS_PPM,
+        "Why dt64/dt53 is off by {ratio_bias:+.2g} ppm against the carrier readings: nothing in a scenario makes that.",
     ),
     (
         lambda flight, fitted: fitted.reflections.life_s is None and fitted.reflections.share > 0,
@@ -71,5 +74,5 @@ def unknowns(flight: Flight, fitted: Fitted) -> Iterator[str]:
     interval = shortest_interval_s(flight)
     for untold, text in SOMETIMES:
         if untold(flight, fitted):
-            yield text.format(interval=interval if np.isfinite(interval) else 0.0)
+            yield text.format(interval=interval, ratio_bias=fitted.clocks.ratio_bias_ppm)
     yield from ALWAYS
