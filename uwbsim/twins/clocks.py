@@ -17,6 +17,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals
 from uwbsim.twins.flight import Flight
+from uwbsim.twins.persistence import bulk_spread
 
 UNKNOWNS: Final = 300
 """Rates that are solved for at most, tags times knots."""
@@ -216,9 +217,7 @@ def _first_guess(flight: Flight) -> Floats:
 
 def _robust(values: Floats) -> float:
     finite = values[np.isfinite(values)]
-    if not len(finite):
-        return float("nan")
-    return float(1.4826 * np.median(np.abs(finite - np.median(finite))))
+    return bulk_spread(finite) if len(finite) else float("nan")
 
 
 def _walk_precision(knots: int) -> Floats:

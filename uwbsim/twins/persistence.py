@@ -155,6 +155,12 @@ def effective_size(value: Floats, group: Ints) -> float:
     return float(np.clip(count / max(total, 1e-9), 2.0, count))
 
 
+def bulk_spread(value: Floats) -> float:
+    """Return half the distance of the quantiles at 16 and 84 %, a standard deviation that outliers do not move."""
+    low, high = np.quantile(value, [0.16, 0.84])
+    return float(high - low) / 2
+
+
 def lag_one(value: Floats, group: Ints) -> float:
     """Return the autocorrelation of values (n,) to the next of their group, about the mean of all; NaN for none."""
     order = np.argsort(group, kind="stable")

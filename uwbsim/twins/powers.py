@@ -10,7 +10,7 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import Lasting, autocovariance, lasting
+from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, lasting
 from uwbsim.world.patterns import harmonics
 from uwbsim.world.radio import ANTENNAS
 
@@ -179,9 +179,7 @@ def _ridge(design: Floats, value: Floats, penalty: Floats, weight: Floats) -> Fl
 
 
 def _spread(values: Floats) -> float:
-    """Return the standard deviation of the bulk of values."""
-    low, high = np.quantile(values, [0.16, 0.84])
-    return max(float(high - low) / 2, 1e-6)
+    return max(bulk_spread(values), 1e-6)
 
 
 def _mean_gains(flight: Flight, pattern_db: Floats) -> Floats:

@@ -18,7 +18,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import intervals
 from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import Lasting, autocovariance, effective_size, lasting
+from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, effective_size, lasting
 
 LEAST_SHARE: Final = 1e-4
 SHORTEST_CORE_M: Final = 1e-3
@@ -98,7 +98,7 @@ def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
     """Return the core's mean, its spread beyond the white noise, the mean detour and the share of the tail."""
     thin = slice(None, None, max(len(error) // SAMPLED, 1))
     error, white = error[thin], white[thin]
-    scale = max(1.4826 * float(np.median(np.abs(error - np.median(error)))), SHORTEST_CORE_M)
+    scale = max(bulk_spread(error), SHORTEST_CORE_M)
 
     def unpack(at: Floats) -> tuple[float, float, float, float]:
         return float(at[0]), float(np.exp(at[1])), float(np.exp(at[2])), float(1 / (1 + np.exp(-at[3])))

@@ -16,6 +16,7 @@ from uwbsim.scenario.radio import Radio, TwoStateMultipath
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.twins.clocks import ClockFit
 from uwbsim.twins.flight import Flight, attitude
+from uwbsim.twins.persistence import bulk_spread
 from uwbsim.twins.powers import PowerFit
 from uwbsim.twins.reflections import ReflectionFit
 from uwbsim.twins.schedules import SHORTEST_LIFE_S, ScheduleFit, plan_rows
@@ -27,6 +28,7 @@ LEVEL_RAD: Final = 0.01
 AFTER_S: Final = 0.2
 NOISE_BINS: Final = 6
 FEWEST_IN_A_BIN: Final = 200
+OUTLIER: Final = 5.0
 ALIKE: Final = 0.01
 LEAST_DB: Final = 0.1
 """Of fading, below which there is none."""
@@ -67,7 +69,7 @@ def receive_noise(flight: Flight, clocks: ClockFit) -> ReceiveNoise:
     if not good.any():
         return ReceiveNoise(power_dbm=np.zeros(0), std_s=np.zeros(0))
     noise, power = noise[good], power[good]
-    limit = 5 * 1.4826 * float(np.median(np.abs(noise)))
+    limit = OUTLIER * bulk_spread(noise)
     keep = np.abs(noise) < limit
     noise, power = noise[keep], power[keep]
     count = int(np.clip(len(noise) // FEWEST_IN_A_BIN, 1, NOISE_BINS))
