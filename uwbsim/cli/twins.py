@@ -70,4 +70,4 @@ def _print(compared: Sequence[Compared]) -> None:
         table.add_column(name, justify="left" if k == 0 else "right", no_wrap=True)
     for one in compared:
         table.add_row(*(show(one) for show in TWIN_COLUMNS.values()))
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    Console(width=None if sys.stdout.isatty() else 150).print(table)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
@@ -21,7 +22,7 @@ TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {
     "median": lambda c: _both(c.median_measured, c.median_simulated),
     "10 %": lambda c: _both(c.low_measured, c.low_simulated),
     "90 %": lambda c: _both(c.high_measured, c.high_simulated),
-    "to a pair's next": lambda c: _both(c.lag1_measured, c.lag1_simulated),
+    "to a pair's next": lambda c: _both(c.lag1_measured, c.lag1_simulated, ".2f"),
     "worth": lambda c: f"{c.worth_measured:.0f} of {c.count}",
     "D": lambda c: f"{c.distance:.3f}",
     "p": lambda c: f"{c.probability:.2g}",
@@ -88,8 +89,8 @@ def _shown(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _both(measured: float, simulated: float) -> str:
-    return " / ".join("–" if value != value else f"{value:.3g}" for value in (measured, simulated))
+def _both(measured: float, simulated: float, form: str = ".3g") -> str:
+    return " / ".join("–" if math.isnan(value) else format(value, form) for value in (measured, simulated))
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
