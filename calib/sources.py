@@ -91,6 +91,16 @@ class RecordedSource:
         """Return the columns of passively heard exchanges."""
         return self._recording.overheard()
 
+    @cached_property
+    def imu(self) -> dict[str, NDArray[Any]]:
+        """Return the columns of inertial readings."""
+        return self._recording.imu()
+
+    @cached_property
+    def height(self) -> dict[str, NDArray[Any]]:
+        """Return the columns of readings of height sensors."""
+        return self._recording.heights()
+
 
 @dataclass(frozen=True, slots=True)
 class _Bare:

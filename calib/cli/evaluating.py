@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from calib import Calibration
 
 from calib.cli.arguments import CalibrationFile, Force, Recordings
 
@@ -55,6 +58,13 @@ def evaluate(
 def localize(
     recordings: Recordings,
     calibration: CalibrationFile,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="poses (velocity and attitude from motion capture, to weigh calibrations), or without any: imu, "
+            "constant-velocity, by ranges to fixed anchors and the height sensor."
+        ),
+    ] = "poses",
     training: Annotated[
         Path | None, typer.Option(help="Flight on which the fixed variances are tuned; else they are the fit's (.uwb).")
     ] = None,
@@ -73,6 +83,9 @@ def localize(
     from calib.evaluation import Settings, localization_json, localization_text, summarize, write_tum
 
     known = calib.load_calibration(calibration)
+    if model != "poses":
+        _onboard(recordings, known, model, tum, as_json=as_json, force=force)
+        return
     settings = Settings(velocity_std_mps=process_noise, seeds=seeds)
     found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
     if tum:
@@ -81,6 +94,19 @@ def localize(
         typer.echo(json.dumps(localization_json(found), indent=1))
         return
     typer.echo(localization_text(found, summarize(found), settings))
+
+
+def _onboard(
+    recordings: list[Path], known: Calibration, model: str, tum: Path | None, *, as_json: bool, force: bool
+) -> None:
+    """Localize by what is on board, and print it."""
+    from calib.evaluation import OnboardSettings, localize_onboard, onboard_json, onboard_text, write_onboard_tum
+
+    settings = OnboardSettings(model=model)
+    found = [one for path in recordings for one in localize_onboard(path, known, settings)]
+    if tum:
+        write_onboard_tum(found, tum, force=force)
+    typer.echo(json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings))
 
 
 def doctor(

@@ -6,7 +6,16 @@ from uwblink.lazy import offer
 
 if TYPE_CHECKING:
     from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, Settings, summarize
-    from calib.evaluation.localization_display import as_tum, localization_json, localization_text, write_tum
+    from calib.evaluation.localization_display import (
+        as_tum,
+        localization_json,
+        localization_text,
+        onboard_json,
+        onboard_text,
+        write_onboard_tum,
+        write_tum,
+    )
+    from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation
 
 __all__ = [
@@ -15,11 +24,16 @@ __all__ = [
     "PAPER_RMSE_M",
     "ErrorStatistics",
     "Evaluation",
+    "OnboardSettings",
     "Settings",
     "as_tum",
     "localization_json",
     "localization_text",
+    "localize_onboard",
+    "onboard_json",
+    "onboard_text",
     "summarize",
+    "write_onboard_tum",
     "write_tum",
 ]
 
@@ -29,11 +43,16 @@ _HOMES: Final = {
     "Evaluation": "calib.evaluation.statistics",
     "FILTERS": "calib.evaluation.localization",
     "PAPER_RMSE_M": "calib.evaluation.localization",
+    "OnboardSettings": "calib.evaluation.onboard",
     "Settings": "calib.evaluation.localization",
     "as_tum": "calib.evaluation.localization_display",
     "localization_json": "calib.evaluation.localization_display",
     "localization_text": "calib.evaluation.localization_display",
+    "localize_onboard": "calib.evaluation.onboard",
+    "onboard_json": "calib.evaluation.localization_display",
+    "onboard_text": "calib.evaluation.localization_display",
     "summarize": "calib.evaluation.localization",
+    "write_onboard_tum": "calib.evaluation.localization_display",
     "write_tum": "calib.evaluation.localization_display",
 }
 

@@ -250,14 +250,14 @@ def _problem(flight: Flight, body: str) -> _Problem | None:
         body=body,
         rows=rows[known],
         time_ns=time[known],
-        attitude=_attitude(flight.poses, body, time[known]),
+        attitude=nearest_attitude(flight.poses, body, time[known]),
         place=place[known],
         arm=(antenna - place)[known],
         other=away[known],
     )
 
 
-def _attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
+def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
     """Return the attitude of a body at the pose nearest to each time, (n, 4)."""
     rows = np.flatnonzero(poses.body == body)
     known = poses.time_ns[rows]

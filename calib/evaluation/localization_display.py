@@ -6,6 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from calib.evaluation.localization import (
     PAPER_RMSE_M,
     Localization,
@@ -14,6 +16,8 @@ from calib.evaluation.localization import (
     Track,
     summarize,
 )
+from calib.evaluation.onboard import OnboardSettings, OnboardTrack
+from uwblink.arrays import Floats, Ints
 from uwblink.output import write_text
 
 NAMES: Final = {"raw": "raw", "calibrated": "calibrated", "variance": "variance", "robust": "robust"}
@@ -88,15 +92,63 @@ def write_tum(found: list[Localization], folder: Path, *, force: bool = False) -
             write_text(folder / f"{name}.tum", text, force=force)
 
 
+def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
+    """Return a line a body: what it was localized by, and how far off it was where that is known."""
+    lines = [f"{'by ranges to fixed anchors':34s}{'RMSE (m)':>10s}{'median':>9s}{'95 %':>9s}{'own std':>9s}  restarts"]
+    for one in found:
+        off = np.linalg.norm(one.estimate_m - one.truth_m, axis=1)
+        off = off[np.isfinite(off)]
+        figures = (one.rmse_m, *np.quantile(off, (0.5, 0.95))) if len(off) else (np.nan,) * 3
+        cells = "".join(f"{'-':>9s}" if value != value else f"{value:9.3f}" for value in figures)
+        own = float(np.sqrt(np.mean(one.std_m**2)))
+        lines.append(f"{one.source + ' ' + one.body:34s} {cells}{own:9.3f}  {len(one.restarts_s)}")
+    noise = settings.noise
+    moves = (
+        f"accelerometer {noise.force:g} m/s^2 and gyro {noise.gyro:g} rad/s a root of Hz"
+        if settings.model == "imu"
+        else f"velocity wanders by {noise.acceleration:g} m/s^2 a root of Hz"
+    )
+    return "\n".join([*lines, f"used: {found[0].used}; process noise: {moves}, speed about {settings.speed_m_s:g} m/s"])
+
+
+def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
+    """Return a table a body for JSON; what is not known is None."""
+    return [
+        {
+            "recording": one.source,
+            "body": one.body,
+            "model": one.model,
+            "used": one.used,
+            "rmse_m": None if one.rmse_m != one.rmse_m else one.rmse_m,
+            "std_m": float(np.sqrt(np.mean(one.std_m**2))),
+            "nis": float(np.mean(one.nis)),
+            "believed": float(np.mean(one.believed)),
+            "restarts_s": list(one.restarts_s),
+        }
+        for one in found
+    ]
+
+
+def write_onboard_tum(found: list[OnboardTrack], folder: Path, *, force: bool = False) -> None:
+    """Write the trajectory of each body with its attitudes, and the true one where there is one, into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in found:
+        name = "".join(c if c.isalnum() or c in "-_" else "_" for c in f"{one.source}-{one.body}-{one.model}")
+        write_text(folder / f"{name}.tum", _tum(one.time_ns, one.estimate_m, one.attitude), force=force)
+        known = np.isfinite(one.truth_m).all(axis=1) & np.isfinite(one.true_attitude).all(axis=1)
+        if known.any():
+            text = _tum(one.time_ns[known], one.truth_m[known], one.true_attitude[known])
+            write_text(folder / f"{name}-truth.tum", text, force=force)
+
+
 def as_tum(track: Track, *, truth: bool = False) -> str:
     """Return an estimated trajectory in TUM form, or the true one, with the attitude that was the filter's input."""
+    return _tum(track.time_ns, track.truth_m if truth else track.estimate_m, track.attitude)
+
+
+def _tum(time_ns: Ints, place_m: Floats, attitude: Floats) -> str:
     rows = [
         f"{time * 1e-9:.9f} {x:.6f} {y:.6f} {z:.6f} {qx:.6f} {qy:.6f} {qz:.6f} {qw:.6f}"
-        for time, (x, y, z), (qx, qy, qz, qw) in zip(
-            track.time_ns.tolist(),
-            (track.truth_m if truth else track.estimate_m).tolist(),
-            track.attitude.tolist(),
-            strict=True,
-        )
+        for time, (x, y, z), (qx, qy, qz, qw) in zip(time_ns.tolist(), place_m.tolist(), attitude.tolist(), strict=True)
     ]
     return "# time x y z qx qy qz qw\n" + "\n".join(rows) + "\n"

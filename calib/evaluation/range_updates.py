@@ -36,11 +36,16 @@ class RangeErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
-    """What filters make of a range: mean and variance of the noise in an innovation, and whether they believe it."""
+    """What filters make of a range: mean and variance of the noise in an innovation, and whether they believe it.
+
+    `log_density` is how likely the innovation was, in 1/m, `nis` its square over its variance as plain noise.
+    """
 
     noise_m: Floats
     variance_m2: Floats
     believed: Bools
+    log_density: Floats
+    nis: Floats
 
 
 def gated(innovation_m: Floats, variance_m2: Floats, gate: float) -> Heard:
@@ -50,6 +55,8 @@ def gated(innovation_m: Floats, variance_m2: Floats, gate: float) -> Heard:
         noise_m=np.where(believed, innovation_m, 0.0),
         variance_m2=np.where(believed, 0.0, variance_m2),
         believed=believed,
+        log_density=-0.5 * (innovation_m**2 / variance_m2 + np.log(2 * np.pi * variance_m2)),
+        nis=innovation_m**2 / variance_m2,
     )
 
 
@@ -79,4 +86,10 @@ def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> H
     spread = variance_m2 * np.maximum(1 - u * hazard - hazard**2, 0.0)
     mean = core * innovation_m + tail * of_tail
     square = core * innovation_m**2 + tail * (of_tail**2 + spread) + wild * variance_m2
-    return Heard(noise_m=mean, variance_m2=np.maximum(square - mean**2, 0.0), believed=wild < 0.5)
+    return Heard(
+        noise_m=mean,
+        variance_m2=np.maximum(square - mean**2, 0.0),
+        believed=wild < 0.5,
+        log_density=np.log(total),
+        nis=z * z,
+    )

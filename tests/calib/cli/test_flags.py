@@ -29,6 +29,7 @@ ONLY_FROM_PYTHON = {
     "before",
     "section",
     "shares",
+    "start_m",
 }
 
 

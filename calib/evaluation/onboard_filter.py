@@ -1,0 +1,195 @@
+"""An error-state Kalman filter of position, velocity, attitude and biases, for several headings at once.
+
+State errors (16): position, velocity, attitude (in the axes of the body), bias of gyro, bias of accelerometer, offset
+of the height sensor (Solà 2017, sections 5 to 7). Without an IMU, attitude and biases are not estimated, and velocity
+wanders. Arrays are (headings, ...).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.evaluation.multilateration import Fix
+from calib.evaluation.range_updates import Heard, RangeErrors, weighed
+from uwblink.arrays import Floats
+
+GRAVITY: Final = 9.81
+SIZE: Final = 16
+REST_M_S: Final = 0.01
+REST_RAD_S: Final = 0.003
+REST_M_S2: Final = 0.03
+"""Noise of a body at rest."""
+
+P, V, A, G, F, H = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noise:
+    """What the filter takes for noise: of accelerometer and gyro (a root of Hz), of their biases, of motion without.
+
+    Defaults are those of a consumer IMU on a small drone with its vibrations. `acceleration` (m/s^2 a root of Hz) is
+    how velocity wanders without an IMU.
+    """
+
+    force: float = 0.05
+    gyro: float = 0.005
+    force_bias: float = 0.02
+    gyro_bias: float = 0.0005
+    acceleration: float = 1.0
+    height_m: float = 0.1
+    height_offset: float = 0.005
+
+
+class InertialFilter:
+    """Predicts by inertial readings or by constant velocity, and corrects by ranges and heights."""
+
+    def __init__(self, fix: Fix, attitudes: Floats, noise: Noise, *, inertial: bool, speed_m_s: float = 1.0) -> None:
+        """Begin at a fix with attitudes (headings, 3, 3), body to world."""
+        count = len(attitudes)
+        self.noise, self.inertial = noise, inertial
+        self.place, self.velocity = np.tile(fix.place_m, (count, 1)), np.zeros((count, 3))
+        self.attitude = attitudes.copy()
+        self.gyro_bias, self.force_bias = np.zeros((count, 3)), np.zeros((count, 3))
+        self.offset = np.zeros(count)
+        self.likelihood = np.zeros(count)
+        spread = np.zeros(SIZE)
+        spread[V] = speed_m_s
+        if inertial:
+            # Heading is from a grid; tilt and bias of the accelerometer are told apart by `pulled`; consumer parts.
+            spread[A], spread[G], spread[F] = (0.3, 0.3, np.pi / count), 0.02, 0.4
+        spread[H] = 0.15
+        self.covariance = np.tile(np.diag(spread**2), (count, 1, 1))
+        self.covariance[:, P, P] = fix.covariance_m2
+
+    def predict(self, dt: float, gyro: Floats, force: Floats) -> None:
+        """Move on by `dt` seconds with mean angular velocity (3,) and specific force (3,), which nothing may be of."""
+        noise, step = self.noise, np.zeros((len(self.place), SIZE, SIZE))
+        step[:, P, V] = np.eye(3) * dt
+        added = np.zeros(SIZE)
+        if self.inertial:
+            turn, pull = gyro - self.gyro_bias, force - self.force_bias
+            world = np.einsum("hij,hj->hi", self.attitude, pull) - (0.0, 0.0, GRAVITY)
+            step[:, V, A] = -self.attitude @ _cross(pull) * dt
+            step[:, V, F] = -self.attitude * dt
+            step[:, A, A] = -_cross(turn) * dt
+            step[:, A, G] = -np.eye(3) * dt
+            self.attitude = self.attitude @ _rotation(turn * dt)
+            added[V], added[A] = noise.force**2 * dt, noise.gyro**2 * dt
+            added[G], added[F] = noise.gyro_bias**2 * dt, noise.force_bias**2 * dt
+        else:
+            world = np.zeros_like(self.velocity)
+            added[P], added[V] = noise.acceleration**2 * dt**3 / 3, noise.acceleration**2 * dt
+        self.place = self.place + self.velocity * dt + 0.5 * world * dt**2
+        self.velocity = self.velocity + world * dt
+        added[H] = noise.height_offset**2 * dt
+        whole = np.eye(SIZE) + step
+        self.covariance = whole @ self.covariance @ whole.transpose(0, 2, 1) + np.diag(added)
+        self.covariance = (self.covariance + self.covariance.transpose(0, 2, 1)) / 2
+
+    def hear(self, range_m: float, noise_m: float, errors: RangeErrors, arm_m: Floats, anchor_m: Floats) -> Heard:
+        """Correct by a range to an anchor (3,); return what the filters made of it."""
+        towards = self.place - anchor_m
+        if self.inertial:
+            towards = towards + self.attitude @ arm_m
+        else:
+            # Heading is unknown: a lever arm may point anywhere.
+            noise_m = float(np.hypot(noise_m, np.hypot(arm_m[0], arm_m[1]) / np.sqrt(2)))
+            towards = towards + np.array([0.0, 0.0, arm_m[2]])
+        distance = np.maximum(np.linalg.norm(towards, axis=1), 1e-6)
+        row = np.zeros((len(distance), SIZE))
+        row[:, P] = towards / distance[:, None]
+        if self.inertial:
+            row[:, A] = -np.einsum("hi,hij->hj", row[:, P], self.attitude @ _cross(np.tile(arm_m, (len(distance), 1))))
+        innovation = range_m - distance
+        reach = np.einsum("hij,hj->hi", self.covariance, row)
+        variance = np.einsum("hi,hi->h", row, reach) + noise_m**2
+        heard = weighed(innovation, variance, errors)
+        self.likelihood = self.likelihood + heard.log_density
+        self._correct(reach, variance, heard)
+        return heard
+
+    def level(self, height_m: float) -> None:
+        """Correct by the height above the world's zero, less an offset that the sensor may have."""
+        innovation = height_m - self.place[:, 2] - self.offset
+        reach = self.covariance[:, :, 2] + self.covariance[:, :, H]
+        variance = reach[:, 2] + reach[:, H] + self.noise.height_m**2
+        errors = RangeErrors(share=1e-6, least_m=0.0, detour_m=1.0, outlier=0.05, outlier_m=1.0)
+        self._correct(reach, variance, weighed(innovation, variance, errors))
+
+    def pulled(self, force: Floats, std: float) -> None:
+        """Take the mean specific force (3,) for gravity's, but for an acceleration of `std` m/s^2 an axis.
+
+        Tilt and bias are then known together: what one is off, the other makes up for.
+        """
+        pull = force - self.force_bias
+        rows = np.zeros((len(self.place), 3, SIZE))
+        rows[:, :, A], rows[:, :, F] = -self.attitude @ _cross(pull), -self.attitude
+        world = np.einsum("hij,hj->hi", self.attitude, pull) - (0.0, 0.0, GRAVITY)
+        self._observe(rows, -world, std)
+
+    def slow(self, speed_m_s: float) -> None:
+        """Take it that the body is no faster than it may be: what holds it in the room while no range comes."""
+        rows = np.zeros((len(self.place), 3, SIZE))
+        rows[:, :, V] = np.eye(3)
+        self._observe(rows, -self.velocity, speed_m_s)
+
+    def rest(self, gyro: Floats, force: Floats) -> None:
+        """Take the body for still: no velocity, no turning, no acceleration."""
+        rows = np.zeros((len(self.place), 3, SIZE))
+        rows[:, :, V] = np.eye(3)
+        self._observe(rows, -self.velocity, REST_M_S)
+        rows = np.zeros_like(rows)
+        rows[:, :, G] = np.eye(3)
+        self._observe(rows, gyro - self.gyro_bias, REST_RAD_S)
+        self.pulled(force, REST_M_S2)
+
+    def _observe(self, rows: Floats, innovation: Floats, std: float) -> None:
+        """Correct by a linear observation of three (headings, 3, states) with plain noise."""
+        reach = self.covariance @ rows.transpose(0, 2, 1)
+        gain = reach @ np.linalg.inv(rows @ reach + std**2 * np.eye(3))
+        self._move(np.einsum("hij,hj->hi", gain, innovation))
+        # Joseph's form: symmetric and positive whatever rounding does.
+        left = np.eye(SIZE) - gain @ rows
+        self.covariance = left @ self.covariance @ left.transpose(0, 2, 1) + std**2 * gain @ gain.transpose(0, 2, 1)
+
+    def restart(self, fix: Fix, speed_m_s: float) -> None:
+        """Begin anew at a fix, with the attitude and the biases that are there."""
+        self.place, self.velocity = np.tile(fix.place_m, (len(self.place), 1)), np.zeros_like(self.velocity)
+        for part in (P, V):
+            self.covariance[:, part, :] = self.covariance[:, :, part] = 0
+        self.covariance[:, P, P] = fix.covariance_m2
+        self.covariance[:, V, V] = np.eye(3) * speed_m_s**2
+
+    def _correct(self, reach: Floats, variance: Floats, heard: Heard) -> None:
+        gain = reach / variance[:, None]
+        self._move(gain * heard.noise_m[:, None])
+        change = (heard.variance_m2 - variance)[:, None, None]
+        self.covariance = self.covariance + gain[:, :, None] * gain[:, None, :] * change
+
+    def _move(self, by: Floats) -> None:
+        self.place, self.velocity = self.place + by[:, P], self.velocity + by[:, V]
+        self.offset = self.offset + by[:, H]
+        if self.inertial:
+            self.attitude = self.attitude @ _rotation(by[:, A])
+            self.gyro_bias, self.force_bias = self.gyro_bias + by[:, G], self.force_bias + by[:, F]
+
+
+def _cross(vectors: Floats) -> Floats:
+    """Return the matrices (n, 3, 3) that take cross products with vectors (n, 3)."""
+    found = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
+    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
+    return found
+
+
+def _rotation(vectors: Floats) -> Floats:
+    """Return rotations (n, 3, 3) by vectors (n, 3) in radians (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    small = np.maximum(angle, 1e-12)
+    skew = _cross(vectors)
+    one, two = np.sinc(angle / np.pi), 0.5 * np.sinc(small / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + one[:, None, None] * skew + two[:, None, None] * (skew @ skew))

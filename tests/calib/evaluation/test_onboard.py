@@ -1,0 +1,220 @@
+"""Localization by what is on board: flights written down as formulas, whose readings share no code with the filter."""
+
+import tarfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.calibration.error_model import ErrorModel
+from calib.calibration.formats import read_miluv
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import Curve
+from calib.errors import BadInputError, UnanswerableError
+from calib.evaluation.localization_display import onboard_json, onboard_text, write_onboard_tum
+from calib.evaluation.multilateration import multilaterate
+from calib.evaluation.onboard import OnboardSettings, localize_onboard
+from calib.evaluation.onboard_filter import Noise
+from calib.samples import _exchanges
+from tests.shared_data import shared
+from uwblink.importers import read_source
+from uwblink.recording.contents import Contents
+from uwblink.recording.schema import Poses, Tag
+
+ANCHORS = np.array([[3, 3, 0.3], [-3, 3, 2.2], [-3, -3, 0.4], [3, -3, 2.4], [0, 3.5, 1.2], [3.5, 0, 1.4]])
+ARMS = {10: (0.15, -0.15, -0.05), 11: (-0.15, 0.15, -0.05)}
+NOISE_M = 0.05
+IMU = Noise(force=0.02, gyro=0.002, force_bias=0.001, gyro_bias=0.0001, height_offset=0.001)
+BIASES = np.array([0.004, -0.006, 0.003]), np.array([0.15, -0.1, 0.08])
+
+
+def place(t):
+    """Where the body is: sums of sines, as fast as a careful drone."""
+    return np.stack(
+        [1.5 * np.sin(0.5 * t) + 0.3 * np.sin(1.3 * t), 1.3 * np.cos(0.4 * t), 1.4 + 0.4 * np.sin(0.7 * t)], axis=-1
+    )
+
+
+def attitude(t):
+    """How it is turned: heading all around, and a tilt."""
+    angles = np.stack([0.6 * t + 1.0, 0.1 * np.sin(0.9 * t), 0.08 * np.cos(1.1 * t)], axis=-1)
+    return Rotation.from_euler("ZYX", angles)
+
+
+def turning(t):
+    """Angular velocity in the axes of the body, from attitudes a hundredth of a millisecond apart."""
+    return (attitude(t - 5e-6).inv() * attitude(t + 5e-6)).as_rotvec() / 1e-5
+
+
+def pull(t):
+    """Specific force in the axes of the body, from second differences of the place."""
+    step = 1e-3
+    acceleration = (place(t + step) - 2 * place(t) + place(t - step)) / step**2
+    return attitude(t).inv().apply(acceleration + np.array([0, 0, 9.81]))
+
+
+def flight(seconds=20.0, seed=1, reflected=0.0, rate=50.0, start=0.0):
+    """A flight among anchors with inertial readings at 100 Hz and heights at 10, with the noise of `IMU`."""
+    rng = np.random.default_rng(seed)
+    t = start + np.arange(0, seconds, 1 / rate)
+    tag = np.where(np.arange(len(t)) % 2, 10, 11)
+    anchor = rng.integers(0, len(ANCHORS), len(t))
+    antenna = place(t) + attitude(t).apply(np.array([ARMS[k] for k in tag.tolist()]))
+    measured = np.linalg.norm(antenna - ANCHORS[anchor], axis=1) + NOISE_M * rng.normal(size=len(t))
+    measured += np.where(rng.random(len(t)) < reflected, rng.exponential(0.35, len(t)), 0.0)
+    ns = 10**12
+    power = np.full((2, len(t)), -85.0)
+    exchanges = _exchanges((t * 1e9).astype(np.int64) + ns, np.column_stack([tag, anchor]), measured, power)
+    ti = start + np.arange(-1.0, seconds + 1, 0.01)
+    # White noise of a density d in readings 10 ms apart has the standard deviation d / sqrt(10 ms).
+    gyro = turning(ti) + BIASES[0] + rng.normal(size=(len(ti), 3)) * IMU.gyro / 0.1
+    force = pull(ti) + BIASES[1] + rng.normal(size=(len(ti), 3)) * IMU.force / 0.1
+    columns = dict(zip(("wx", "wy", "wz", "ax", "ay", "az"), np.hstack([gyro, force]).T, strict=True))
+    th = start + np.arange(0, seconds, 0.1)
+    height = place(th)[:, 2] + 0.12 + IMU.height_m * rng.normal(size=len(th))
+    tp = start + np.arange(-1.0, seconds + 1, 0.01)
+    names = [f"anchor{k}" for k in range(len(ANCHORS))]
+    poses = Poses(
+        np.concatenate([(tp * 1e9).astype(np.int64) + ns, np.full(len(names), ns)]),
+        np.array(["drone"] * len(tp) + names),
+        np.vstack([place(tp), ANCHORS]),
+        np.vstack([attitude(tp).as_quat(), np.tile([0.0, 0, 0, 1], (len(names), 1))]),
+    )
+    return Contents(
+        exchanges=exchanges,
+        tags=[Tag(k, "drone", arm) for k, arm in ARMS.items()]
+        + [Tag(k, name, (0.0, 0.0, 0.0)) for k, name in enumerate(names)],
+        poses=poses,
+        imu={"time_ns": (ti * 1e9).astype(np.int64) + ns, "body": np.full(len(ti), "drone"), **columns},
+        height={"time_ns": (th * 1e9).astype(np.int64) + ns, "body": np.full(len(th), "drone"), "height_m": height},
+    )
+
+
+def calibration(share=0.001):
+    tags = [*range(len(ANCHORS)), *ARMS]
+    zero, sigma = (Curve((0.0,) * 4 + (9.0,) * 4, (v,) * 4, 3, (0.0, 9.0)) for v in (0.0, NOISE_M))
+    errors = ErrorModel(
+        lifted=(0.1, 1.0), noise_m=(NOISE_M,) * 2, tail_share=(share,) * 2, least_m=0.0, detour_m=0.35,
+        outlier_share=1e-4, outlier_m=3.0,
+    )  # fmt: skip
+    return Calibration(
+        delays_ns=dict.fromkeys(tags, 0.0), delays_std_ns=dict.fromkeys(tags, 0.0), loss="mixture", scale_ns=0.1,
+        lift="mean-of-lifted", alpha_dbm=-82.0, speed_of_light=299702547.0, bias_curve=zero, sigma_curve=sigma,
+        errors=errors,
+    )  # fmt: skip
+
+
+def errors_of(track, after_s=0.0):
+    late = track.time_ns >= track.time_ns[0] + int(after_s * 1e9)
+    return np.linalg.norm(track.estimate_m[late] - track.truth_m[late], axis=1)
+
+
+def test_imu_height_and_ranges_find_place_and_heading():
+    (track,) = localize_onboard(flight(reflected=0.1), calibration(0.1), OnboardSettings(noise=IMU))
+    assert track.used == "ranges, imu, height"
+    wrong = errors_of(track, 3.0)
+    assert np.sqrt(np.mean(wrong**2)) < 0.08
+    t = (track.time_ns - 10**12) * 1e-9
+    off = (attitude(t).inv() * Rotation.from_quat(track.attitude)).magnitude()
+    # Headings begin all around; turns and accelerations tell.
+    assert np.degrees(off[t > 10].max()) < 6
+    assert track.restarts_s == ()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_it_knows_how_good_it_is(seed):
+    (track,) = localize_onboard(flight(seed=seed), calibration(), OnboardSettings(noise=IMU))
+    late = track.time_ns > track.time_ns[0] + 5_000_000_000
+    # Errors of the state last for a second: fifteen independent values of three, known to 15 % each way.
+    assert 1.5 < np.mean(track.nees[late]) < 5.0
+    settled = track.range_time_ns > track.time_ns[0] + 5_000_000_000
+    assert np.mean(track.nis[settled]) == pytest.approx(1.0, abs=0.17)
+    sure = replace(calibration(), errors=replace(calibration().errors, noise_m=(0.02, 0.02)))
+    (found_out,) = localize_onboard(flight(seed=seed), sure, OnboardSettings(noise=IMU))
+    assert np.mean(found_out.nis[settled[: len(found_out.nis)]]) > 2
+
+
+@pytest.mark.parametrize("model", ["imu", "constant-velocity"])
+@pytest.mark.parametrize("away", [(5.0, 0.0, 0.0), (-3.0, 4.0, 0.0), (0.0, -10.0, 0.0), (7.0, 7.0, 1.0)])
+def test_a_wrong_start_is_left_within_two_seconds(model, away):
+    start = tuple((place(np.array(0.0)) + away).tolist())
+    settings = OnboardSettings(model=model, noise=IMU if model == "imu" else Noise(), start_m=start)
+    (track,) = localize_onboard(flight(6.0, reflected=0.1), calibration(0.1), settings)
+    first = np.linalg.norm(track.estimate_m[0] - track.truth_m[0])
+    assert first > 4
+    assert track.restarts_s
+    assert errors_of(track, 2.0).max() < (0.5 if model == "imu" else 0.7)
+
+
+def test_a_velocity_that_lasts_does_without_an_imu():
+    contents = flight(reflected=0.1)
+    settings = OnboardSettings(model="constant-velocity")
+    (track,) = localize_onboard(replace(contents, imu={}), calibration(0.1), settings)
+    assert track.used == "ranges, height"
+    # Lever arms of 21 cm point anywhere without a heading.
+    assert np.sqrt(np.mean(errors_of(track, 2.0) ** 2)) < 0.25
+    (blind,) = localize_onboard(replace(contents, imu={}, height={}), calibration(0.1), settings)
+    assert blind.used == "ranges"
+    assert np.sqrt(np.mean(errors_of(blind, 2.0) ** 2)) < 0.35
+
+
+def test_no_truth_is_needed(tmp_path):
+    contents = flight(5.0)
+    still = np.char.startswith(contents.poses.body, "anchor")
+    replace(contents, poses=contents.poses[still]).save(tmp_path / "f.uwb")
+    (track,) = localize_onboard(tmp_path / "f.uwb", calibration(), OnboardSettings(noise=IMU))
+    assert np.isnan(track.rmse_m)
+    write_onboard_tum([track], tmp_path / "blind")
+    assert [path.name for path in (tmp_path / "blind").iterdir()] == ["f_uwb-drone-imu.tum"]
+    assert onboard_json([track])[0]["rmse_m"] is None
+    assert "used: ranges, imu, height" in onboard_text([track], OnboardSettings())
+    assert "no truth to judge by" in repr(track)
+    (known,) = localize_onboard(contents, calibration(), OnboardSettings(noise=IMU))
+    np.testing.assert_allclose(track.estimate_m, known.estimate_m, atol=1e-6)
+    write_onboard_tum([known], tmp_path / "both")
+    truth = np.loadtxt(tmp_path / "both" / "memory-drone-imu-truth.tum")
+    t = (known.time_ns - 10**12) * 1e-9
+    np.testing.assert_allclose(truth[:, 1:4], place(t), atol=1e-3)
+    # Attitudes are those of the nearest pose, 5 ms away at most.
+    assert (attitude(t).inv() * Rotation.from_quat(truth[:, 4:])).magnitude().max() < 0.005
+
+
+def test_what_cannot_be_localized():
+    contents = flight(3.0)
+    with pytest.raises(UnanswerableError, match="no inertial readings of drone; choose the model constant-velocity"):
+        localize_onboard(replace(contents, imu={}), calibration())
+    few = contents.poses[np.flatnonzero(~np.isin(contents.poses.body, ["anchor0", "anchor1", "anchor2", "anchor3"]))]
+    with pytest.raises(UnanswerableError, match="2 tags stay in one place"):
+        localize_onboard(replace(contents, poses=few), calibration())
+    with pytest.raises(BadInputError, match="`model`: found 'magic', allowed: imu, constant-velocity"):
+        OnboardSettings(model="magic")
+    with pytest.raises(BadInputError, match="`start_m`"):
+        OnboardSettings(start_m=(0.0, np.nan, 1.0))
+
+
+def test_multilateration_is_exact_and_leaves_a_reflection_out():
+    true = np.array([0.7, -1.1, 1.9])
+    exact = np.linalg.norm(true - ANCHORS, axis=1)
+    np.testing.assert_allclose(multilaterate(exact, ANCHORS, 0.0).place_m, true, atol=1e-6)
+    twice, reflected = np.tile(ANCHORS, (2, 1)), np.tile(exact, 2)
+    reflected[[2, 9]] += 3.0, 0.8
+    assert np.linalg.norm(multilaterate(reflected, twice, 0.0).place_m - true) < 0.15
+    # Three anchors leave two mirrored places, between which a height decides.
+    low = multilaterate(exact[:3], ANCHORS[:3] * [1, 1, 0] + [0, 0, 1.0], 0.0, 1.9)
+    assert low.place_m[2] > 1.0
+
+
+def test_a_real_flight_by_imu_height_and_ranges_alone(tmp_path):
+    """The dataset's own flight among obstacles: a range to an anchor in 1.2 s, gaps of 6 s, published calibration."""
+    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as archive:
+        archive.extractall(tmp_path, filter="data")
+    contents = read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv")
+    known = read_miluv(shared("miluv_published_calibration.json"))
+    tracks = localize_onboard(contents, known)
+    rmse = {track.body: track.rmse_m for track in tracks}
+    assert sorted(rmse) == ["ifo001", "ifo002", "ifo003"]
+    # Measured: 0.78, 0.94 and 1.94 m.
+    assert rmse["ifo001"] < 1.0
+    assert rmse["ifo002"] < 1.2
+    assert rmse["ifo003"] < 2.5
