@@ -34,6 +34,7 @@ class Recipe:
 
     `share` is the share of reflected ranges, or bounds between which each pair draws its own. A reflection lasts
     `lasts_s` on average (0: each range on its own). `by_power` is how much of the share goes with weak power (0 to 1).
+    By `lever_m` the antenna of tag 2 stands elsewhere on its body than true distances say.
     """
 
     tags: int = 5
@@ -49,6 +50,7 @@ class Recipe:
     power_spread_db: float = 3.0
     noise_m: float = 0.06
     unequal_noise: float = 0.0
+    lever_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,9 +74,10 @@ def sigma_m(lifted: Floats, noise_m: float) -> Floats:
     return np.asarray(noise_m * (0.7 + 0.6 / (1 + 2 * lifted)))
 
 
-def make(recipe: Recipe, seed: int) -> World:
-    """Draw a world."""
-    rng = np.random.default_rng([seed, 90_210])
+def make(recipe: Recipe, seed: int, flight: int = 0) -> World:
+    """Draw a world; another `flight` is of the same boards and walls, with other motion, reflections and noise."""
+    rng = np.random.default_rng([seed, 90_210, flight] if flight else [seed, 90_210])
+    known = make(recipe, seed).notes if flight else {}
     count = int(recipe.seconds * recipe.per_second)
     pairs = np.array(list(combinations(range(1, recipe.tags + 1), 2)))
     time_s = np.sort(rng.uniform(0, recipe.seconds, count))
@@ -84,13 +87,14 @@ def make(recipe: Recipe, seed: int) -> World:
     truth = _distance(rng, recipe, time_s, first, second)
     powers = _powers(rng, recipe, time_s, first, second, truth)
     lifted = np.mean(10 ** ((powers + 82) / 10), axis=0)
-    delays = np.concatenate([[0.0], rng.uniform(-0.4, 0.3, recipe.tags)])
-    skew = rng.normal(0, 3e-6, recipe.tags + 1)
+    delays = known.get("delays_ns", np.concatenate([[0.0], rng.uniform(-0.4, 0.3, recipe.tags)]))
+    skew = known.get("skew", rng.normal(0, 3e-6, recipe.tags + 1))
     ratio = (1 + skew[first]) / (1 + skew[second])
-    noisy = np.exp(recipe.unequal_noise * rng.normal(size=recipe.tags + 1))
+    noisy = known.get("noisy", np.exp(recipe.unequal_noise * rng.normal(size=recipe.tags + 1)))
     scale = np.sqrt((noisy[first] ** 2 + noisy[second] ** 2) / 2)
     error = bias_m(lifted) + sigma_m(lifted, recipe.noise_m) * scale * rng.standard_t(12, count) * np.sqrt(10 / 12)
-    error += _detours(rng, recipe, time_s, which, len(pairs), lifted)
+    shares = known.get("shares", rng.uniform(*recipe.share, len(pairs)))
+    error += _detours(rng, recipe, time_s, which, shares, lifted)
     error += _wander(rng, recipe, time_s, which, len(pairs))
     raw = truth + error - LIGHT_M_PER_NS * (0.5 * delays[first] + 0.5 * ratio * delays[second])
     ranges = Ranges(
@@ -100,7 +104,7 @@ def make(recipe: Recipe, seed: int) -> World:
         target=second.astype(np.int64),
         protocol=np.full(count, "ds"),
         raw_m=raw,
-        truth_m=truth,
+        truth_m=truth - _elsewhere(recipe, time_s, first, second),
         weight_initiator=np.full(count, 0.5),
         weight_target=0.5 * ratio,
         fpp1_dbm=powers[0],
@@ -113,7 +117,15 @@ def make(recipe: Recipe, seed: int) -> World:
         delays_ns={tag: float(delays[tag]) for tag in range(1, recipe.tags + 1)},
         bias_m=bias_m,
         lifted=lifted,
+        notes={"delays_ns": delays, "skew": skew, "noisy": noisy, "shares": shares},
     )
+
+
+def _elsewhere(recipe: Recipe, time_s: Floats, first: Any, second: Any) -> Floats:
+    """Return how much farther tag 2 is, whose body turns, than its lever arm says."""
+    other = np.where(first == 2, second, first)
+    toward = np.cos(0.5 * time_s + 2 * np.pi * other / recipe.tags)
+    return np.asarray(recipe.lever_m * toward * ((first == 2) | (second == 2)))
 
 
 def _distance(rng: np.random.Generator, recipe: Recipe, time_s: Floats, first: Any, second: Any) -> Floats:
@@ -145,17 +157,16 @@ def _powers(rng: np.random.Generator, recipe: Recipe, time_s: Floats, first: Any
 
 
 def _detours(
-    rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any, pairs: int, lifted: Floats
+    rng: np.random.Generator, recipe: Recipe, time_s: Floats, which: Any, shares: Floats, lifted: Floats
 ) -> Floats:
-    """Return what reflections add to each range."""
-    shares = rng.uniform(*recipe.share, pairs)
+    """Return what reflections add to each range, whose share goes by pair."""
     count = len(time_s)
     if not recipe.lasts_s:
         weak = 1 / (1 + (lifted / np.median(lifted)) ** 2)
         likely = shares[which] * (1 - recipe.by_power + 2 * recipe.by_power * weak)
         return np.asarray(np.where(rng.random(count) < likely, _lengths(rng, recipe, count), 0.0))
     found = np.zeros(count)
-    for pair in range(pairs):
+    for pair in range(len(shares)):
         rows, share = np.flatnonzero(which == pair), float(np.clip(shares[pair], 1e-3, 0.95))
         now, reflected = 0.0, rng.random() < share
         while now < recipe.seconds:
@@ -217,6 +228,8 @@ CLEAN: Final[dict[str, Recipe]] = {
     "twenty tags": Recipe(tags=20),
     "three tags": Recipe(tags=3),
     "unequal noise": Recipe(unequal_noise=0.4),
+    "a lever arm 2 cm off": Recipe(lever_m=0.02),
+    "twelve tags, six ranges a pair": Recipe(tags=12, seconds=78, per_second=5, share=(0, 0.5)),
 }
 
 

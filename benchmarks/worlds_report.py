@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 import calib
+from benchmarks import held_back
 from benchmarks.worlds import CLEAN, FIRST_REPORTED, PLANTED, Recipe, World, make
 from calib.calibration.power_curves import basis
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
 LOSSES = ("mixture", "cauchy")
+SAMPLES = PAGE.parents[2] / "shared" / "data" / "icra2023_bias_fpp.csv"
 SEEDS = 20
 DOUBTED = 200
 PLANTINGS = 3
@@ -36,10 +38,15 @@ class Outcome:
     curve_mm: float
     band_holds: float
     doubted: bool
+    z_std: float = float("nan")
+    inside_95: float = float("nan")
 
 
-def judged(world: World, loss: str) -> Outcome:
-    """Fit a world and compare with what is behind it, after the common shift has been taken out."""
+def judged(world: World, loss: str, other: World | None = None) -> Outcome:
+    """Fit a world and compare with what is behind it, after the common shift has been taken out.
+
+    The ranges of another flight are held against what the calibration says of them.
+    """
     found = calib.fit(world.ranges, loss=loss)
     known = found.calibration
     tags = list(world.delays_ns)
@@ -53,26 +60,29 @@ def judged(world: World, loss: str) -> Outcome:
     band = np.sqrt(np.einsum("ij,jk,ik->i", splines, np.array(uncertainty.bias_m2), splines))
     wrong = known.bias_curve(grid) - world.bias_m(grid)
     wrong = wrong - wrong.mean()
+    held = None if other is None else calib.evaluate(other.ranges, known).overall
     return Outcome(
         errors_ps=tuple((1e3 * error).tolist()),
         std_ps=tuple((1e3 * std).tolist()),
         curve_mm=1e3 * float(np.sqrt(np.mean(wrong**2))),
         band_holds=float(np.mean(np.abs(wrong) < 1.96 * band)),
         doubted=bool(found.warnings),
+        z_std=held.total_std if held else float("nan"),
+        inside_95=held.inside_95 if held else float("nan"),
     )
 
 
 def clean(name: str, seed: int) -> dict[str, Outcome]:
     """Judge every loss in a world without a fault."""
-    world = make(CLEAN[name], FIRST_REPORTED + seed)
-    return {loss: judged(world, loss) for loss in LOSSES}
+    world, other = (make(CLEAN[name], FIRST_REPORTED + seed, flight) for flight in (0, 1))
+    return {loss: judged(world, loss, other) for loss in LOSSES}
 
 
-def alarmed(seed: int) -> bool:
-    """Return whether a fit doubts a sound world, of a kind that goes by the seed."""
-    kinds = [name for name in CLEAN if CLEAN[name].seconds <= 240 and CLEAN[name].tags <= 5]
-    world = make(CLEAN[kinds[seed % len(kinds)]], FIRST_REPORTED + 5000 + seed)
-    return bool(calib.fit(world.ranges).warnings)
+def alarmed(seed: int) -> list[str]:
+    """Return the warnings of a fit to a sound world, of a kind that goes by the seed."""
+    kinds = [name for name, one in CLEAN.items() if one.seconds <= 240 and one.tags <= 5 and not one.lever_m]
+    world = make(CLEAN[kinds[seed % len(kinds)]], FIRST_REPORTED + 20_000 + seed)
+    return calib.fit(world.ranges).warnings
 
 
 def planted(name: str, seed: int) -> str:
@@ -91,8 +101,9 @@ def planted(name: str, seed: int) -> str:
 def table(outcomes: dict[str, list[dict[str, Outcome]]]) -> list[str]:
     """Return the rows of sound worlds."""
     rows = [
-        "| world | loss | delays, rms | 95 % intervals that hold | bias curve, rms | its 95 % band holds |",
-        "|---|---|---|---|---|---|",
+        "| world | loss | delays, rms | 95 % intervals that hold | bias curve, rms | its 95 % band holds | "
+        'z-std of another flight | its "95 %" holds |',
+        "|---|---|---|---|---|---|---|---|",
     ]
     for name, runs in outcomes.items():
         for loss in LOSSES:
@@ -103,7 +114,9 @@ def table(outcomes: dict[str, list[dict[str, Outcome]]]) -> list[str]:
                 f"| {name} | {loss} | {np.sqrt(np.mean(errors**2)):.1f} ps | "
                 f"{100 * np.mean(np.abs(errors) < 1.96 * std):.0f} % | "
                 f"{np.mean([outcome.curve_mm for outcome in some]):.1f} mm | "
-                f"{100 * np.mean([outcome.band_holds for outcome in some]):.0f} % |"
+                f"{100 * np.mean([outcome.band_holds for outcome in some]):.0f} % | "
+                f"{np.mean([outcome.z_std for outcome in some]):.2f} | "
+                f"{100 * np.mean([outcome.inside_95 for outcome in some]):.1f} % |"
             )
     return rows
 
@@ -111,16 +124,19 @@ def table(outcomes: dict[str, list[dict[str, Outcome]]]) -> list[str]:
 def main() -> None:
     """Run all worlds on all cores, and put the tables into the page."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else SEEDS
+    doubted = int(sys.argv[2]) if len(sys.argv) > 2 else DOUBTED
     with ProcessPoolExecutor() as pool:
         runs = {name: list(pool.map(clean, [name] * seeds, range(seeds))) for name in CLEAN}
-        alarms = sum(pool.map(alarmed, range(DOUBTED)))
+        alarms = list(pool.map(alarmed, range(doubted)))
         takes = {name: list(pool.map(planted, [name] * PLANTINGS, range(PLANTINGS))) for name in PLANTED}
     rows = [f"| {name} | {', '.join(sorted(set(found)))} |" for name, found in takes.items()]
     text = TEXT.format(
         seeds=seeds,
         table="\n".join(table(runs)),
-        alarms=alarms,
-        doubted=DOUBTED,
+        alarms=sum(any(TOO_SHORT not in text for text in said) for said in alarms),
+        short=sum(bool(said) and all(TOO_SHORT in text for text in said) for said in alarms),
+        doubted=doubted,
+        samples=_samples(),
         plantings=PLANTINGS,
         rows="\n".join(rows),
     )
@@ -130,22 +146,37 @@ def main() -> None:
     PAGE.write_text(kept.rstrip() + f"\n\n{BEGIN}\n{text}\n{END}\n")
 
 
+def _samples() -> str:
+    """Return the section on the paper's samples, nothing where they are not at hand."""
+    if not SAMPLES.exists():
+        return ""
+    return SAMPLES_TEXT.format(rows="\n".join(held_back.rows(SAMPLES)))
+
+
+TOO_SHORT = "independent"
+
+SAMPLES_TEXT = """
+**The paper's own samples** (17 118 of ICRA 2023, not shipped), given to three tags at random and held back from the fit. Z-scores and "95 %" are those of the total uncertainty, the cubic is a plain one by least squares:
+
+{rows}
+"""
+
 TEXT = """## Worlds that share nothing with the simulator
 
 Written by `make worlds`: {seeds} seeds of each of [these worlds](../benchmarks/worlds.py), whose code and whose shapes of noise and detours are neither the simulator's nor the fit's; 38 400 ranges of five tags in 240 s if not said otherwise.
 Seeds below 10 000 were used to choose what the fit does by default, these are others. "Persistent 1 s, 2 cm over 3 s" are reflections that last a second on average and an error of 2 cm that forgets itself in 3 s.
-Errors are those about the common shift.
+Errors are those about the common shift. Another flight is one of the same boards and pairs, with other motion, reflections and noise, held against the total uncertainty.
 
 {table}
 
-**False alarms**: {alarms} of {doubted} fits of sound worlds of up to 240 s (all kinds above in turn) came with a warning.
+**False alarms**: {alarms} of {doubted} fits of sound worlds of up to 240 s (all kinds above in turn, seeds used for nothing else) came with a warning; {short} more said that errors last too long for so short a recording, as they do in persistent worlds.
 
 **What was planted**, and how the fit took it ({plantings} seeds each; "right" is within three printed standard errors without a word, "SILENT" wrong without one):
 
 | planted | taken |
 |---|---|
 {rows}
-"""
+{samples}"""
 
 
 if __name__ == "__main__":
