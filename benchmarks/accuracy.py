@@ -110,8 +110,8 @@ def main() -> None:
 
 
 PREFACE = """Written by `make accuracy`: {seeds} seeds of [the icra2023 training flight](../scenarios/icra2023/train.toml), 38 400 exchanges each, every seed with
-other noise, motion and clocks. Reflections are the share of
-time in which the path of a pair is a detour, exponential with 35 cm on average and for 0.15 s on average. Errors are taken after the shift common to all delays has been exchanged with the curve's constant.
+other noise, motion and clocks. Reflections are the share of exchanges with a detour; they last for 0.15 s on average and are exponential with 35 cm.
+Errors are taken after the shift common to all delays has been exchanged with the curve's constant.
 
 """
 AFTERWORD = """

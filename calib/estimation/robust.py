@@ -21,7 +21,7 @@ still leaves a Cauchy loss two thirds of least squares' efficiency on clean data
 """
 
 SCALE_FLOOR_NS: Final = 0.002
-MAX_STEPS: Final = 100
+MAX_STEPS: Final = 400
 SETTLING: Final = 4
 """Steps of reweighting during which an unknown scale follows the residuals; then it stands."""
 
@@ -100,9 +100,10 @@ def robust_fit(
         step = None if curvature is None else np.linalg.solve(curvature, downhill)
         if step is None or np.max(np.abs(reach * step)) > NEWTON_M:
             step, curvature = np.linalg.lstsq(_normal(matrix, weight, ridge), downhill, rcond=1e-13)[0], None
-        x = np.asarray(x + step)
+        x, before = np.asarray(x + step), residual
         residual = error + matrix @ x
-        moved = float(np.max(np.abs(reach * step)))
+        # What no range determines may go where rounding takes it.
+        moved = float(np.max(np.abs(residual - before)))
         steps += 1
         if scale is None and steps <= SETTLING:
             width = scale_of(residual)
