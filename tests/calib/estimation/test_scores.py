@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import exponnorm
 
-from calib.estimation.pair_mixture import Errors, Layout, _scores
+from calib.estimation.pair_mixture import Errors, Layout, _scores, fit_pair_mixture
 from calib.estimation.reflections import Shape, expected
 from calib.estimation.scores import Scores, Sort, inverse_of
 
@@ -138,3 +138,14 @@ def test_eliminating_places_first_gives_the_same_inverse():
     columns += [np.eye(places)[place] * rng.normal(size=(400, 1)) for _ in range(sorts)]
     matrix = np.hstack(columns).T @ np.hstack(columns) + np.eye(common + places * sorts)
     np.testing.assert_allclose(inverse_of(matrix, places, sorts), np.linalg.inv(matrix), rtol=1e-6, atol=1e-9)
+
+
+def test_where_reflections_last_pairs_are_drawn_together():
+    rng = np.random.default_rng(8)
+    some = errors(n=3000, pairs=6)
+    reflected = rng.random(3000) < np.linspace(0.05, 0.5, 6)[some.place // 8]
+    some = replace(some, error=rng.normal(0, 0.05, 3000) + reflected * rng.exponential(0.4, 3000))
+    nothing = np.zeros(2), np.eye(2)
+    spread = [np.std(fit_pair_mixture(some, *nothing, lasting).of("pair_share")) for lasting in (1.0, 30.0)]
+    # Were each range worth a thirtieth, a pair's share would be known to a fifth of its odds.
+    assert spread[1] < 0.8 * spread[0]
