@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration, CorrectedRanges, require_calibration
 from calib.errors import BadInputError, UnanswerableError
+from calib.evaluation.multilateration import multilaterate
 from calib.evaluation.range_updates import Heard, RangeErrors, gated, weighed
 from calib.ranges import Ranges
 from calib.sources import Data, Flight, load_flight
@@ -34,7 +35,11 @@ TUNED_OVER: Final = (0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.6, 1.0)
 TUNED_RANGES: Final = 2500
 """Ranges of each body of a training flight by which they are judged."""
 
-FEWEST_REFUSED: Final = 4
+FEWEST_IN_WINDOW: Final = 12
+LOOK_EVERY: Final = 8
+LOST_NIS: Final = 9.0
+"""Where half of the latest ranges are off by more than three standard deviations, a filter is not where it thinks."""
+
 LEAST_OUTLIERS: Final = 1e-3
 LEAST_OUTLIER_M: Final = 3.0
 """What a filter has to reckon with that a calibration has not seen: a thousandth of any size."""
@@ -45,19 +50,21 @@ class Settings:
     """How the filters are set up.
 
     The velocity input comes at `velocity_rate_hz` with white noise of `velocity_std_mps` an axis; that is the process
-    noise. Percentages depend on it: the noisier velocity, the more the ranges decide. A range is taken when its squared
-    innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 % quantile);
-    the robust filter has no gate. A filter that believed none for `reopen_s` widens its uncertainty by the largest
-    innovation that it refused, so that it finds back from anywhere. `seeds` are runs with other noise, each body and
-    flight with its own; tracks are those of the first, `seed`.
+    noise. Percentages depend on it: the noisier velocity, the more the ranges decide. Filters begin at the true place,
+    but for noise of `initial_std_m` and an `initial_offset_m` that they do not know of. A range is taken when its
+    squared innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 %
+    quantile); the robust filter has no gate. A filter that cannot explain half of the ranges of the last `reopen_s`
+    begins anew where they say (`multilaterate`), so that it finds back from anywhere. `seeds` are runs with other
+    noise, each body and flight with its own; tracks are those of the first, `seed`.
     """
 
     velocity_std_mps: float = 0.3
     velocity_rate_hz: float = 100.0
     initial_std_m: float = 0.1
+    initial_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fixed_std_m: float | None = None
     gate: float = 10.83
-    reopen_s: float = 0.5
+    reopen_s: float = 1.0
     seed: int = 0
     seeds: int = 3
 
@@ -330,7 +337,8 @@ class _Noise:
         rng = np.random.default_rng([seed, *own])
         moves = np.diff(problem.place, axis=0, prepend=problem.place[:1])
         noise = rng.normal(size=moves.shape) * np.sqrt(_spread(problem, settings))[:, None]
-        return cls(problem.place[0] + rng.normal(size=3) * settings.initial_std_m, moves + noise)
+        start = problem.place[0] + rng.normal(size=3) * settings.initial_std_m + settings.initial_offset_m
+        return cls(start, moves + noise)
 
 
 def _spread(problem: _Problem, settings: Settings) -> Floats:
@@ -342,7 +350,7 @@ def _spread(problem: _Problem, settings: Settings) -> Floats:
 def _run(problem: _Problem, ranges: list[_Ranges], noises: list[_Noise], settings: Settings) -> list[list[Track]]:
     """Run filters with every noise, all at once: arrays are (filters, noises, ...). Return their tracks."""
     shape, count = (len(ranges), len(noises)), len(problem.rows)
-    time_s, spread, eye = problem.time_ns * 1e-9, _spread(problem, settings), np.eye(3)
+    spread, eye = _spread(problem, settings), np.eye(3)
     measured, variance = (np.array([getattr(r, name) for r in ranges]) for name in ("measured_m", "std_m"))
     variance = variance**2
     moves = np.array([noise.moves for noise in noises])
@@ -350,7 +358,7 @@ def _run(problem: _Problem, ranges: list[_Ranges], noises: list[_Noise], setting
     p = np.tile(eye * settings.initial_std_m**2, (*shape, 1, 1))
     estimate, covariance = np.empty((count, *shape, 3)), np.empty((count, *shape, 3, 3))
     nis, accepted = np.empty((count, *shape)), np.zeros((count, *shape), dtype=bool)
-    reopening = Reopening(shape, settings.reopen_s, float(time_s[0]))
+    began = np.zeros(shape, dtype=np.int64)
     for k in range(count):
         x = x + moves[:, k]
         p = p + spread[k] * eye
@@ -365,7 +373,12 @@ def _run(problem: _Problem, ranges: list[_Ranges], noises: list[_Noise], setting
         gain = ph / s[..., None]
         x = x + gain * heard.noise_m[..., None]
         p = p + gain[..., None] * gain[..., None, :] * (heard.variance_m2 - s)[..., None, None]
-        p = p + reopening.widening(heard.believed, innovation, float(time_s[k]))[..., None, None] * eye
+        for f, one in _lost(nis[: k + 1], problem, settings, began):
+            window = _Window.until(problem, moves[one], k, settings.reopen_s)
+            if window is not None:
+                fix = multilaterate(measured[f, window.first : k + 1], window.anchor_m, 0.0)
+                x[f, one], p[f, one] = fix.place_m, fix.covariance_m2
+                began[f, one] = k + 1
         estimate[k], covariance[k], accepted[k] = x, p, heard.believed
     wrong = estimate - problem.place[:, None, None, :]
     nees = np.einsum("kfsi,kfsi->kfs", wrong, np.linalg.solve(covariance, wrong[..., None])[..., 0])
@@ -388,6 +401,21 @@ def _run(problem: _Problem, ranges: list[_Ranges], noises: list[_Noise], setting
     ]
 
 
+def _lost(nis: Floats, problem: _Problem, settings: Settings, began: Ints) -> list[tuple[int, int]]:
+    """Return which filters (filter, noise) cannot explain half of the latest ranges, looked at now and then.
+
+    `nis` (n, filters, noises) are those of all ranges so far; those before a filter `began` anew do not count.
+    """
+    last = len(nis) - 1
+    if last % LOOK_EVERY:
+        return []
+    first = int(np.searchsorted(problem.time_ns, problem.time_ns[last] - int(settings.reopen_s * 1e9)))
+    if last + 1 - first < FEWEST_IN_WINDOW:
+        return []
+    lost = (np.median(nis[first:], axis=0) > LOST_NIS) & (began <= first)
+    return [(int(f), int(s)) for f, s in np.argwhere(lost)]
+
+
 def _heard(innovation: Floats, variance: Floats, ranges: list[_Ranges], k: int, gate: float) -> Heard:
     """Return what all filters make of range k: a gate for most, the whole of its error for those who reckon with it."""
     heard = gated(innovation, variance, gate)
@@ -398,26 +426,28 @@ def _heard(innovation: Floats, variance: Floats, ranges: list[_Ranges], k: int, 
     return heard
 
 
-class Reopening:
-    """Widens filters that believe nothing any more, by the largest innovation that they refused meanwhile."""
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """The latest ranges of a body: rows `first` to `last`, and where antennas would be, were it where it is now (n, 3).
 
-    def __init__(self, shape: tuple[int, ...], after_s: float, start_s: float) -> None:
-        """Begin at `start_s` with filters that just believed a range."""
-        self._after_s = after_s
-        self._believed_s = np.full(shape, start_s)
-        self._refused = np.zeros(shape, dtype=np.int64)
-        self._largest = np.zeros(shape)
+    What it moved meanwhile is known from its velocity, and counted to the anchors.
+    """
 
-    def widening(self, believed: Bools, innovation_m: Floats, now_s: float) -> Floats:
-        """Return what to add to the variance of each axis, in square metres; nothing for most."""
-        self._refused = np.where(believed, 0, self._refused + 1)
-        self._largest = np.where(believed, 0.0, np.maximum(self._largest, np.abs(innovation_m)))
-        self._believed_s = np.where(believed, now_s, self._believed_s)
-        lost = (self._refused >= FEWEST_REFUSED) & (now_s - self._believed_s >= self._after_s)
-        widening = np.where(lost, self._largest**2, 0.0)
-        self._believed_s = np.where(lost, now_s, self._believed_s)
-        self._refused, self._largest = np.where(lost, 0, self._refused), np.where(lost, 0.0, self._largest)
-        return widening
+    first: int
+    last: int
+    anchor_m: Floats
+
+    @classmethod
+    def until(cls, problem: _Problem, moves: Floats, last: int, seconds: float) -> _Window | None:
+        """Return the window that ends at a range, None where it holds too few or does not reach back so far."""
+        began = problem.time_ns[last] - int(seconds * 1e9)
+        first = int(np.searchsorted(problem.time_ns, began))
+        if problem.time_ns[0] > began or last + 1 - first < FEWEST_IN_WINDOW:
+            return None
+        rows = slice(first, last + 1)
+        since = moves[first + 1 : last + 1][::-1].cumsum(axis=0)[::-1]
+        since = np.vstack([since, np.zeros(3)])
+        return cls(first, last, problem.other[rows] - problem.arm[rows] + since)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -108,9 +108,25 @@ def test_each_body_and_flight_has_noise_of_its_own(flights):
     assert again.rmse_m["raw"][0] == one.rmse_m["raw"][1]
 
 
+@pytest.mark.parametrize("offset", [(5.0, 0.0, 0.0), (0.0, -10.0, 0.0), (-7.0, 7.0, 0.0), (0.0, 0.0, 5.0)])
+def test_a_wrong_start_is_left_within_two_seconds(flights, offset):
+    calibration = fit(flights["train"].ranges[:12_000]).calibration
+    flight = flights["test1"]
+    early = flight.ranges.time_ns < flight.ranges.time_ns.min() + 8_000_000_000
+    short = replace(flight, ranges=flight.ranges[early])
+    for one in localize(short, calibration, Settings(seeds=1, initial_offset_m=offset)):
+        for track in one.tracks.values():
+            wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
+            assert wrong[0] > 2
+            late = track.time_ns > track.time_ns[0] + 2_000_000_000
+            assert wrong[late].max() < 0.8
+
+
 @pytest.mark.parametrize("far_m", [3.0, 10.0])
-def test_a_wrong_start_does_not_lock_the_filter_out(flights, far_m):
+def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m):
     flight, calibration = clean(flights["test1"])
+    soon = flight.ranges.time_ns < flight.ranges.time_ns.min() + 15_000_000_000
+    flight = replace(flight, ranges=flight.ranges[soon])
     # Metres wrong, and sure of a decimetre: the gate refuses nearly everything until it reopens.
     jump = replace(flight, ranges=replace(flight.ranges, raw_m=flight.ranges.raw_m.copy()))
     early = jump.ranges.time_ns < jump.ranges.time_ns.min() + 2_000_000_000
