@@ -14,7 +14,7 @@ SCENARIOS = sorted((ROOT / "scenarios").rglob("*.toml"))
 
 def test_the_scenarios_that_the_readme_promises_are_there():
     names = {p.relative_to(ROOT / "scenarios").as_posix() for p in SCENARIOS}
-    expected = {"noiseless.toml", *(f"icra2023/{n}.toml" for n in ("train", "test1", "test2"))}
+    expected = {"noiseless.toml", "room/room.toml", *(f"icra2023/{n}.toml" for n in ("train", "test1", "test2"))}
     expected |= {"anchors_and_tag/anchors_and_tag.toml", "anchors_and_tag/bipartite.toml", "new_tag/new_tag.toml"}
     expected |= {"day30/train.toml", "collisions/aloha.toml", "nlos_office/office.toml", "wrap/wrap.toml"}
     expected |= {"two_boards_on_a_bench/bench.toml", "lasting_reflections/hall.toml"}

@@ -10,6 +10,7 @@ PS: Final = 1e-12
 NS: Final = 1e-9
 US: Final = 1e-6
 MS: Final = 1e-3
+MM: Final = 1e-3
 PPM: Final = 1e-6
 
 PS_PER_S: Final = 1e12

@@ -19,7 +19,7 @@ from uwbsim.scenario.airtime import TURNAROUND_S, exchange_air_s, exchange_s
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.devices import Devices, GroupDelay, Profile
 from uwbsim.scenario.motion import Motion, RandomFlight, Static, Waypoints
-from uwbsim.scenario.radio import Obstacle, Radio, Room, Shadow, Spline, TwoStateMultipath
+from uwbsim.scenario.radio import GeometricMultipath, Obstacle, Radio, Room, Shadow, Spline, TwoStateMultipath
 from uwbsim.units import MS, NS, PPM, US
 
 ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
@@ -300,6 +300,7 @@ class Scenario(Section):
                     known = ", ".join(map(str, ids))
                     raise ValueError(f"ranging.pairs: found tag {tag_id}, the tags are {known}")
         self._check_reflections(ids)
+        self._check_geometric()
         self._check_places()
         self._check_plan(ids)
         fastest = self.ranging.fastest_hz(self.radio.preamble_symbols)
@@ -320,6 +321,21 @@ class Scenario(Section):
                 if tag_id not in ids:
                     there = ", ".join(map(str, ids))
                     raise ValueError(f"radio.multipath.pairs[{k}].tags: found tag {tag_id}, the tags are {there}")
+
+    def _check_geometric(self) -> None:
+        """The geometric model takes reflections from materials, and needs a room to put things into."""
+        model = self.radio.multipath
+        if not isinstance(model, GeometricMultipath):
+            return
+        if self.room and self.room.reflection_loss_db is not None:
+            raise ValueError(
+                f"room.reflection_loss_db: found {self.room.reflection_loss_db:g}, but in the geometric model surfaces "
+                "reflect as room.material does; leave it out"
+            )
+        if model.scatterers and self.room is None:
+            raise ValueError(
+                f"radio.multipath.scatterers: found {model.scatterers} and no room to put them into; give room, or 0"
+            )
 
     def _check_places(self) -> None:
         """Bodies must be inside the room, and tags of one body further apart than a wavelength."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId, Vector
 from uwbsim.scenario.devices import GroupDelay, check_grid
 from uwbsim.scenario.published_curves import BIAS, SIGMA
-from uwbsim.units import NS, PS
+from uwbsim.units import MM, MS, NS, PS
 
 MATERIALS: Final = {
     "air": (0.0, 1.0),
@@ -181,12 +181,44 @@ class Outages(Section):
     life_s: Annotated[float, Field(ge=0.01)] = 0.5
 
 
+class GeometricMultipath(Section):
+    """One impulse response from geometry: direct path, reflections off room and obstacles, and things in the room.
+
+    The room's surfaces and the obstacles' faces reflect as their materials do (Fresnel), less what their roughness
+    scatters; obstacles and bodies throw shadows with soft edges. `scatterers` are things at places of their own in the
+    room, drawn from the seed: each gives back what a mirror there would, less `scatter_loss_db` on average (with a
+    Rayleigh distribution of its field), later by what waves bounce around it, whose power dies out over `decay_ns`.
+    All paths add up with their phases. The response is computed for each pair every `step_ms`; of it follow first path,
+    powers, excess range, impulse response, and with `stamp_noise` what noise does to the leading edge: noise is
+    `threshold_to_noise` times below the first path's threshold, which is `radio.dynamic_range_db` below the strongest
+    tap, or at `radio.sensitivity_dbm`.
+    """
+
+    model: Literal["geometric"]
+    scatterers: Annotated[int, Field(ge=0, le=500)] = 32
+    scatter_loss_db: float = 3.0
+    decay_ns: Positive = 12.0
+    step_ms: Annotated[float, Field(ge=0.1, le=100)] = 5.0
+    stamp_noise: bool = True
+    threshold_to_noise: Positive = 12.0
+
+    @property
+    def decay_s(self) -> float:
+        """Return over which time the power of what bounces around falls to a share of 1/e."""
+        return self.decay_ns * NS
+
+    @property
+    def step_s(self) -> float:
+        """Return in seconds how often responses are computed."""
+        return self.step_ms * MS
+
+
 def _independent_unless_named(value: Any) -> Any:
     return {"model": "independent"} | value if isinstance(value, dict) else value
 
 
 Multipath = Annotated[
-    Annotated[IndependentMultipath | TwoStateMultipath, Field(discriminator="model")],
+    Annotated[IndependentMultipath | TwoStateMultipath | GeometricMultipath, Field(discriminator="model")],
     BeforeValidator(_independent_unless_named),
 ]
 
@@ -269,41 +301,79 @@ class Material(Section):
     index: Annotated[float, Field(ge=1)] = 1.0
 
 
+def _known(material: Any) -> Any:
+    if isinstance(material, str) and material not in MATERIALS:
+        raise ValueError(f"found {material!r}, known are {', '.join(MATERIALS)}")
+    return material
+
+
+KnownMaterial = Annotated[str | Material, AfterValidator(_known)]
+
+
 class Obstacle(Section):
-    """A box that waves go through, at a loss and late. `material` is a name or a table of its own."""
+    """A box that waves go through, at a loss and late. `material` is a name or a table of its own.
+
+    In the geometric model its faces reflect; `roughness_mm` is the standard deviation of their heights.
+    """
 
     name: str = "obstacle"
     min_m: Vector
     max_m: Vector
-    material: str | Material
+    material: KnownMaterial
+    roughness_mm: NotNegative = 3.0
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
             raise ValueError("min_m: must be below max_m in every direction")
-        if isinstance(self.material, str) and self.material not in MATERIALS:
-            raise ValueError(f"material: found {self.material!r}, known are {', '.join(MATERIALS)}")
         return self
 
     def properties(self) -> tuple[float, float]:
         """Return loss in dB a metre, and refractive index."""
-        if isinstance(self.material, str):
-            return MATERIALS[self.material]
-        return self.material.loss_db_per_m, self.material.index
+        return properties(self.material)
+
+    @property
+    def roughness_m(self) -> float:
+        """Return the standard deviation of its surface's heights in metres."""
+        return self.roughness_mm * MM
+
+
+def properties(material: str | Material) -> tuple[float, float]:
+    """Return loss in dB a metre and refractive index of a material, by its name or as given."""
+    if isinstance(material, str):
+        return MATERIALS[material]
+    return material.loss_db_per_m, material.index
 
 
 class Room(Section):
-    """The room: a box, whose six surfaces reflect with `reflection_loss_db` where it is given."""
+    """The room: a box, whose six surfaces reflect with `reflection_loss_db` where it is given.
+
+    In the geometric model they reflect as their `material` does, or `floor` and `ceiling` where these are given;
+    `roughness_mm` is the standard deviation of their heights.
+    """
 
     min_m: Vector
     max_m: Vector
     reflection_loss_db: NotNegative | None = None
+    material: KnownMaterial = "concrete"
+    floor: KnownMaterial | None = None
+    ceiling: KnownMaterial | None = None
+    roughness_mm: NotNegative = 3.0
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
             raise ValueError("min_m: must be below max_m in every direction")
         return self
+
+    @property
+    def roughness_m(self) -> float:
+        """Return the standard deviation of its surfaces' heights in metres."""
+        return self.roughness_mm * MM
+
+    def materials(self) -> tuple[str | Material, ...]:
+        """Return those of the six surfaces: two walls across x, two across y, floor and ceiling."""
+        return (*[self.material] * 4, self.floor or self.material, self.ceiling or self.material)
 
 
 class Shadow(Section):

@@ -29,6 +29,7 @@ def overhear(medium: Medium, stamped: Stamped, exchanges: Exchanges) -> dict[str
     A listener that misses a message reports nothing.
     """
     poll = stamped.frames[0]
+    _look_ahead(medium, stamped)
     parts = []
     for me, tag in enumerate(medium.scenario.tags):
         rows = np.flatnonzero((poll.sender != me) & (poll.receiver != me))
@@ -39,6 +40,18 @@ def overhear(medium: Medium, stamped: Stamped, exchanges: Exchanges) -> dict[str
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order = np.argsort(columns["time_ns"], kind="stable")
     return {name: column[order] for name, column in columns.items()}
+
+
+def _look_ahead(medium: Medium, stamped: Stamped) -> None:
+    """Let the world work out what all listeners will ask for: together it takes half the time."""
+    listeners = np.array([me for me, tag in enumerate(medium.scenario.tags) if tag.passive], dtype=np.int64)
+    if not len(listeners) or not isinstance(medium.links, World):
+        return
+    sender, departure = (np.concatenate([getattr(f, name) for f in stamped.frames]) for name in ("sender", "departure"))
+    receiver = np.repeat(listeners, len(sender))
+    sender, departure = np.tile(sender, len(listeners)), np.tile(departure, len(listeners))
+    others = sender != receiver
+    medium.links.prepare(sender[others], receiver[others], departure[others])
 
 
 def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: Exchanges) -> dict[str, NDArray[Any]]:
@@ -83,11 +96,11 @@ def responses(
     last = max(k for k, message in enumerate(protocol.messages) if message.sender == "target")
     stamps = getattr(exchanges, f"rx{last + 1}")
     place = {tag.id: k for k, tag in enumerate(scenario.tags)}
-    times = (exchanges.time_ns, stamped.frames[last].departure)
-    columns = (exchanges.initiator, exchanges.target, stamps, stamped.detour_m, *times)
+    senders, receivers = (np.array([place[i] for i in end.tolist()]) for end in (exchanges.target, exchanges.initiator))
+    heard = world.all_paths(senders, receivers, stamped.frames[last].departure, stamped.detour_m)
+    columns = (exchanges.initiator, exchanges.target, stamps, exchanges.time_ns)
     rows = []
-    for initiator, target, rx, detour_m, time_ns, departure in zip(*(c.tolist() for c in columns), strict=True):
-        paths = world.paths(place[target], place[initiator], departure, detour_m)
+    for initiator, target, rx, time_ns, paths in zip(*(c.tolist() for c in columns), heard, strict=True):
         index, taps = impulse_response(rng, rx, paths)
         rows.append(CirRow(time_ns, initiator, initiator, target, index / INDEX_STEPS, taps))
     return rows

@@ -17,6 +17,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Shadow, TwoStateMultipath
+from uwbsim.world.geometric_responses import GeometricResponses
 from uwbsim.world.group_delay import group_delay_m, has_group_delays
 from uwbsim.world.pair_levels import PairLevels
 from uwbsim.world.patterns import pattern_gain_db
@@ -46,7 +47,8 @@ class Ends:
     `time_s` (n,) is true time; `places` are the tags at the two ends as places in the scenario's list, (n,) each;
     `antennas_m` where their antennas are, (n, 3) each, and `rotations` how they are turned, body to world, (n, 3, 3)
     each. `shadows` are the bodies that may stand in between; `phases` (tags, harmonics) those of the tags' shadowing;
-    `states` the reflections that last by pair, `levels` fading and outages of pairs, where the scenario has such.
+    `states` the reflections that last by pair, `levels` fading and outages of pairs, `responses` those from geometry,
+    where the scenario has such.
     `distance_m` and `gain_db`, (n,) each, follow from these: the lengths of the straight lines, and what the sender's
     power and the two antennas together add along them. The first end sends.
     """
@@ -60,6 +62,7 @@ class Ends:
     shadows: Sequence[PlacedShadow]
     states: ReflectedStates | None = None
     levels: PairLevels | None = None
+    responses: GeometricResponses | None = None
     distance_m: Floats = field(init=False)
     gain_db: Floats = field(init=False)
 
@@ -125,7 +128,7 @@ def _check(name: str, link: Link, ends: Ends) -> None:
 
 
 def _obstacles(link: Link, ends: Ends) -> Link:
-    if not ends.scenario.obstacles:
+    if not ends.scenario.obstacles or ends.responses is not None:
         return link
     loss, excess = through(ends.scenario.obstacles, *ends.antennas_m)
     return replace(link, excess_m=excess, power_dbm=link.power_dbm - loss, total_dbm=link.total_dbm - loss)
@@ -133,7 +136,7 @@ def _obstacles(link: Link, ends: Ends) -> Link:
 
 def _shadows(link: Link, ends: Ends) -> Link:
     """Bodies in the way of the direct path, before the first path is chosen."""
-    for body in ends.shadows:
+    for body in ends.shadows if ends.responses is None else ():
         loss = _shadow_db(body, *(spots[:, None] for spots in ends.antennas_m))[:, 0]
         link = replace(link, power_dbm=link.power_dbm - loss, total_dbm=link.total_dbm - loss)
     return link
@@ -182,6 +185,16 @@ def _states(link: Link, ends: Ends) -> Link:
     return replace(later, excess_m=excess, power_dbm=power, total_dbm=total)
 
 
+def _response(link: Link, ends: Ends) -> Link:
+    """All that geometry does, read off one response: instead of the effects above, which leave such links alone."""
+    if ends.responses is None:
+        return link
+    read = ends.responses.at(ends.places, ends.time_s)
+    return replace(
+        link, excess_m=read.excess_m, power_dbm=read.power_dbm, total_dbm=read.total_dbm, noise_s=read.noise_s
+    )
+
+
 def _levels(link: Link, ends: Ends) -> Link:
     """Fading and outages of pairs, of all paths alike."""
     if ends.levels is None:
@@ -208,6 +221,7 @@ CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
     "shadows": _shadows,
     "reflections": _reflections,
     "lasting reflections": _states,
+    "response": _response,
     "fading and outages": _levels,
     "group delays": _group_delays,
 }

@@ -59,6 +59,8 @@ class SampledWorld:
         spots, turns = self._tags.at(index, into)
         count = len(spots)
         origin = np.full(count, sender)
+        if self._world.responses is not None:
+            self._world.responses.look_ahead(sender, time / SUBTICKS_PER_SECOND)
         return link_between(
             Ends(
                 scenario=self._world.scenario,
@@ -70,6 +72,7 @@ class SampledWorld:
                 shadows=self._shadows(index, into, count),
                 states=self._world.states,
                 levels=self._world.levels,
+                responses=self._world.responses,
             )
         )
 

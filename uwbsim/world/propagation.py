@@ -21,7 +21,8 @@ class Link:
 
     `distance_m` is the straight line, `excess_m` how much longer the first detected path is or seems;
     `power_dbm` that path's power, `total_dbm` that of all paths together. Where there are several paths, `paths_m` and
-    `paths_dbm` are the lengths and powers of all, (n, paths), in any order.
+    `paths_dbm` are the lengths and powers of all, (n, paths), in any order. `noise_s` is what noise does to the leading
+    edge of the first path, a standard deviation, where a response tells.
     """
 
     distance_m: Floats
@@ -30,6 +31,7 @@ class Link:
     total_dbm: Floats
     paths_m: Floats | None = None
     paths_dbm: Floats | None = None
+    noise_s: Floats | None = None
 
     def __getitem__(self, rows: Ints) -> Link:
         """Return the chosen segments."""
@@ -41,6 +43,7 @@ class Link:
             total_dbm=self.total_dbm[rows],
             paths_m=None if self.paths_m is None else self.paths_m[rows],
             paths_dbm=None if self.paths_dbm is None else self.paths_dbm[rows],
+            noise_s=None if self.noise_s is None else self.noise_s[rows],
         )
 
 

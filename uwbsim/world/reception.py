@@ -49,10 +49,11 @@ class Arrival:
 def arrive(radio: Radio, link: Link) -> Arrival:
     """Return what a link does to the stamps of frames that take it."""
     seen_dbm = reported_dbm(radio, link.power_dbm)
+    std_s = reception_noise_s(radio, seen_dbm)
     return Arrival(
         flight_s=(link.distance_m + link.excess_m) / SPEED_OF_LIGHT,
         bias_s=reception_bias_s(radio, seen_dbm, link.total_dbm),
-        std_s=reception_noise_s(radio, seen_dbm),
+        std_s=std_s if link.noise_s is None else np.hypot(std_s, link.noise_s),
     )
 
 

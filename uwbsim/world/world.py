@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, Self
 
@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import NS, NS_PER_S
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
-from uwbsim.world.impulse_response import PathsHeard, paths_heard
+from uwbsim.world.geometric_responses import GeometricResponses
+from uwbsim.world.impulse_response import PathsHeard, Waves, paths_heard
 from uwbsim.world.pair_levels import PairLevels
 from uwbsim.world.propagation import Link
 from uwbsim.world.radio import shadowing_phases
@@ -33,7 +35,7 @@ class World:
     """Bodies on their trajectories, with tags on lever arms.
 
     `phases` are those of the tags' shadowing, `states` the reflections that last by pair, `levels` the fading and the
-    outages of pairs.
+    outages of pairs, `responses` those from geometry.
     """
 
     scenario: Scenario
@@ -41,32 +43,61 @@ class World:
     phases: Floats
     states: ReflectedStates | None
     levels: PairLevels | None = None
+    responses: GeometricResponses | None = None
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         """Sample every body's trajectory from the seed; raises `ScenarioError` where they cannot keep apart."""
-        phases = [shadowing_phases(scenario.run.seed, tag.id) for tag in scenario.tags]
+        phases = np.array([shadowing_phases(scenario.run.seed, tag.id) for tag in scenario.tags])
+        trajectories = _trajectories(scenario)
         states, levels = ReflectedStates.of(scenario), PairLevels.of(scenario)
-        return cls(scenario, _trajectories(scenario), np.array(phases), states, levels)
+        responses = GeometricResponses.of(scenario, trajectories, phases)
+        return cls(scenario, trajectories, phases, states, levels, responses)
 
     def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
         """Return what reaches the second tag from the first, shape (n,); reciprocal but for the sender's power.
 
         Tags are places in the scenario's list, times true sub-ticks.
         """
-        columns = np.empty((4, len(time)))
+        self.prepare(initiator, target, time)
+        columns = np.empty((5, len(time)))
         pair = initiator * len(self.scenario.tags) + target
         for key in np.unique(pair):
             rows = np.flatnonzero(pair == key)
             i, j = divmod(int(key), len(self.scenario.tags))
             found = self._pair(i, j, time[rows] / SUBTICKS_PER_SECOND)
-            columns[:, rows] = found.distance_m, found.excess_m, found.power_dbm, found.total_dbm
-        return Link(*columns)
+            noise_s = 0.0 if found.noise_s is None else found.noise_s
+            columns[:4, rows] = found.distance_m, found.excess_m, found.power_dbm, found.total_dbm
+            columns[4, rows] = noise_s
+        distance_m, excess_m, power_dbm, total_dbm, edge_s = columns
+        link = Link(distance_m, excess_m, power_dbm, total_dbm)
+        return link if self.responses is None else replace(link, noise_s=edge_s)
+
+    def prepare(self, initiator: Ints, target: Ints, time: Ints) -> None:
+        """Work out responses that will be asked for, (n,); quicker for many pairs at once than for one by one."""
+        if self.responses is not None:
+            self.responses.prepare((initiator, target), time / SUBTICKS_PER_SECOND)
 
     def paths(self, sender: int, receiver: int, time: int, detour_m: float = 0.0) -> PathsHeard:
         """Return the paths at one instant as a response shows them; `detour_m` is the range's own by chance."""
-        link = self._pair(sender, receiver, np.array([time / SUBTICKS_PER_SECOND]))
-        return paths_heard(link, detour_m)
+        (found,) = self.all_paths(np.array([sender]), np.array([receiver]), np.array([time]), np.array([detour_m]))
+        return found
+
+    def all_paths(self, sender: Ints, receiver: Ints, time: Ints, detour_m: Floats) -> list[PathsHeard]:
+        """Return the paths of n links as responses show them."""
+        time_s = time / SUBTICKS_PER_SECOND
+        if self.responses is None:
+            columns = zip(sender.tolist(), receiver.tolist(), time_s[:, None], detour_m.tolist(), strict=True)
+            return [paths_heard(self._pair(i, j, now), detour) for i, j, now, detour in columns]
+        link, read = self.link(sender, receiver, time), self.responses.at((sender, receiver), time_s)
+        paths = self.responses.paths((sender, receiver), time_s)
+        later_s = (paths.detour_m - (read.excess_m + detour_m)[:, None]) / SPEED_OF_LIGHT
+        # What else happens to a link happens to all its paths alike.
+        amplitude = paths.amplitude * 10 ** ((link.power_dbm - read.power_dbm) / 20)[:, None]
+        return [
+            PathsHeard(power_dbm=power, echoes=[], waves=Waves(delay_s=delays, amplitude=amplitudes))
+            for power, delays, amplitudes in zip(link.power_dbm.tolist(), later_s, amplitude, strict=True)
+        ]
 
     def _pair(self, i: int, j: int, time_s: Floats) -> Link:
         tags = self.scenario.tags
@@ -86,6 +117,7 @@ class World:
                 shadows=self._shadows(bodies),
                 states=self.states,
                 levels=self.levels,
+                responses=self.responses,
             )
         )
 
