@@ -6,7 +6,7 @@ All functions work on n straight segments from `a` (n, 3) to `b` (n, 3), metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -29,6 +29,7 @@ class Link:
     excess_m: Floats
     power_dbm: Floats
     total_dbm: Floats
+    _: KW_ONLY
     paths_m: Floats | None = None
     paths_dbm: Floats | None = None
     noise_s: Floats | None = None
