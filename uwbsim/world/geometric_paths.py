@@ -13,10 +13,10 @@ import numpy as np
 
 from uwblink.arrays import Complexes, Floats, Ints
 from uwbsim.scenario.model import WAVELENGTH_M, Scenario
+from uwbsim.world.antenna_patterns import antenna_gain_db
 from uwbsim.world.diffraction import box_cover
 from uwbsim.world.fresnel_reflection import WAVENUMBER, roughness_factor
 from uwbsim.world.mirrors import AXIAL, coupling, on_faces, planes
-from uwbsim.world.antenna_patterns import antenna_gain_db
 from uwbsim.world.propagation import box_chords_m
 from uwbsim.world.surroundings import (
     SHORTEST_M,
