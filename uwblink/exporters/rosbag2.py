@@ -1,7 +1,8 @@
 """A recording as a bag of ROS 2 (Jazzy, stored as MCAP), of standard messages alone.
 
 Poses as PoseStamped and tf, ranges as sensor_msgs/Range with their variance, a topic a pair, inertial readings as Imu,
-heights as Range, faults as Log. Names become what topics may be called: other letters turn into "_".
+heights as Range, temperatures as Temperature, faults as Log. Names become what topics may be called: other letters
+turn into "_".
 """
 
 from __future__ import annotations
@@ -46,7 +47,10 @@ def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
     held = load(recording)
     store = get_typestore(Stores.ROS2_JAZZY)
     made = _Messages(store.types)
-    parts = (made.poses(held), made.ranges(held), made.imu(held), made.heights(held), made.faults(held))
+    parts = (
+        made.poses(held), made.ranges(held), made.imu(held), made.heights(held), made.temperatures(held),
+        made.faults(held),
+    )  # fmt: skip
     count, known = 0, dict[str, Any]()
     with Writer(folder / "rosbag2", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
         for time_ns, topic, kind, message in merge(*parts, key=lambda row: row[0]):
@@ -127,6 +131,13 @@ class _Messages:
             for time_ns, body, height_m in zip(*columns, strict=True):
                 message = self._range(time_ns, body, height_m, 0.0)
                 yield time_ns, f"/height/{topic_name(body)}", "sensor_msgs/msg/Range", message
+
+    def temperatures(self, held: Contents) -> Iterator[Message]:
+        if held.temperature:
+            columns = (held.temperature[name].tolist() for name in ("time_ns", "tag", "temperature_c"))
+            for time_ns, tag, celsius in zip(*columns, strict=True):
+                message = self._new("sensor_msgs/Temperature", self._header(time_ns, f"uwb_{tag}"), celsius, 0.0)
+                yield time_ns, f"/temperature/uwb_{tag}", "sensor_msgs/msg/Temperature", message
 
     def faults(self, held: Contents) -> Iterator[Message]:
         for fault in sorted(held.faults, key=lambda fault: fault.time_ns):

@@ -46,6 +46,12 @@ def recording(tmp_path):
         poses=poses,
         imu=readings | {name: random.normal(size=n) for name in ("wx", "wy", "wz", "ax", "ay", "az")},
         height=readings | {"height_m": random.uniform(0, 3, n)},
+        temperature={
+            "time_ns": WHEN + np.arange(2),
+            "tag": np.array([2, 2]),
+            "temperature_c": np.array([31.5, 32.0]),
+            "supply_v": np.array([3.25, np.nan]),
+        },
         faults=[Fault(WHEN + 4, "7", "time-out", 'no "answer"')],
     )
     held.save(tmp_path / "r.uwb")
@@ -66,6 +72,8 @@ def test_the_mcap_library_reads_every_message(recording, tmp_path):
     mine = held.poses[held.poses.body == "drone"]
     assert [[p["position"][a] for a in "xyz"] for p in poses] == mine.position_m.tolist()
     assert [[p["orientation"][a] for a in "xyzw"] for p in poses] == mine.quaternion.tolist()
+    warm = [d for _, c, _, d in found if c.topic == "/temperature/2"]
+    assert [(d["temperature_c"], d.get("supply_v")) for d in warm] == [(31.5, 3.25), (32.0, None)]
 
 
 def test_rosbags_reads_standard_messages(recording, tmp_path):
@@ -93,6 +101,7 @@ def test_rosbags_reads_standard_messages(recording, tmp_path):
     assert [imu.angular_velocity.x, imu.linear_acceleration.z] == [held.imu["wx"][3], held.imu["az"][3]]
     assert imu.orientation_covariance[0] == -1, "by its definition: the attitude is not measured"
     assert len(by_topic["/height/drone"]) == 50
+    assert [m.temperature for *_, m in by_topic["/temperature/uwb_2"]] == [31.5, 32.0]
     assert by_topic["/faults"][0][2].msg == 'time-out: no "answer"'
 
 
