@@ -375,6 +375,38 @@ def test_a_hostile_name_of_a_column_is_a_name(tmp_path, name, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.toml", "t.csv", "t.jsonl", "t.parquet"]
 
 
+HOSTILE = ("x'); COPY (SELECT 1) TO 'pwned.csv'; --", "__import__('os').mkdir('pwned')", '{0.__class__}"; ${HOME}')
+PLACES = (
+    "layout = {}", "counter = {}", "protocol = {}", "delimiter = {}", "decimal = {}", "each = {}",
+    "[columns]\ntx1 = {}",
+    "[columns]\ntime_s = {}", "[units]\nstamps = {}", "[units]\ntime = {}", "[units]\ndistance = {}",
+    "[constants]\nfrom_id = {}", "[constants]\ntx1 = {}", "[ids]\n{} = 3", "[antenna_delays]\nunit = {}",
+    "[antenna_delays.tags.{}]\ntx = 1", "[topics.{}]\nto_id = 1",
+)  # fmt: skip
+
+
+def outcome(table, map_file):
+    try:
+        return read_table(table, map_file)
+    except ImportTableError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_no_text_of_a_map_is_a_program(tmp_path, place, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = flights()
+    write(tmp_path / "t.csv", wrapped(rows))
+    for text in HOSTILE:
+        found = outcome(tmp_path / "t.csv", mapped(tmp_path, place.format(json.dumps(text))))
+        if isinstance(found, str):
+            assert "\n" not in found
+        else:
+            assert place.startswith(("[constants]\nfrom_id", "[ids]")), "only the name of a device can be any text"
+            assert len(found.exchanges) == len(rows)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.toml", "t.csv"]
+
+
 def test_duckdb_may_open_the_named_file_only(tmp_path):
     from uwblink.importers.table import Table
 
