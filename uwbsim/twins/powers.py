@@ -10,7 +10,7 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, lasting
+from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, effective_size, lasting
 from uwbsim.world.patterns import harmonics
 from uwbsim.world.radio import ANTENNAS
 
@@ -24,8 +24,8 @@ DEGREES: Final = ((800, 3), (250, 2), (80, 1))
 OFFSET_STD_DB: Final = 4.0
 """How different offsets of tags are thought to be before anything is seen."""
 
-PATTERN_STD_DB: Final = 1.5
-"""The same for a harmonic of an antenna."""
+PATTERN_STD_DB: Final = 2.0
+"""The same for a harmonic of degree 1 of an antenna; higher ones are as much smaller as their degree."""
 
 BETTER: Final = 0.97
 """Of the variance that is left, below which an antenna with a shape is taken instead of none."""
@@ -75,19 +75,28 @@ class _Solved:
     left_db: Floats
 
 
+@dataclass(frozen=True, slots=True)
+class _Doubt:
+    """How often readings are weighed anew, and the variance in dB^2 with which one tells something of an antenna."""
+
+    rounds: int
+    scale_db2: float = 100.0
+
+
 def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     """Fit powers of a flight whose ranges are reflected with known probabilities (n,)."""
     share = float(reflected.sum())
-    tries = [_solve(flight, reflected, antenna, 1) for antenna in ANTENNAS]
+    tries = [_solve(flight, reflected, antenna, _Doubt(rounds=1)) for antenna in ANTENNAS]
     enough = share >= LEAST_WEIGHT
     plain = tries[0]
     best = min(tries[1:], key=lambda one: float(np.var(one.left_db)))
     antenna = (best if np.var(best.left_db) < BETTER * np.var(plain.left_db) else plain).antenna
-    solved = _solve(flight, reflected, antenna, REWEIGHTED)
+    doubt = _Doubt(rounds=REWEIGHTED, scale_db2=_worth_db2(flight, best if antenna == best.antenna else plain))
+    solved = _solve(flight, reflected, antenna, doubt)
     if solved.loss_db < 0:
         # Reflections are not stronger than what they replace; what looks like that is something else.
         reflected = np.zeros(len(flight))
-        solved = _solve(flight, reflected, antenna, REWEIGHTED)
+        solved = _solve(flight, reflected, antenna, doubt)
     told = np.std(np.log10(flight.distance_m)) >= LEAST_SPREAD
     # Where a tag was seen from one side only, its antenna can take its offsets over; towards there they count together.
     seen = _mean_gains(flight, solved.pattern_db)
@@ -118,7 +127,7 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     )
 
 
-def _solve(flight: Flight, reflected: Floats, antenna: str, rounds: int) -> _Solved:
+def _solve(flight: Flight, reflected: Floats, antenna: str, doubt: _Doubt) -> _Solved:
     """Solve one penalized least-squares problem: two readings an exchange."""
     tags, degree = len(flight.tags), _degree(flight)
     size = (degree + 1) ** 2 - 1  # all of a tag's readings know of its mean, which the offsets have
@@ -140,8 +149,8 @@ def _solve(flight: Flight, reflected: Floats, antenna: str, rounds: int) -> _Sol
         blocks.append(columns)
         readings.append(flight.power_dbm[0 if receiver == 1 else 1] - gain)
     design, value = np.vstack(blocks), np.concatenate(readings)
-    penalty, weight = _penalty(tags, size, flight), np.ones(len(value))
-    for _ in range(rounds):
+    penalty, weight = _penalty(tags, degree, flight, doubt.scale_db2), np.ones(len(value))
+    for _ in range(doubt.rounds):
         found = _ridge(design, value, penalty, weight)
         left = value - design @ found
         weight = 1 / np.maximum(np.abs(left) / (HUBER * _spread(left)), 1.0)
@@ -161,13 +170,19 @@ def _degree(flight: Flight) -> int:
     return next((degree for least, degree in DEGREES if each >= least), 0)
 
 
-def _penalty(tags: int, size: int, flight: Flight) -> Floats:
-    """Return prior precisions by unknown, in units of a residual of 2 dB."""
-    scale = 4.0
+def _penalty(tags: int, degree: int, flight: Flight, scale_db2: float) -> Floats:
+    """Return prior precisions by unknown, in units of what a reading tells; fine patterns are less likely."""
     free = [0.0, 0.0, 1e-6]
     if np.std(np.log10(flight.distance_m)) < LEAST_SPREAD:
         free[1] = 1e9
-    return np.array(free + [scale / OFFSET_STD_DB**2] * (2 * tags) + [scale / PATTERN_STD_DB**2] * (tags * size))
+    fine = [k**2 / PATTERN_STD_DB**2 for k in range(1, degree + 1) for _ in range(2 * k + 1)]
+    return np.array(free + [scale_db2 / OFFSET_STD_DB**2] * (2 * tags) + [scale_db2 * one for one in fine] * tags)
+
+
+def _worth_db2(flight: Flight, solved: _Solved) -> float:
+    """Return the variance of a reading, as much larger as values that last are worth less than their number."""
+    both = solved.left_db.mean(axis=0)
+    return float(np.var(solved.left_db) * 2 * len(both) / effective_size(both, flight.pair))
 
 
 def _ridge(design: Floats, value: Floats, penalty: Floats, weight: Floats) -> Floats:
@@ -197,14 +212,16 @@ def _mean_gains(flight: Flight, pattern_db: Floats) -> Floats:
 def _split(sends_db: Floats, reads_db: Floats) -> tuple[float, Floats, Floats, Floats]:
     """Split what tags send and read too strong into the level of all, antenna, transmitter and receiver, (tags,) each.
 
-    What both have in common is the antenna's, as a weak antenna shows in both directions; only what is left is the
-    transmitter's or the reading's. Nothing but the medians of all tags says what is weak.
+    What differs between the two directions is certain, but for a constant that all have in common: the median tag
+    differs by nothing. It is put on one of the two, on that which leaves less to the antenna, whose is what both have
+    in common.
     """
-    sends, reads = sends_db - np.median(sends_db), reads_db - np.median(reads_db)
-    same = np.sign(sends) == np.sign(reads)
-    common = np.where(same, np.sign(sends) * np.minimum(np.abs(sends), np.abs(reads)), 0.0)
-    level = float(np.median(sends_db) + np.median(reads_db))
-    return level, common, sends - common, reads - common
+    between, common = sends_db - reads_db, (sends_db + reads_db) / 2
+    level = float(np.median(common))
+    between, common = between - np.median(between), common - level
+    by_sending = np.sign(between) == np.sign(common)
+    tx, offset = np.where(by_sending, between, 0.0), np.where(by_sending, 0.0, -between)
+    return 2 * level, common - (tx + offset) / 2, tx, offset
 
 
 def _levels(both_db: Floats, reflected: Floats, fading_db: float) -> Floats:

@@ -17,6 +17,7 @@ from scipy.special import erfcx, log_ndtr
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import intervals
+from uwbsim.scenario.radio import TwoStateMultipath
 from uwbsim.twins.flight import Flight
 from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, effective_size, lasting
 
@@ -29,6 +30,11 @@ SAMPLED: Final = 15_000
 TRIM_M: Final = 0.6
 """Nearer than this a residual may be of the core for certain; further below it is a mistake of some other kind."""
 
+LEAST_DETOUR: Final = 1.0
+"""Of a detour to the spread of the core: shorter ones cannot be told from it."""
+
+NEEDED: Final = 8.0
+DETOUR_M: Final = TwoStateMultipath(model="two-state").mean_excess_m
 ENOUGH_SPELLS: Final = 6.0
 
 
@@ -64,6 +70,8 @@ def fit_reflections(flight: Flight, receive_noise_s: Floats) -> ReflectionFit:
     usable = error > np.median(error) - TRIM_M
     mean, direct, excess, share = _mixture(error[usable], white[usable])
     core = np.hypot(white, direct)
+    if not _is_a_tail(error[usable], white[usable], mean, direct, excess, share):
+        return _no_tail(flight, error, white)
     reflected = _responsibility(error, mean, core, excess, np.full(len(error), share))
     found = _lasting_of(flight, reflected)
     pair_share, spread = _shares(flight, mean, core, excess, share, reflected)
@@ -115,6 +123,37 @@ def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
         )
     mean, direct, excess, share = unpack(min(tries, key=lambda one: float(one.fun)).x)
     return mean, (direct if direct > SHORTEST_CORE_M else 0.0), excess, share
+
+
+def _is_a_tail(error: Floats, white: Floats, mean: float, direct: float, excess: float, share: float) -> bool:
+    """Say whether the tail explains more than a core alone, beyond what a few of its exchanges could by chance."""
+    core, alone = np.hypot(white, direct), max(float(np.std(error)), SHORTEST_CORE_M)
+    if excess < LEAST_DETOUR * float(np.median(core)):
+        return False
+    with_tail = _log_density(error, mean, core, excess, share)
+    without = -0.5 * ((error - error.mean()) / alone) ** 2 - np.log(alone * np.sqrt(2 * np.pi))
+    return float(np.sum(with_tail - without)) > NEEDED
+
+
+def _no_tail(flight: Flight, error: Floats, white: Floats) -> ReflectionFit:
+    """Return a core alone."""
+    mean = float(np.median(error))
+    direct = float(np.sqrt(max(bulk_spread(error) ** 2 - float(np.mean(white**2)), 0.0)))
+    pairs = len(flight.pairs)
+    return ReflectionFit(
+        core_mean_m=mean,
+        direct_std_m=direct if direct > SHORTEST_CORE_M else 0.0,
+        white_m=white,
+        share=0.0,
+        share_std=0.0,
+        mean_excess_m=DETOUR_M,
+        life_s=None,
+        life_spread=0.0,
+        pair_share=np.zeros(pairs),
+        pair_excess_m=np.full(pairs, DETOUR_M),
+        pair_life_s=np.full(pairs, np.nan),
+        reflected=np.zeros(len(flight)),
+    )
 
 
 def _log_density(error: Floats, mean: float, core: Floats, excess: float, share: float | Floats) -> Floats:

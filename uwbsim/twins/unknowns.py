@@ -16,8 +16,8 @@ ALWAYS: Final = (
     "How a delay splits into transmission and reception: 0.44 to 0.56.",
     "What a reflection does to total power and to impulse responses (total_loss_db, rise_ns).",
     "The shape of detours: exponential (excess_shape).",
-    "Which of antenna, transmitter and receiver makes all of a tag's powers alike weak: what it sends and reads weak "
-    "is the antenna's, the rest of either its own, and the median tag has none.",
+    "Which of antenna, transmitter and receiver makes a tag's powers weak: what differs between the two directions is "
+    "put on one of transmitter and receiver (the median tag has no difference), and the rest on the antenna.",
     "Powers that were never heard: sensitivity_dbm is the default or just below the weakest reading; capture_db and "
     "dynamic_range_db have their defaults.",
     "Errors of poses: those recorded are taken for true, so what they add is in direct_std_m.",
@@ -43,7 +43,7 @@ SOMETIMES: Final[tuple[tuple[Untold, str], ...]] = (
         "that is seen.",
     ),
     (
-        lambda flight, fitted: fitted.reflections.share_std == 0,
+        lambda flight, fitted: fitted.reflections.share > 0 and fitted.reflections.share_std == 0,
         "Whether pairs have different shares of reflections: they differ no more than by chance, and have the same.",
     ),
     (
