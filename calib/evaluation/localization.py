@@ -206,11 +206,11 @@ def _tuned(flight: Flight, calibration: Calibration, settings: Settings) -> Fixe
     squares = np.zeros((2, len(TUNED_OVER)))
     for whole in _problems(flight):
         problem = whole.first(TUNED_RANGES)
-        noises = [_Noise.drawn(problem, settings, settings.seed)]
+        noises = [_Noise.drawn(problem, settings, settings.seed + k) for k in range(settings.seeds)]
         measured = (applied.raw_m[problem.rows], applied.corrected_m[problem.rows])
         ranges = [_Ranges(m, np.full(len(m), std)) for m in measured for std in TUNED_OVER]
-        errors = [tracks[0].rmse_m for tracks in _run(problem, ranges, noises, settings)]
-        squares += np.array(errors).reshape(squares.shape) ** 2
+        errors = [[track.rmse_m for track in tracks] for tracks in _run(problem, ranges, noises, settings)]
+        squares += np.sum(np.array(errors) ** 2, axis=1).reshape(squares.shape)
     best = [TUNED_OVER[k] for k in np.argmin(squares, axis=1)]
     return FixedStd({"raw": best[0], "calibrated": best[1]}, f"tuned on {flight.ranges.source}")
 

@@ -76,7 +76,7 @@ def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights):
     # Reckoning with reflections is worth little in metres here, and makes the filter know how good it is.
     assert summary.rmse_m["robust"] < summary.rmse_m["variance"] * 1.02
     nees = {name: np.mean([one.tracks[name].nees for one in found]) for name in ("variance", "robust")}
-    assert nees["robust"] < 3.3 < nees["variance"]
+    assert nees["robust"] < 3.5 < nees["variance"]
     assert all(spread < 0.02 for spread in summary.spread_m.values())
 
 
