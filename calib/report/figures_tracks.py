@@ -35,7 +35,7 @@ def rmse_bars(found: list[Localization]) -> Figure:
         axes.bar(np.arange(len(names)) + 0.21 * (k - 1.5), heights, 0.2, color=COLOUR_OF[stage], label=NAMES[stage])
     axes.set_xticks(np.arange(len(names)), names, fontsize="small")
     label(axes, "", "RMSE of the position (m)")
-    axes.legend(frameon=False, fontsize="small")
+    figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize="small", loc="outside upper left", ncols=4)
     return figure
 
 
