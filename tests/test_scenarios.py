@@ -9,6 +9,10 @@ import pytest
 from uwblink.recording.file import Recording
 
 ROOT = Path(__file__).parents[1]
+BITING = (
+    *("warm_up", "bench", "mounted_differently", "lasting_reflections"),
+    *("office", "hall_with_metal", "six_robots"),
+)
 SCENARIOS = sorted((ROOT / "scenarios").rglob("*.toml"))
 
 
@@ -23,10 +27,11 @@ def test_the_scenarios_that_the_readme_promises_are_there():
         "bench/bench.toml",
         *(f"mounted_differently/{n}.toml" for n in ("before", "after")),
     }
+    expected |= {"office/office.toml", "hall_with_metal/hall.toml", "six_robots/six_robots.toml"}
     assert expected <= names
 
 
-@pytest.mark.parametrize("name", ["warm_up", "bench", "mounted_differently", "lasting_reflections"])
+@pytest.mark.parametrize("name", BITING)
 def test_scenarios_that_bite_say_what_they_test(name):
     for path in (ROOT / "scenarios" / name).glob("*.toml"):
         head = "".join(line[2:] for line in path.read_text().splitlines(keepends=True) if line.startswith("# "))
