@@ -42,13 +42,10 @@ RISEN = 5.0
 EARLY_NS, LATE_NS = 10_000_000, 400_000_000
 
 
-MODEL = {"model": "geometric", "scatter_loss_db": 1.0}
-
-
 def features(row: CirRow) -> tuple[float, float]:
     """Return what tells a detour: total less first-path power in dB, and the first path's rise time in taps.
 
-    It rises from where the response leaves the noise (five standard deviations of either part) to its own peak: a direct
+    It rises from where the response leaves the noise (five standard deviations of a part) to its own peak: a direct
     path too weak for the chip's threshold makes it longer.
     """
     taps, first = np.array(row.magnitudes, dtype=float), int(row.first_path_index)
@@ -87,7 +84,7 @@ def room(seed: int, duration_s: float) -> uwbsim.Scenario:
         {
             "run": {"name": f"room {seed}", "seed": seed, "duration_s": duration_s},
             "ranging": {"rate_hz": 36.0, "get_cir": True},
-            "radio": {"first_path_at_1m_dbm": -76.0, "dynamic_range_db": 18.0, "multipath": MODEL},
+            "radio": {"first_path_at_1m_dbm": -76.0, "dynamic_range_db": 18.0, "multipath": {"model": "geometric"}},
             "room": {"min_m": [0.0, 0.0, 0.0], "max_m": size.tolist()} | walls,
             "obstacles": obstacles,
             "bodies": bodies,

@@ -189,7 +189,9 @@ def test_pairs_have_their_own_excess(slow_flight):
     assert np.ptp(means) > 0.05
     count = min(map(len, pairs))
     first, second = (pair[:count] - pair.mean() for pair in pairs[:2])
-    assert abs(np.corrcoef(first, second)[0, 1]) < 0.5
+    # What they have in common is the one tag's slow way; from a tenth of a second to the next each goes its own.
+    changes = [pair[10:] - pair[:-10] for pair in (first, second)]
+    assert abs(np.corrcoef(*changes)[0, 1]) < 0.4
 
 
 def test_excess_shows_in_powers_and_responses(slow_flight):
