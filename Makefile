@@ -76,6 +76,9 @@ accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 
 worlds: setup ## fits in worlds that share nothing with the simulator, into docs/accuracy.md (20 minutes)
 	$(BIN)/python -m benchmarks.worlds_report
 
+doctor-table: setup ## write docs/doctor.md's table: planted faults, hits and false alarms (15 minutes)
+	$(BIN)/python -W ignore -m benchmarks.doctor
+
 bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
 	$(BIN)/python -m benchmarks.boards
 

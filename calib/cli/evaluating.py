@@ -110,27 +110,41 @@ def _onboard(
 
 
 def doctor(
-    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings (.uwb); of several, what changed between them is said, too.")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
 ) -> None:
-    """Name the faults in a recording, each with what shows it and what to do about it."""
+    """Name the faults in recordings, each with what shows it and what to do about it, and compare clocks by pair."""
     from dataclasses import asdict, replace
 
     import calib
     from calib.cli.flags import with_flags
+    from uwblink import Recording
+    from uwblink.recording import clock_skews
 
     findings = [
-        replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in calib.examine(recording)
+        replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in calib.examine(recordings)
     ]
+    skews = {}
+    for path in recordings:
+        with Recording.open(path) as recording:
+            skews[str(path)] = clock_skews(recording.exchanges())
     if as_json:
-        typer.echo(json.dumps([asdict(finding) for finding in findings], indent=1))
+        clocks = {path: [asdict(one) | {"slope": one.slope} for one in found] for path, found in skews.items()}
+        typer.echo(json.dumps({"findings": [asdict(f) for f in findings], "clock_skews": clocks}, indent=1))
         return
     if not findings:
-        typer.echo(f"{recording}: nothing found")
+        typer.echo(f"{', '.join(map(str, recordings))}: nothing found")
     for finding in findings:
         typer.echo(f"{finding.fault} (confidence {finding.confidence:.2f})")
         typer.echo(f"  evidence: {finding.evidence}")
         typer.echo(f"  remedy:   {finding.remedy}")
+    for name, found in skews.items():
+        if found:
+            typer.echo(f"clock skew in {name}, the second tag against the first")
+        for one in found:
+            typer.echo(f"  {one}")
 
 
 def compare(

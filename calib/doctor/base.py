@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from calib.spread import robust_spread
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.twr import Exchanges
 
@@ -47,6 +47,11 @@ class RecordingView:
     def error_m(self) -> Floats:
         """Range less truth, shape (n,)."""
         return self.raw_m - self.truth_m
+
+
+def chosen(view: RecordingView, rows: Bools) -> RecordingView:
+    """Return a view of some exchanges."""
+    return replace(view, exchanges=view.exchanges[rows], raw_m=view.raw_m[rows], truth_m=view.truth_m[rows])
 
 
 def spread_m(view: RecordingView, truth_m: Floats | None = None, raw_m: Floats | None = None) -> float:

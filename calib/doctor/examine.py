@@ -7,53 +7,94 @@ agreement is the robust spread of errors after each pair's own median, which nei
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from calib.doctor import geometry, pairs, radio, timestamps
-from calib.doctor.base import Finding, RecordingView
-from calib.sources import Data, opened
+from calib.doctor import (
+    anchors,
+    clocks,
+    closures,
+    geometry,
+    pairs,
+    protocols,
+    radio,
+    reflected,
+    several,
+    steps,
+    timestamps,
+)
+from calib.doctor.base import Finding, RecordingView, chosen
+from calib.sources import Data, each, opened
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.recording.target_reports import differences, single_reports
 from uwblink.twr import Exchanges, raw_range
 
 
-def examine(data: Data) -> list[Finding]:
+def examine(data: Data | Iterable[Data]) -> list[Finding]:
     """Return what is wrong with a recording, the surest first: each fault with its evidence and what to do about it.
 
-    `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`; ranges
-    alone do not say enough. Raises what `Recording.open` raises.
+    `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`, or several
+    of those, which are then compared, too; ranges alone do not say enough. Rows that cannot be are set aside before
+    anything else is judged, and what would only follow from a graver fault is not looked for. Raises what
+    `Recording.open` raises.
 
     >>> import calib
     >>> [finding.fault for finding in calib.examine(calib.sample_flight())]
     []
     """
+    views, findings = [], list[Finding]()
+    recordings = each(data)
+    for number, one in enumerate(recordings):
+        found, view = _examined(one)
+        name = f"{view.name if view else number + 1}: " if len(recordings) > 1 else ""
+        findings += [replace(finding, evidence=name + finding.evidence) for finding in found]
+        if view is not None and not {finding.fault for finding in found} & GROSS_FAULTS:
+            views.append(view)
+    if len(views) > 1:
+        between = list(several.compared(views))
+        # What moved between two recordings is no fault of either one.
+        moved = any(finding.fault == several.MOVED_ANCHOR for finding in between)
+        findings = [one for one in findings if not (moved and one.fault == anchors.ELSEWHERE)] + between
+    return sorted(findings, key=lambda f: -f.confidence)
+
+
+def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
+    """Return what is wrong with one recording, and the recording without its impossible rows."""
     with opened(data) as (name, source):
         exchanges, poses, tags = source.exchanges, source.poses, list(source.tags)
         faults = list(getattr(source, "faults", ()))
     if not len(exchanges):
-        return [Finding("empty", "the recording holds no exchanges", "record or import some", 1.0)]
+        return [Finding("empty", "the recording holds no exchanges", "record or import some", 1.0)], None
     view = _admitted(name, exchanges, poses, tags, faults)
     findings: list[Finding] = []
     for examination in GROSS:
         findings += examination(view)
         if findings:
-            return findings
+            return findings, None
+    bad = timestamps.impossible(view)
+    findings += timestamps.corrupted(view, bad)
+    if bad.all():
+        return findings, None
+    whole, view = view, chosen(view, ~bad)
     # Only stamps that make sense can say something about poses, and only right poses something about radios.
-    for examination in GEOMETRY:
-        findings += examination(view)
-    if not findings:
-        for examination in RADIO:
-            findings += examination(view)
+    suspected = [finding for examination in GEOMETRY for finding in examination(view)]
+    if not suspected:
+        suspected = [finding for examination in RADIO for finding in examination(view)]
+    findings += suspected
     for always in STRUCTURE:
-        findings += always(view)
+        findings += always(whole if always in OF_ALL_ROWS else view)
     found = {finding.fault for finding in findings}
     # Where nothing moves, every pair has one distance and one power, and the one explains the other.
-    implied = {radio.CONFOUNDED} if pairs.STATIC in found else set()
-    return sorted((f for f in findings if f.fault not in implied), key=lambda f: -f.confidence)
+    implied = {radio.CONFOUNDED, closures.OPEN} if pairs.STATIC in found else set[str]()
+    if anchors.ELSEWHERE in found:
+        implied |= {closures.OPEN}
+    if steps.MOVED in found or steps.DRIFTED in found or clocks.LEFT in found or clocks.WRONG_SIGN in found:
+        implied |= {closures.OPEN, reflected.MANY, reflected.LASTING}
+    return [finding for finding in findings if finding.fault not in implied], view
 
 
 def _admitted(name: str, both: Exchanges, poses: Poses, tags: list[Tag], faults: list[Fault]) -> RecordingView:
@@ -79,17 +120,20 @@ def _admitted(name: str, both: Exchanges, poses: Poses, tags: list[Tag], faults:
 
 
 Examination = Callable[[RecordingView], Iterator[Finding]]
-GROSS: Final[tuple[Examination, ...]] = (timestamps.single_as_double, timestamps.units, timestamps.width)
-GEOMETRY: Final[tuple[Examination, ...]] = (geometry.pose_clock, geometry.geometry)
-RADIO: Final[tuple[Examination, ...]] = (radio.skew, radio.moved_delay, radio.reflections)
+GROSS: Final[tuple[Examination, ...]] = (timestamps.single_as_double, timestamps.units, protocols.another)
+GROSS_FAULTS: Final = {"single-sided data taken for double-sided", "unit slip", "timestamp width", "another protocol"}
+GEOMETRY: Final[tuple[Examination, ...]] = (geometry.pose_clock, geometry.geometry, anchors.anchors)
+RADIO: Final[tuple[Examination, ...]] = (clocks.skew, steps.moved_delay, closures.closures, reflected.reflections)
 STRUCTURE: Final[tuple[Examination, ...]] = (
     timestamps.swapped_roles,
     timestamps.speed_of_light,
-    timestamps.corrupted,
     timestamps.contradicting,
+    clocks.unread,
+    clocks.carriers,
     pairs.pairs,
     pairs.silent,
     pairs.still,
     radio.confounded,
     pairs.no_truth,
 )
+OF_ALL_ROWS: Final = (timestamps.contradicting, pairs.silent)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from calib.doctor.base import PLAUSIBLE_M, Finding, RecordingView, pair_ids, plausible_share
+from calib.doctor.base import PLAUSIBLE_M, Finding, RecordingView, pair_ids
+from calib.doctor.protocols import sound_clocks
+from uwblink.arrays import Bools
 from uwblink.protocols.table import single_sided
 from uwblink.ticks import SPEED_OF_LIGHT, TICKS_PER_SECOND
-from uwblink.twr import board_range, intervals, raw_range
+from uwblink.twr import board_range, intervals
 
+FARTHEST_M: Final = 50.0
+CONTRADICTS_M: Final = 0.01
+FEWEST_CORRUPT: Final = 3
+LEAST_CORRUPT: Final = 0.002
+MOST_CORRUPT: Final = 0.5
 VACUUM_OVER_AIR: Final = 299_792_458.0 / SPEED_OF_LIGHT
 
 
@@ -32,25 +38,6 @@ def units(view: RecordingView) -> Iterator[Finding]:
         )
 
 
-def width(view: RecordingView) -> Iterator[Finding]:
-    """Stamps of a counter with another number of bits."""
-    e = view.exchanges
-    for bits in (32, 40):
-        if bits == e.bits:
-            continue
-        with np.errstate(all="ignore"):
-            other = raw_range(replace(e, bits=bits))
-        gained = plausible_share(other) - plausible_share(view.raw_m)
-        if gained > 0.01:
-            yield Finding(
-                "timestamp width",
-                f"with {e.bits}-bit stamps {100 * plausible_share(view.raw_m):.1f} % of the ranges are possible, "
-                f"with {bits}-bit stamps {100 * plausible_share(other):.1f} %",
-                f"import again with bits = {bits}",
-                0.95,
-            )
-
-
 def single_as_double(view: RecordingView) -> Iterator[Finding]:
     """Double-sided exchanges without a third message."""
     e = view.exchanges
@@ -64,17 +51,27 @@ def single_as_double(view: RecordingView) -> Iterator[Finding]:
         )
 
 
-def corrupted(view: RecordingView) -> Iterator[Finding]:
-    """Exchanges that are impossible, or contradict their own reported range."""
+def impossible(view: RecordingView) -> Bools:
+    """Return which exchanges are impossible, or contradict their reported range or the clocks of their pair (n,)."""
+    e = view.exchanges
     with np.errstate(all="ignore"):
-        said = np.abs(board_range(view.exchanges) - view.exchanges.range_m)
-    bad = ~(np.abs(view.raw_m) < PLAUSIBLE_M) | (np.isfinite(said) & (said > 0.01))
+        said = np.abs(board_range(e) - e.range_m)
+        bad = ~(np.abs(view.raw_m) < PLAUSIBLE_M) | ~sound_clocks(e)
+        away = np.abs(view.error_m) > FARTHEST_M
+    if not _is_scaled(view):
+        bad |= np.isfinite(said) & (said > CONTRADICTS_M)
+    # Where most are far off, something else is wrong with all of them.
+    return np.asarray(bad | away if np.mean(away) < MOST_CORRUPT else bad)
+
+
+def corrupted(view: RecordingView, bad: Bools) -> Iterator[Finding]:
+    """Exchanges that are impossible, or contradict themselves; the other examinations do without them."""
     share = float(np.mean(bad))
-    if 0.002 < share < 0.5 and not _is_scaled(view):
+    if np.count_nonzero(bad) >= FEWEST_CORRUPT and LEAST_CORRUPT < share < MOST_CORRUPT:
         yield Finding(
             "corrupted exchanges",
             f"{np.count_nonzero(bad)} of {len(bad)} exchanges have impossible stamps, or stamps that contradict the "
-            "range reported with them",
+            "range reported with them or the clocks of their pair; what else is said here is said without them",
             "a robust fit leaves them out; check cables and USB load, and decode the recording again if it has bytes",
             0.9,
         )
@@ -125,7 +122,8 @@ def swapped_roles(view: RecordingView) -> Iterator[Finding]:
         yield Finding(
             "swapped roles",
             "the carriers say that the targets' clocks are slower where the stamps say faster, and the other way round",
-            "initiator and target (ids, powers and skews) are exchanged: swap the columns on import",
+            "initiator and target (ids, powers and skews) are exchanged, or the readings have the other sign: change "
+            "it on import",
             0.9,
         )
 

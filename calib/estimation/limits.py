@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.estimation.confounding import explained_by_distance
 from calib.estimation.pairs import pairs_of
 from calib.estimation.problem import Problem
@@ -33,7 +34,7 @@ def limits(ranges: Ranges, problem: Problem, residuals_m: Floats, fixed: Mapping
             f"{_pairs(len(problem.pairs.ends))}: antenna delays stay unknown, other pairs cannot be corrected, and "
             "what else is constant in the ranges of a pair (an obstacle, a wrong lever arm) is in its constant"
         )
-    share = explained_by_distance(problem.lifted, problem.ranges.truth_m) if unknowns.curve else None
+    share = explained_by_distance(_lifted(ranges), ranges.truth_m) if unknowns.curve else None
     if share is not None:
         yield (
             f"distance explains {100 * share:.0f} % of the power's variance: the curve may hold what belongs to "
@@ -100,6 +101,10 @@ def _without_curve(ranges: Ranges, problem: Problem, residuals_m: Floats) -> str
         f"{high:.0f} dBm; delays hold for the recorded powers, and differ by up to {differ} at others among "
         "them"
     )
+
+
+def _lifted(ranges: Ranges) -> Floats:
+    return lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
 
 
 def _mean_dbm(ranges: Ranges) -> Floats:

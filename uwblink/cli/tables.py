@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
@@ -28,7 +29,7 @@ def print_summary(summary: Summary, console: Console) -> None:
         tried = pair.exchanges + pair.failed
         success = f"{100 * pair.exchanges / tried:.1f} %" if tried else ""
         pairs.add_row(str(pair.initiator), str(pair.target), str(pair.exchanges), rate, success)
-    for table in (tags, pairs):
+    for table in (tags, pairs, *_skews(summary)):
         console.print(table)
     if summary.reported_twice:
         console.print(f"{summary.reported_twice} reported by both ends, {summary.contradictory} of them differently")
@@ -36,6 +37,21 @@ def print_summary(summary: Summary, console: Console) -> None:
     console.print(f"faults: {escape(counted(summary.faults))}")
     for key, value in summary.provenance.items():
         console.print(f"  {_plain(key)}: {_plain(value)}")
+
+
+def _skews(summary: Summary) -> Iterator[Table]:
+    """Yield a table of clock skews by the stamps and by the carriers, in ppm, where pairs range double-sided."""
+    if not summary.skews:
+        return
+    table = Table("pair", "by stamps (ppm)", "by carriers", "slope", "residual", "sign")
+    signs = {True: "same", False: "OTHER", None: ""}
+    for one in summary.skews:
+        carrier, residual, slope = (
+            "" if value is None else f"{value:{form}}"
+            for value, form in ((one.carrier_ppm, "+.2f"), (one.residual_ppm, ".2f"), (one.slope, ".3f"))
+        )
+        table.add_row(one.pair, f"{one.stamps_ppm:+.2f}", carrier, slope, residual, signs[one.same_sign])
+    yield table
 
 
 def progress_table(progress: Progress) -> Table:

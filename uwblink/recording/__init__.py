@@ -5,15 +5,18 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
+    from uwblink.recording.clock_skews import clock_skews
     from uwblink.recording.summary import Summary, counted
 
 __all__ = [
     "Summary",
+    "clock_skews",
     "counted",
 ]
 
 _HOMES: Final = {
     "Summary": "uwblink.recording.summary",
+    "clock_skews": "uwblink.recording.clock_skews",
     "counted": "uwblink.recording.summary",
 }
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwblink.display import as_html, cut, first_few, printable
+from uwblink.recording.clock_skews import ClockSkew, clock_skews, told
 from uwblink.recording.schema import TABLES, Fault, Tag
 from uwblink.recording.target_reports import single_reports
 
@@ -34,7 +35,7 @@ class Summary:
 
     An exchange counts once: `reported_twice` are those that both ends reported, `contradictory` those of them whose two
     reports differ. `span_s` is the time from the first to the last exchange; `provenance` is what `meta` says of where
-    it comes from, without the scenario and what was planted.
+    it comes from, without the scenario and what was planted. `skews` are those of pairs that range double-sided.
     """
 
     file: str
@@ -48,6 +49,7 @@ class Summary:
     provenance: dict[str, Any]
     reported_twice: int = 0
     contradictory: int = 0
+    skews: tuple[ClockSkew, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwblink show --json` prints."""
@@ -87,6 +89,7 @@ class Summary:
             f"  poses: {counted(self.poses)}",
             f"  faults: {counted(self.faults)}",
             *([f"  also: {counted(rows)}"] if rows else []),
+            *([f"  clock skew: {told(self.skews)}"] if self.skews else []),
         ]
 
 
@@ -112,6 +115,7 @@ def summarize(recording: Recording) -> Summary:
         provenance={k: v for k, v in recording.meta().items() if k not in {"scenario", "planted"}},
         reported_twice=reports.repeated,
         contradictory=len(reports.differing),
+        skews=tuple(clock_skews(exchanges)),
     )
 
 

@@ -1,0 +1,359 @@
+"""Faults planted in flights that share nothing with the simulator nor with the doctor, and what the doctor says.
+
+Writes the table of docs/doctor.md: hits, and whatever else was said. Seeds are those from `FIRST_REPORTED` on, which
+have chosen no threshold; `--tuning` takes those that have.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import calib
+from benchmarks.flights import FIRST_REPORTED, LIGHT, TICKS, Flight, Plan, fly
+from uwblink.recording.schema import Fault
+from uwbsim.scenario.loading import load
+from uwbsim.simulation.run import simulate
+
+PAGE = Path(__file__).parents[1] / "docs" / "doctor.md"
+BEGIN, END = "<!-- table -->", "<!-- end of table -->"
+SEEDS: Final = 4
+CLEAN_SEEDS: Final = 10
+SCENARIO: Final = Path(__file__).parents[1] / "scenarios" / "icra2023" / "test1.toml"
+VACUUM: Final = 299_792_458.0 / LIGHT
+STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A kind of fault: the flight it is planted in, how, and the names by which the doctor may call it."""
+
+    name: str
+    plan: Plan
+    plant: Callable[[Flight, np.random.Generator], Flight | list[Flight]]
+    expected: frozenset[str]
+    also: frozenset[str] = frozenset()
+
+
+def changed(flight: Flight, **columns: Any) -> Flight:
+    """Return a flight with other columns in its exchanges."""
+    return replace(flight, exchanges=replace(flight.exchanges, **columns))
+
+
+def of_tag(flight: Flight, tag: int) -> Any:
+    """Return which exchanges are a tag's."""
+    return (flight.exchanges.initiator == tag) | (flight.exchanges.target == tag)
+
+
+def seconds(flight: Flight) -> Any:
+    """Return when exchanges were."""
+    return flight.exchanges.time_ns * 1e-9 - 1
+
+
+def longer(flight: Flight, metres: Any) -> Flight:
+    """Return a flight whose ranges (n,) are longer: the initiator receives later."""
+    e = flight.exchanges
+    late, mask = np.rint(2 * np.broadcast_to(metres, len(e)) / LIGHT * TICKS).astype(np.int64), (1 << e.bits) - 1
+    third = (e.protocol == "ds") & (e.rx3 != 0)
+    rx2, rx3 = (e.rx2 + late) & mask, np.where(third, (e.rx3 + late) & mask, e.rx3)
+    return changed(flight, rx2=rx2, rx3=rx3, range_m=np.trunc((e.range_m + late / TICKS * LIGHT / 2) * 1e4) / 1e4)
+
+
+def corrupt(flight: Flight, rng: np.random.Generator, share: float) -> Flight:
+    """Replace stamps of some rows by any."""
+    hit = rng.random(len(flight.exchanges)) < share
+    which, e = rng.integers(0, 6, len(hit)), flight.exchanges
+    found = {
+        name: np.where(hit & (which == k), rng.integers(0, 2**32, len(hit)), getattr(e, name))
+        for k, name in enumerate(STAMPS)
+    }
+    return changed(flight, **found)
+
+
+def stepped(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Change a tag's delay by 0.3 to 1.2 ns at some time."""
+    size = float(rng.choice([-1, 1]) * rng.uniform(0.3, 1.2)) * LIGHT * 1e-9 / 2
+    at = rng.uniform(0.2, 0.8) * seconds(flight).max()
+    return longer(flight, np.where(of_tag(flight, tag_of(flight, rng)) & (seconds(flight) > at), size, 0.0))
+
+
+def drifting(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Let a tag's delay drift by a nanosecond."""
+    part = seconds(flight) / seconds(flight).max()
+    return longer(flight, np.where(of_tag(flight, tag_of(flight, rng)), 0.15 * part, 0.0))
+
+
+def tag_of(flight: Flight, rng: np.random.Generator) -> int:
+    """Return one of the tags that move."""
+    return int(rng.choice([tag.tag for tag in flight.tags if tag.tag < 100]))
+
+
+def pair_off(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Make the ranges of one pair 12 to 30 cm longer."""
+    e = flight.exchanges
+    pairs = np.unique(np.sort(np.column_stack([e.initiator, e.target]), axis=1), axis=0)
+    a, b = pairs[rng.integers(0, len(pairs))]
+    return longer(flight, np.where(of_tag(flight, a) & of_tag(flight, b), rng.uniform(0.12, 0.3), 0.0))
+
+
+def swapped_roles(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Exchange initiator and target, and what they measured."""
+    e = flight.exchanges
+    return changed(
+        flight, initiator=e.target, target=e.initiator, fpp1_dbm=e.fpp2_dbm, fpp2_dbm=e.fpp1_dbm,
+        skew1_ppm=e.skew2_ppm, skew2_ppm=e.skew1_ppm,
+    )  # fmt: skip
+
+
+def arms(flight: Flight, change: Callable[[Any], Any]) -> Flight:
+    """Return a flight with other lever arms."""
+    return replace(flight, tags=[replace(tag, lever_arm_m=change(tag)) for tag in flight.tags])
+
+
+def swapped_tags(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Exchange the two tags of a body."""
+    body, by_tag = int(rng.integers(1, 4)) * 10, {tag.tag: tag.lever_arm_m for tag in flight.tags}
+    other = {body: body + 1, body + 1: body}
+    return arms(flight, lambda tag: by_tag[other.get(tag.tag, tag.tag)])
+
+
+def turned_arms(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Change the sign of a body's lever arms."""
+    body = f"drone{rng.integers(1, 4)}"
+    return arms(flight, lambda tag: tuple(-v for v in tag.lever_arm_m) if tag.body == body else tag.lever_arm_m)
+
+
+def wxyz(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Write quaternions in the other order."""
+    return replace(flight, poses=replace(flight.poses, quaternion=flight.poses.quaternion[:, [3, 0, 1, 2]]))
+
+
+def late_poses(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Let the clock of the poses be off."""
+    shift = int(rng.choice([-1, 1]) * rng.uniform(0.15, 1.5) * 1e9)
+    return replace(flight, poses=replace(flight.poses, time_ns=flight.poses.time_ns + shift))
+
+
+def dead(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Let a tag fail in nearly all of its exchanges."""
+    mine = of_tag(flight, tag_of(flight, rng)) & (rng.random(len(flight.exchanges)) < 0.97)
+    e = flight.exchanges
+    failed = [
+        Fault(int(t), "1", "lost frame", "message 1 below sensitivity", initiator=int(a), target=int(b))
+        for t, a, b in zip(e.time_ns[mine], e.initiator[mine], e.target[mine], strict=True)
+    ]
+    return replace(flight, exchanges=e[~mine], faults=failed)
+
+
+def moved_anchor(flight: Flight, rng: np.random.Generator, *, plan: Plan, both: bool) -> Flight | list[Flight]:
+    """Let an anchor stand 20 to 60 cm from where the recording says; in the second of two recordings, if `both`."""
+    away = rng.normal(size=3)
+    away *= rng.uniform(0.2, 0.6) / np.linalg.norm(away)
+    which = int(rng.integers(0, plan.anchors))
+    seed = int(rng.integers(0, 2**31))
+    second = fly(plan, seed + 1, 1, (which, away))
+    return [named(fly(plan, seed, 1), "first"), named(second, "second")] if both else second
+
+
+def named(flight: Flight, name: str) -> Flight:
+    """Return a flight with a name."""
+    return replace(flight, name=name)
+
+
+def other_delay(flight: Flight, rng: np.random.Generator, *, plan: Plan) -> list[Flight]:
+    """Change a tag's delay by 0.5 to 1.2 ns between two recordings."""
+    seed = int(rng.integers(0, 2**31))
+    second = fly(plan, seed + 1, 1)
+    size = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.2)) * LIGHT * 1e-9 / 2
+    second = longer(second, np.where(of_tag(second, tag_of(second, rng)), size, 0.0))
+    return [named(fly(plan, seed, 1), "first"), named(second, "second")]
+
+
+def two(flight: Flight, rng: np.random.Generator, *, plan: Plan) -> list[Flight]:
+    """Return two recordings of the same boards with nothing planted."""
+    seed = int(rng.integers(0, 2**31))
+    return [named(fly(plan, seed + k, 1), str(k)) for k in range(2)]
+
+
+def few_pairs(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Leave two bodies, whose tags range with the other's only, and corrupt 130 rows."""
+    e = flight.exchanges
+    some = replace(flight, exchanges=e[(e.initiator < 30) & (e.target < 30)])
+    return corrupt(some, rng, 130 / len(some.exchanges))
+
+
+def still(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Keep true distances as they were measured by a tape, and ranges near them."""
+    e = flight.exchanges
+    tape = 2.0 + 0.1 * ((e.initiator + e.target) % 17)
+    known = calib.Ranges.from_exchanges(e, poses=flight.poses, tags=flight.tags).truth_m
+    return changed(longer(flight, tape - known), truth_m=tape)
+
+
+def as_read(flight: Flight, rng: np.random.Generator, **columns: Any) -> Flight:
+    """Return a flight that was imported otherwise than it was recorded."""
+    whole = {
+        name: np.full(len(flight.exchanges), value) if name == "protocol" else value for name, value in columns.items()
+    }
+    return changed(flight, **whole)
+
+
+def in_ns(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Take nanoseconds for ticks."""
+    return changed(flight, **{n: np.rint(getattr(flight.exchanges, n) * 1e9 / TICKS).astype(np.int64) for n in STAMPS})
+
+
+def simulated(flight: Flight, rng: np.random.Generator, *, settings: tuple[str, ...] = ()) -> Any:
+    """Return a flight of the simulator instead, of a minute."""
+    seed = f"run.seed={rng.integers(0, 2**31)}"
+    return simulate(load(SCENARIO, [seed, "run.duration_s=60", *settings]))
+
+
+def nothing(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Plant nothing."""
+    return flight
+
+
+def names(*words: str) -> frozenset[str]:
+    """Return names of faults."""
+    return frozenset(words)
+
+
+BASE: Final = Plan()
+ANCHORS: Final = Plan(anchors=4, tags_a_body=1)
+LASTING: Final = "reflections that last"
+SHORT: Final = Plan(seconds=2)
+ONE: Final = Plan(tags_a_body=1, bodies=5)
+
+CLEAN: Final = (
+    *(Case(name, plan, nothing, frozenset(), also)
+    for name, plan, also in (
+        ("three bodies with two tags, 2 minutes", BASE, names()),
+        ("20 s", Plan(seconds=20), names()),
+        ("5 minutes", Plan(seconds=300), names()),
+        ("three tags", Plan(tags_a_body=1), names()),
+        ("five tags, reflections that last 4 s, 15 %", replace(ONE, share=0.15, lasts_s=4.0), names(LASTING)),
+        ("reflections that last 15 s, 10 %", Plan(share=0.1, lasts_s=15.0, seconds=240), names(LASTING)),
+        ("four anchors", ANCHORS, names()),
+        ("third message from the initiator", Plan(protocol="ds-alt"), names()),
+        ("single-sided, corrected by the carriers", Plan(protocol="ss-cfo"), names()),
+        ("40-bit stamps, no carriers", Plan(bits=40, carriers=False), names()),
+    )),
+    Case("two recordings of the same boards", ANCHORS, partial(two, plan=ANCHORS), frozenset()),
+    Case("simulator: the flight of ICRA 2023, a minute", SHORT, simulated, frozenset()),
+)  # fmt: skip
+
+FAULTS: Final = (
+    Case("3 % corrupt stamps", BASE, partial(corrupt, share=0.03), names("corrupted exchanges")),
+    Case("two bodies only, and 130 corrupt rows", BASE, few_pairs, names("too few pairs"),
+         names("corrupted exchanges")),
+    Case("`ds` read as `ds-alt`", BASE, partial(as_read, protocol="ds-alt"), names("another protocol")),
+    Case("`ds-alt` read as `ds`", Plan(protocol="ds-alt"), partial(as_read, protocol="ds"), names("another protocol")),
+    Case("32-bit stamps read as 40", BASE, partial(as_read, bits=40), names("timestamp width")),
+    Case("nanoseconds read as ticks", BASE, in_ns, names("unit slip")),
+    Case("`ss` read as `ds`", Plan(protocol="ss-cfo"), partial(as_read, protocol="ds"),
+         names("single-sided data taken for double-sided")),
+    Case("initiator and target exchanged", BASE, swapped_roles, names("swapped roles")),
+    Case("tags of a body exchanged", BASE, swapped_tags, names("swapped tag ids", "lever arm sign")),
+    Case("lever arms of a body with the wrong sign", BASE, turned_arms, names("lever arm sign", "swapped tag ids")),
+    Case("quaternions w x y z", BASE, wxyz, names("wxyz quaternion")),
+    Case("poses 0.15 to 1.5 s off", BASE, late_poses, names("pose time offset")),
+    Case("vacuum's speed of light", BASE, lambda f, _: changed(f, range_m=f.exchanges.range_m * VACUUM),
+         names("speed of light in vacuum")),
+    Case("a delay steps by 0.3 to 1.2 ns", BASE, stepped, names("delay changed mid-flight")),
+    Case("the same, reflections that last 5 s", Plan(share=0.1, lasts_s=5.0), stepped,
+         names("delay changed mid-flight"), names(LASTING)),
+    Case("a delay drifts by 1 ns", BASE, drifting, names("delay drifts", "delay changed mid-flight")),
+    Case("a pair 12 to 30 cm long", BASE, pair_off, names("pairs that do not close")),
+    Case("a tag that hardly answers", BASE, dead, names("dead or deaf tag")),
+    Case("nothing moves", BASE, still, names("static data")),
+    Case("power that follows distance", Plan(turning_db=0.1), nothing, names("power confounded with distance")),
+    Case("single-sided, skew left in", Plan(protocol="ss"), nothing, names("skew in single-sided ranges")),
+    Case("the same, carriers not read", Plan(protocol="ss", carriers=False), nothing,
+         names("skew in single-sided ranges"), names("single-sided without carrier readings")),
+    Case("corrected with the carriers' wrong sign", Plan(protocol="ss-cfo"),
+         lambda f, _: changed(f, skew1_ppm=-f.exchanges.skew1_ppm, skew2_ppm=-f.exchanges.skew2_ppm,
+                              range_m=np.full(len(f.exchanges), np.nan)),
+         names("carrier readings with the wrong sign")),
+    Case("a third of the ranges reflected", Plan(share=0.34), nothing, names("reflections")),
+    Case("reflections that last 3 s, a quarter", Plan(share=0.25, lasts_s=3.0), nothing, names(LASTING)),
+    Case("simulator: single-sided, skew left in", SHORT, partial(simulated, settings=("ranging.protocol=ss",)),
+         names("skew in single-sided ranges")),
+    Case("simulator: half of the ranges reflected", SHORT,
+         partial(simulated, settings=("radio.multipath.share=0.5",)), names("reflections")),
+    Case("an anchor 20 to 60 cm elsewhere", ANCHORS, partial(moved_anchor, plan=ANCHORS, both=False),
+         names("anchor stands elsewhere")),
+    Case("an anchor moved between two recordings", ANCHORS, partial(moved_anchor, plan=ANCHORS, both=True),
+         names("anchor moved between recordings")),
+    Case("a delay of 0.5 to 1.2 ns more in the second", ONE, partial(other_delay, plan=ONE),
+         names("delay changed between recordings")),
+)  # fmt: skip
+
+
+def said(case: Case, seed: int) -> set[str]:
+    """Return what the doctor says of a case."""
+    rng = np.random.default_rng([seed, 33])
+    return {finding.fault for finding in calib.examine(case.plant(fly(case.plan, seed), rng))}
+
+
+def row(case: Case, seeds: range) -> tuple[str, int, int]:
+    """Return a row of the table, hits and runs with a false alarm."""
+    found = [said(case, seed) for seed in seeds]
+    hits = sum(bool(one & case.expected) for one in found)
+    wrong = Counter(fault for one in found for fault in one - case.expected - case.also)
+    alarms = sum(bool(one - case.expected - case.also) for one in found)
+    also = Counter(fault for one in found for fault in one & case.also)
+    told = ", ".join(f"{fault} ({n})" for fault, n in wrong.most_common()) or "nothing"
+    true = ", ".join(f"{fault} ({n})" for fault, n in also.most_common())
+    named_by = " or ".join(sorted(case.expected)) or "nothing"
+    share = f"{hits} of {len(found)}" if case.expected else ""
+    return f"| {case.name} | {named_by} | {share} | {told} | {true} |", hits, alarms
+
+
+def table(first: int) -> str:
+    """Return the table, from cases on all cores."""
+    jobs = [(case, range(first, first + CLEAN_SEEDS)) for case in CLEAN]
+    jobs += [(case, range(first + 500, first + 500 + SEEDS)) for case in FAULTS]
+    with ProcessPoolExecutor(2) as pool:
+        rows = list(pool.map(_row_by_number, range(len(jobs)), [first] * len(jobs)))
+    clean, faulty = rows[: len(CLEAN)], rows[len(CLEAN) :]
+    runs = sum(len(seeds) for _, seeds in jobs[: len(CLEAN)])
+    alarms, hits = sum(one[2] for one in clean), sum(one[1] for one in faulty)
+    planted = sum(len(seeds) for _, seeds in jobs[len(CLEAN) :])
+    beside = sum(one[2] for one in faulty)
+    head = "| recording | should be named | named | said beside | said, and there |\n|---|---|---|---|---|"
+    return "\n".join([
+        f"Nothing planted: {alarms} of {runs} recordings with a false alarm ({100 * alarms / runs:.1f} %). Planted: "
+        f"{hits} of {planted} named ({100 * hits / planted:.0f} %), {beside} with something else said beside.",
+        "", head,
+        *(one[0] for one in clean), *(one[0] for one in faulty),
+    ])  # fmt: skip
+
+
+def _row_by_number(number: int, first: int) -> tuple[str, int, int]:
+    if number < len(CLEAN):
+        return row(CLEAN[number], range(first, first + CLEAN_SEEDS))
+    return row(FAULTS[number - len(CLEAN)], range(first + 500, first + 500 + SEEDS))
+
+
+def main() -> None:
+    """Print the table of tuning seeds, or write that of reported ones into the page."""
+    if "--tuning" in sys.argv:
+        print(table(0))
+        return
+    page = PAGE.read_text(encoding="utf-8")
+    text = f"{BEGIN}\n{table(FIRST_REPORTED)}\n{END}"
+    PAGE.write_text(re.sub(f"{BEGIN}.*?{END}", lambda _: text, page, flags=re.S), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
