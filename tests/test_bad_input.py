@@ -252,7 +252,10 @@ def test_calibrations_of_other_tags_and_versions(tmp_path, flight):
     refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "no delay for tag 3")
     (tmp_path / "c.json").write_text(json.dumps(document | {"schema_version": 7}))
     refused(
-        run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "schema version 7", "reads 1, 2 and 3"
+        run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"),
+        2,
+        "schema version 7",
+        "reads 1, 2, 3 and 4",
     )
     document["uncertainty"]["bias_m2"] = [[1.0]]
     (tmp_path / "c.json").write_text(json.dumps(document))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -13,6 +14,9 @@ from uwblink.cli.shared import Force
 
 if TYPE_CHECKING:
     from uwblink.importers import Importer
+
+LONG_BYTES: Final = 50_000_000
+"""From here on an import takes a second and more."""
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")]
 
@@ -93,12 +97,20 @@ def _argument(row: Importer) -> Any:
     return Annotated[list[Path], typer.Argument(help=f"{what} Several are one table.")]
 
 
+def _say_if_long(sources: list[Path]) -> None:
+    """Tell whoever waits at a terminal what is being read, where that takes seconds."""
+    size = sum(path.stat().st_size for path in sources if path.is_file())
+    if size > LONG_BYTES and sys.stderr.isatty():
+        typer.echo(f"reading {size / 1e6:.0f} MB ...", err=True)
+
+
 def _import(row: Importer, source: Path | list[Path], output: Path, map_file: Path | None, *, force: bool) -> None:
     from uwblink.display import printable
     from uwblink.importers import read_source
     from uwblink.output import check_output
 
     check_output(output, force=force)
+    _say_if_long(source if isinstance(source, list) else [source])
     contents = read_source(source, importer=row.name, map_file=map_file)
     contents.save(output, force=force)
     counts = contents.counts()
