@@ -24,7 +24,7 @@ UNKNOWNS: Final = 300
 
 SHORTEST_STEP_S: Final = 0.5
 ROUNDS: Final = 40
-WARM_UPS_S: Final = (7.0, 14.0, 28.0, 56.0, 112.0)
+WARM_UPS_S: Final = (10.0, 25.0, 60.0)
 WARM_UP_PPM: Final = 5.0
 """How much faster clocks are thought to run at first before anything is seen."""
 
@@ -91,7 +91,8 @@ def fit_clocks(flight: Flight) -> ClockFit:
         tries = [_Search(flight, decay).run(ROUNDS) for decay in WARM_UPS_S if decay < 2 * span]
         best = min(tries, key=lambda one: float(np.sum(np.log(one.walk))), default=found)
         # Each clock pays for its warming up with a walk that is shorter by more than one number explains.
-        if np.sum(np.log(found.walk / best.walk)) * (best.knots - 1) > NEEDED * len(flight.tags):
+        shorter = float(np.sum(np.log(found.walk / best.walk))) * (best.knots - 1)
+        if shorter > NEEDED * len(flight.tags) and best.warmed_up() > NEEDED:
             found = best
     return found.result()
 
@@ -145,6 +146,11 @@ class _Search:
 
     def _set_noise(self, scatter: Floats, weight: Floats, kind: Ints) -> None:
         self.noise = np.array([_spread(scatter, weight, kind == k, self.noise[k]) for k in range(KINDS)])
+
+    def warmed_up(self) -> float:
+        """Return how much more than its walk does meanwhile the clock that warms up most does, from all others."""
+        warm = self.found[self.tags * self.knots : -KINDS]
+        return float(np.max(np.abs(warm - np.median(warm)) / (self.walk * np.sqrt(self.decay_s or 1.0))))
 
     def result(self) -> ClockFit:
         """Return what was found; the noise is taken of all readings."""

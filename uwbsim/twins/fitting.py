@@ -29,6 +29,9 @@ from uwbsim.twins.scenario_text import scenario_text
 from uwbsim.twins.schedules import fit_schedule
 from uwbsim.twins.unknowns import unknowns
 
+ENOUGH: Final = 50_000
+"""Exchanges to which clocks and powers are fitted at most; more would only take longer."""
+
 HEAD: Final = (
     "The twin of {recording} with {calibration}: fitted to it by `uwbsim twin`, which also wrote what lies beside this "
     "file. What nothing is said of here has its default."
@@ -174,11 +177,13 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
 
 
 def _fit(flight: Flight, faults: list[Any]) -> Fitted:
-    clocks = fit_clocks(flight)
-    noise = receive_noise(flight, clocks)
+    rows = flight.some(ENOUGH)
+    part = flight[rows]
+    clocks = fit_clocks(part)
+    noise = receive_noise(part, clocks)
     std = np.sqrt(np.mean([noise.at(power) ** 2 for power in flight.power_dbm], axis=0))
     reflections = fit_reflections(flight, std)
-    powers = fit_powers(flight, reflections.reflected)
+    powers = fit_powers(part, reflections.reflected[rows])
     return Fitted(
         clocks=clocks,
         noise=noise,

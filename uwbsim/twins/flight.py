@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol, Self
 
@@ -22,6 +22,7 @@ from uwbsim.errors import ScenarioError
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.units import NS
 
+BLOCK: Final = 2000
 FEWEST: Final = 100
 """Exchanges below which nothing of a distribution can be told."""
 
@@ -90,6 +91,30 @@ class Flight:
     def __len__(self) -> int:
         """Return the number of exchanges."""
         return len(self.time_s)
+
+    def __getitem__(self, rows: Ints) -> Self:
+        """Return the chosen exchanges, in their order; times go on counting from the same instant."""
+        return replace(
+            self,
+            exchanges=self.exchanges[rows],
+            time_s=self.time_s[rows],
+            ends=self.ends[:, rows],
+            pair=self.pair[rows],
+            distance_m=self.distance_m[rows],
+            towards=self.towards[:, rows],
+            residual_m=self.residual_m[rows],
+            ratio_ppm=self.ratio_ppm[rows],
+        )
+
+    def some(self, most: int) -> Ints:
+        """Return rows of `most` exchanges, all where there are no more: blocks all over the flight.
+
+        What comes soon after one another stays together, so that short lags stay.
+        """
+        if len(self) <= most:
+            return np.arange(len(self))
+        begins = np.linspace(0, len(self) - BLOCK, most // BLOCK).astype(np.int64)
+        return np.unique(begins[:, None] + np.arange(BLOCK))
 
     @property
     def power_dbm(self) -> Floats:

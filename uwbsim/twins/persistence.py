@@ -21,6 +21,9 @@ SHORTEST_LAG_S: Final = 1e-3
 LONGEST_SHARE: Final = 0.25
 """Of a flight's length, up to which lags count."""
 
+LONGEST_SUM: Final = 3000
+"""Lags that are added up at most."""
+
 SIGNIFICANT: Final = 4.0
 
 
@@ -144,7 +147,7 @@ def effective_size(value: Floats, group: Ints) -> float:
     order = np.argsort(group, kind="stable")
     sorted_value, sorted_group = centred[order], group[order]
     total, before, longest = 1.0, 0.0, int(np.bincount(np.unique(group, return_inverse=True)[1]).max())
-    for step in range(1, longest):
+    for step in range(1, min(longest, LONGEST_SUM)):
         same = sorted_group[step:] == sorted_group[:-step]
         if np.count_nonzero(same) < 2:
             break

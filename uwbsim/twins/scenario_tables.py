@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import Poses
@@ -79,7 +79,7 @@ def receive_noise(flight: Flight, clocks: ClockFit) -> ReceiveNoise:
     together = float(np.sqrt(np.mean(noise**2)))
     # The logarithm of a spread has the standard error 1/sqrt(2n).
     misfit = float(np.sum(2 * size * np.log(std / together) ** 2))
-    if count == 1 or chi2.sf(misfit, count - 1) > ALIKE:
+    if count == 1 or chdtrc(count - 1, misfit) > ALIKE:
         return ReceiveNoise(power_dbm=np.array([np.median(power)]), std_s=np.array([together]))
     middle = np.array([np.median(power[rows]) for rows in parts])
     distinct = np.append(True, np.diff(middle) > 1e-3)

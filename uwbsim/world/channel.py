@@ -85,10 +85,10 @@ class Ends:
             phases = self.phases[tags] if radio.shadowing_db else self.phases
             there = np.einsum("ni,nij->nj", way, rotation)
             gain = gain + gain_db(radio, phases, there)
-            for place, tag in enumerate(self.scenario.tags):
-                if tag.pattern_db:
-                    mine = np.flatnonzero(tags == place)
-                    gain[mine] += pattern_gain_db(tag.pattern_db, there[mine])
+            for place in np.unique(tags).tolist() if any(tag.pattern_db for tag in self.scenario.tags) else ():
+                mine, own = np.flatnonzero(tags == place), self.scenario.tags[place].pattern_db
+                if own:
+                    gain[mine] += pattern_gain_db(own, there[mine])
         if any(tag.tx_power_db for tag in self.scenario.tags):
             gain = gain + np.array([tag.tx_power_db for tag in self.scenario.tags])[self.places[0]]
         return gain
