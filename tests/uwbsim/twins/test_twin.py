@@ -43,6 +43,8 @@ def test_reflections_are_found(found):
     assert found.found["reflection_life_s"] == pytest.approx(0.25, rel=0.2)
     assert found.found["mean_excess_m"] == pytest.approx(0.45, rel=0.2)
     assert found.found["reflection_loss_db"] == pytest.approx(6.0, abs=0.5)
+    assert found.found["core_mean_m"] == pytest.approx(0.0, abs=0.003)
+    assert found.found["direct_std_m"] < 0.01
 
 
 def test_powers_are_found(found):
