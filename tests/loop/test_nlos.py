@@ -6,8 +6,6 @@ import pytest
 from benchmarks.nlos import DETOUR_M, FLIGHT, auc, classifier, of_real_flight, of_rooms
 from tests.shared_data import shared
 
-pytest.importorskip("sklearn", reason="scikit-learn is of the group dev")
-
 
 @pytest.fixture(scope="module")
 def trained():

@@ -23,6 +23,7 @@ STEPS_A_UNIT: Final = 256
 LIT: Final = -0.78
 """From here on an edge takes nothing away, by the approximation of ITU-R P.526."""
 
+AT_EDGE: Final = 10 ** (-6.9 / 20)
 NEAREST_M: Final = 1e-3
 PARALLEL: Final = 1e-9
 CENTRED_M: Final = 1e-4
@@ -31,8 +32,8 @@ CENTRED_M: Final = 1e-4
 def edge_gain(nu: Floats) -> Floats:
     """Return the field behind a knife edge as a share: ITU-R P.526-15, equation 31, and 1 in the light."""
     over = np.maximum(nu, LIT) - 0.1
-    loss_db = 6.9 + 20 * np.log10(np.sqrt(over**2 + 1) + over)
-    return np.asarray(np.where(nu > LIT, np.minimum(10 ** (-loss_db / 20), 1.0), 1.0))
+    # 6.9 dB and 20 log10(sqrt(over^2 + 1) + over), without the logarithm.
+    return np.asarray(np.where(nu > LIT, AT_EDGE / (np.sqrt(over * over + 1) + over), 1.0))
 
 
 def covered(nu: Floats) -> Complexes:
@@ -137,10 +138,10 @@ def _past(shadow: Shadow, start: Floats, way: Floats, length_m: Floats) -> Float
     radius = np.sqrt(_dot(point, point))
     aside = _aside(point * axes, way, int(np.argmin(axes)))
     out_m, wide_m = (_extent_m(axes, direction) for direction in (aside, _cross(way, aside)))
-    covered_share = np.ones(len(way))
-    for extent_m, at in ((out_m, radius), (wide_m, np.zeros(len(way)))):
-        unit = fresnel_number(extent_m, line, length_m)
-        covered_share *= 1 - np.minimum(edge_gain(unit * (1 - at)) + edge_gain(unit * (1 + at)), 1.0)
+    unit = fresnel_number(np.ones(len(way)), line, length_m)
+    out, wide = out_m * unit, wide_m * unit
+    near, opposite, across = edge_gain(np.stack([out * (1 - radius), out * (1 + radius), wide]))
+    covered_share = (1 - np.minimum(near + opposite, 1.0)) * (1 - np.minimum(2 * across, 1.0))
     root = np.sqrt(np.maximum(q**2 - p * (r - 1), 0))
     inside = np.clip((-q + root) / p, 0, 1) - np.clip((-q - root) / p, 0, 1)
     through = np.where(inside > 0, 10 ** (-inside * length_m * shadow.loss_db_per_m / 20), 0.0)

@@ -76,11 +76,11 @@ def paths_between(
     ]
     length = np.concatenate([part[0] for part in parts], axis=1)
     amplitude = np.concatenate([part[1] for part in parts], axis=1)
-    # The carrier turns with the way; those that there are not have no amplitude.
+    # The carrier turns with the way.
     turns = length / WAVELENGTH_M
     angle = -2 * np.pi * (turns - np.rint(turns))
     turned = amplitude * (np.cos(angle) + 1j * np.sin(angle))
-    return Paths(detour_m=np.where(amplitude == 0, 0.0, length - distance[:, None]), amplitude=turned)
+    return Paths(detour_m=length - distance[:, None], amplitude=turned)
 
 
 def _direct(
