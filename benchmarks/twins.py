@@ -1,6 +1,7 @@
 """How well twins of simulated recordings find what was planted (`make twins`): a table over seeds, as in docs/twin.md.
 
-The world is of this file alone: nothing in `uwbsim.twins` was chosen on it. Two robots and three anchors, pairs whose
+The world is of this file alone: nothing in `uwbsim.twins` was chosen on it but how offsets of tags are told from their
+antennas. Two robots and three anchors, pairs whose
 reflections differ in share and life, fading, outages, tags that send weak or read strong, dipoles.
 """
 

@@ -19,6 +19,7 @@ BY_PAIR: Final = ("residual of calibrated ranges", "first-path power at initiato
 
 TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {
     "quantity": lambda c: f"{c.name} ({c.unit})",
+    "verdict": lambda c: "alike" if c.alike else "differ",
     "median": lambda c: _both(c.median_measured, c.median_simulated),
     "10 %": lambda c: _both(c.low_measured, c.low_simulated),
     "90 %": lambda c: _both(c.high_measured, c.high_simulated),
@@ -26,7 +27,6 @@ TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {
     "worth": lambda c: f"{c.worth_measured:.0f} of {c.count}",
     "D": lambda c: f"{c.distance:.3f}",
     "p": lambda c: f"{c.probability:.2g}",
-    "verdict": lambda c: "alike" if c.alike else "differ",
 }
 """What tables on the page and on the terminal show of a quantity: measured, then simulated."""
 

@@ -17,7 +17,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals
 from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import bulk_spread
+from uwbsim.twins.persistence import bulk_spread, some_rows
 
 UNKNOWNS: Final = 300
 """Rates that are solved for at most, tags times knots."""
@@ -32,8 +32,8 @@ LONG_WALK_PPM: Final = 0.15
 """Over a flight; who walks that far may be warming up."""
 
 NEEDED: Final = 3.0
-SAMPLED: Final = 6000
-"""Readings of which the noise is taken in each round, at least."""
+SAMPLED: Final = 10_000
+"""Readings of which the noise is taken in each round, at most."""
 
 PRIOR_STEPS: Final = 1.0
 """How many steps of an average clock each clock's walk is taken together with: a short flight has few of its own."""
@@ -108,7 +108,7 @@ class _Search:
         self.readings = _readings(flight, self.knots, self.step_s, decay_s)
         self.noise, self.walk = _first_guess(flight), np.full(tags, 3e-3)
         self.weight = np.ones(len(self.readings.value))
-        self.some = np.arange(0, len(self.weight), max(len(self.weight) // SAMPLED, 1))
+        self.some = some_rows(len(self.weight), SAMPLED)
         self.stiffness = _walk_precision(self.knots)
 
     def run(self, rounds: int) -> _Search:

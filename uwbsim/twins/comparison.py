@@ -17,7 +17,7 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import simulate
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import effective_size, lag_one
+from uwbsim.twins.persistence import effective_size, lag_one, some_rows
 
 LEVEL: Final = 0.01
 """Below this probability chance does not explain a difference."""
@@ -159,7 +159,7 @@ def _distance(one: Floats, other: Floats) -> float:
 
 
 def _thinned(values: Floats) -> Floats:
-    return values[:: max(-(-len(values) // SHOWN), 1)]
+    return values[some_rows(len(values), SHOWN)]
 
 
 def _by_pair(measured: Flight, values: Floats, simulated: list[tuple[Flight, Floats]]) -> dict[str, dict[str, float]]:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from uwblink.arrays import Floats, Ints
+from uwbsim.random_streams import stream
 
 BINS: Final = 24
 MOST_STEPS: Final = 80
@@ -156,6 +157,13 @@ def effective_size(value: Floats, group: Ints) -> float:
             break
         total, before = total + 2 * correlation, correlation
     return float(np.clip(count / max(total, 1e-9), 2.0, count))
+
+
+def some_rows(count: int, most: int) -> Ints:
+    """Return `most` of so many rows, in their order and by chance: every k-th would leave pairs out that take turns."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(stream(0, "some rows", count).choice(count, most, replace=False))
 
 
 def bulk_spread(value: Floats) -> float:

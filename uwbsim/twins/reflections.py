@@ -19,13 +19,13 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import intervals
 from uwbsim.scenario.radio import TwoStateMultipath
 from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, effective_size, lasting
+from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, effective_size, lasting, some_rows
 
 LEAST_SHARE: Final = 1e-4
 SHORTEST_CORE_M: Final = 1e-3
 ROUNDS: Final = 50
-SAMPLED: Final = 15_000
-"""Ranges to which the core and the tail of all are fitted, at least."""
+SAMPLED: Final = 30_000
+"""Ranges to which the core and the tail of all are fitted, at most."""
 
 TRIM_M: Final = 0.6
 """Nearer than this a residual may be of the core for certain; further below it is a mistake of some other kind."""
@@ -104,7 +104,7 @@ def range_noise_m(flight: Flight, receive_noise_s: Floats) -> Floats:
 
 def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
     """Return the core's mean, its spread beyond the white noise, the mean detour and the share of the tail."""
-    thin = slice(None, None, max(len(error) // SAMPLED, 1))
+    thin = some_rows(len(error), SAMPLED)
     error, white = error[thin], white[thin]
     scale = max(bulk_spread(error), SHORTEST_CORE_M)
 

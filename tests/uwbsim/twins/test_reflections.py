@@ -9,7 +9,7 @@ import pytest
 
 from uwblink import PROTOCOLS, Exchanges, Tag
 from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import autocovariance, effective_size, lag_one, lasting
+from uwbsim.twins.persistence import autocovariance, effective_size, lag_one, lasting, some_rows
 from uwbsim.twins.reflections import fit_reflections
 
 
@@ -110,6 +110,13 @@ def test_independent_reflections_have_no_life(made):
     whole = made[0]
     shuffled = flight(whole.time_s, whole.pair, rng.permutation(whole.residual_m))
     assert fit_reflections(shuffled, np.zeros(len(shuffled))).life_s is None
+
+
+def test_some_rows_are_of_all_pairs_that_take_turns():
+    rows = some_rows(24_000, 4000)
+    assert len(np.unique(rows)) == 4000
+    assert np.bincount(rows % 12).min() > 4000 / 12 * 0.8
+    assert np.array_equal(some_rows(10, 10), np.arange(10))
 
 
 def autoregressive(rng, count, share):
