@@ -28,6 +28,9 @@ PAGE = Path(__file__).parents[1] / "docs" / "doctor.md"
 BEGIN, END = "<!-- table -->", "<!-- end of table -->"
 SEEDS: Final = 4
 CLEAN_SEEDS: Final = 10
+OF_FAULTS: Final = 700
+"""Where seeds of faults begin, after the first."""
+
 SCENARIO: Final = Path(__file__).parents[1] / "scenarios" / "icra2023" / "test1.toml"
 VACUUM: Final = 299_792_458.0 / LIGHT
 STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -322,7 +325,7 @@ def row(case: Case, seeds: range) -> tuple[str, int, int]:
 def table(first: int) -> str:
     """Return the table, from cases on all cores."""
     jobs = [(case, range(first, first + CLEAN_SEEDS)) for case in CLEAN]
-    jobs += [(case, range(first + 500, first + 500 + SEEDS)) for case in FAULTS]
+    jobs += [(case, range(first + OF_FAULTS, first + OF_FAULTS + SEEDS)) for case in FAULTS]
     with ProcessPoolExecutor(2) as pool:
         rows = list(pool.map(_row_by_number, range(len(jobs)), [first] * len(jobs)))
     clean, faulty = rows[: len(CLEAN)], rows[len(CLEAN) :]
@@ -342,7 +345,7 @@ def table(first: int) -> str:
 def _row_by_number(number: int, first: int) -> tuple[str, int, int]:
     if number < len(CLEAN):
         return row(CLEAN[number], range(first, first + CLEAN_SEEDS))
-    return row(FAULTS[number - len(CLEAN)], range(first + 500, first + 500 + SEEDS))
+    return row(FAULTS[number - len(CLEAN)], range(first + OF_FAULTS, first + OF_FAULTS + SEEDS))
 
 
 def main() -> None:
