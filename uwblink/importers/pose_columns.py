@@ -35,8 +35,11 @@ def poses_of_table(path: Path, body: str | None) -> Poses | None:
                 return None
     except ImportTableError:
         return None
-    bodies = np.full(len(time_ns), body) if body is not None else words["body"]
-    return _checked(time_ns, bodies, np.column_stack([numbers[name] for name in NUMBERS]))
+    values = np.column_stack([numbers[name] for name in NUMBERS])
+    # A file that somebody is still writing is longer when the second of its columns is read.
+    count = min(len(time_ns), len(values))
+    bodies = np.full(count, body) if body is not None else words["body"][:count]
+    return _checked(time_ns[:count], bodies, values[:count])
 
 
 def poses_of_lines(path: Path, body: str, *, euroc: bool) -> Poses | None:

@@ -9,7 +9,9 @@ import pytest
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.motion_capture import add_poses
+from uwblink.importers.pose_columns import poses_of_table
 from uwblink.importers.poses import _READERS, _as_poses, _at_once, read_poses
+from uwblink.importers.table import Table
 from uwblink.recording.file import Recording
 from uwbsim.boards.live_poses import LivePoses
 from uwbsim.scenario.loading import load
@@ -157,3 +159,21 @@ def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, tmp_pat
         assert done.returncode == 2
         assert fragment in done.stderr
         assert done.stderr.count("\n") == 1
+
+
+def test_a_file_that_grows_while_it_is_read_gives_what_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "motion.csv"
+    lines = [f"{k * 10**9},drone,{k}.0,0.0,1.0,0.0,0.0,0.0,1.0\n" for k in range(300)]
+    path.write_text("time_ns,body,x,y,z,qx,qy,qz,qw\n" + "".join(lines[:200]))
+    plain = Table.read
+
+    def growing(table, *arguments):
+        found = plain(table, *arguments)
+        with path.open("a") as file:
+            file.writelines(lines[200:])
+        return found
+
+    monkeypatch.setattr(Table, "read", growing)
+    poses = poses_of_table(path, None)
+    assert poses.time_ns.tolist() == [k * 10**9 for k in range(200)]
+    assert poses.position_m[:, 0].tolist() == list(map(float, range(200)))
