@@ -26,7 +26,6 @@ from tests.calib.synthetic import ranges
         ("fixed_ns", {1: math.nan}),
         ("fixed_ns", {1.5: 0.1}),
         ("fixed_ns", {99: 0.1}),
-        ("fixed_ns", {1: 0, 2: 0, 3: 0, 7: 0}),
         ("groups", {"a": [1, 2], "b": [2, 3, 7]}),
         ("groups", {"a": "12"}),
         ("groups", {"a": []}),
