@@ -30,3 +30,20 @@ def test_usage_errors_have_status_2(command):
     assert subprocess.run([str(BIN / command), "nonsense"], capture_output=True).returncode == 2
     done = subprocess.run([str(BIN / command), "--version"], capture_output=True, text=True)
     assert done.stdout.strip() == uwblink.__version__
+
+
+@pytest.mark.parametrize("package", ["uwbsim", "uwblink", "calib"])
+@pytest.mark.parametrize("module", ["typer", "uwblink.cli.shared"])
+def test_interrupted_while_it_is_imported(package, module):
+    code = (
+        "import os, signal, sys\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {module!r}:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+        f"from {package}.cli import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")

@@ -14,6 +14,7 @@ BESIDE = {
     "uwblink.exporters.export_recording": "the front door offers no export yet",
     "uwblink.importers.guess.guess_map": "what import suggests where no map is given; read_source takes the map",
     "uwblink.__version__": "what --version prints",
+    "uwblink.cli.starting": "Ctrl-C while a command is being imported, before anything of it is there",
     "uwblink.cli.shared": "options, errors and interrupts that the three commands have in common",
 }
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import sys
 from typing import NoReturn
 
-from calib.cli import evaluating, files, fitting, reporting, showing
-from calib.cli.flags import FLAGS
-from calib.errors import CalibError, UnanswerableError
-from uwblink.cli import shared
-
-app = shared.new_app(
-    "Fit antenna delays and power curves to ultra-wideband ranges, apply them, and say how good they are."
-)
-for room in (fitting, showing, evaluating, reporting, files):
-    room.add_to(app)
+from uwblink.cli.starting import start
 
 
 def main() -> NoReturn:
-    """Run the command; a mistake is one line on standard error, status 2, or 1 (see docs)."""
-    words = reporting.spread(sys.argv[1:])
+    """Run the command; a mistake is one line on standard error, status 2, or 1 (see docs), Ctrl-C one and 130."""
+    start(_run)
+
+
+def _run() -> NoReturn:
+    # Here, so that Ctrl-C is answered while these are loaded.
+    import sys
+
+    from calib.cli.commands import app
+    from calib.cli.flags import FLAGS
+    from calib.cli.reporting import spread
+    from calib.errors import CalibError, UnanswerableError
+    from uwblink.cli import shared
+
+    words = spread(sys.argv[1:])
     shared.run(app, CalibError, statuses={UnanswerableError: 1}, arguments=words, flags=FLAGS)

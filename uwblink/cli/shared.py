@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final, NoReturn
 import typer
 
 from uwblink import __version__
+from uwblink.cli.starting import INTERRUPTED as INTERRUPTED
 from uwblink.errors import PluginWarning, UwblinkError
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -29,9 +30,6 @@ _PARAMETER: Final = re.compile(r"`([a-z_]+)`")
 
 MISTAKE: Final = 2
 """Exit status of a command that cannot do what it was told."""
-
-INTERRUPTED: Final = 130
-"""Exit status of a command that Ctrl-C ended before it was done, as shells have it."""
 
 
 def new_app(text: str) -> typer.Typer:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Final, NoReturn
+from typing import NoReturn
 
-from uwblink.cli import shared
-from uwbsim.cli import flights, twins, workbench
-from uwbsim.errors import UwbsimError
-
-app = shared.new_app("Simulate tags that range with ultra-wideband radios.")
-for room in (flights, workbench, twins):
-    room.add_to(app)
-
-FLAGS: Final = {"count": "-n/--ranges", "overhead_s": "--overhead-us", "overrides": "--set", "evaluate": "evaluate"}
-"""Of parameters that are spelt otherwise; what evaluates a sweep is a plug-in, which no flag names."""
+from uwblink.cli.starting import start
 
 
 def main() -> NoReturn:
-    """Run the command; a user's mistake is one line on standard error and exit status 2."""
+    """Run the command; a user's mistake is one line on standard error and exit status 2, Ctrl-C one and 130."""
+    start(_run)
+
+
+def _run() -> NoReturn:
+    # Here, so that Ctrl-C is answered while these are loaded.
+    from uwblink.cli import shared
+    from uwbsim.cli.commands import FLAGS, app
+    from uwbsim.errors import UwbsimError
+
     shared.run(app, UwbsimError, flags=FLAGS)

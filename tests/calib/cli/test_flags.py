@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import typer
 
-from calib.cli import app
+from calib.cli.commands import app
 from calib.cli.flags import with_flags
 from calib.estimation.arguments import FitSettings
 

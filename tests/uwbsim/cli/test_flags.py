@@ -8,7 +8,7 @@ import typer
 
 import uwbsim
 from uwblink.cli.shared import with_flags
-from uwbsim.cli import FLAGS, app
+from uwbsim.cli.commands import FLAGS, app
 
 ROOT = Path(__file__).parents[3]
 COMMANDS: Any = typer.main.get_command(app)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import uwbsim
 from tests.uwbsim.twins.worlds import known, world
 from uwblink import Poses, UwblinkError, load
-from uwbsim.cli import app
+from uwbsim.cli.commands import app
 
 
 @pytest.fixture(scope="module")

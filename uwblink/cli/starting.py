@@ -1,0 +1,29 @@
+"""Ctrl-C while a command is still being imported, for all three commands.
+
+Nothing heavy is imported here: this is what must run before the rest is loaded, which takes some tenths of a second.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from typing import Any, Final, NoReturn
+
+INTERRUPTED: Final = 130
+"""Exit status of a command that Ctrl-C ended before it was done, as shells have it."""
+
+
+def start(command: Callable[[], NoReturn]) -> NoReturn:
+    """Import and run a command; until it answers Ctrl-C itself, that is one line and status 130."""
+    before = signal.signal(signal.SIGINT, _leave)
+    try:
+        command()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _leave(_number: int, _frame: Any) -> NoReturn:
+    """End the process at once: an exception could be taken by the module that is being imported, and reported."""
+    os.write(2, b"interrupted\n")
+    os._exit(INTERRUPTED)
