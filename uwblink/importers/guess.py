@@ -17,43 +17,13 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, ISO, LAYOUTS, POSITIONS, STAMP_UNITS
+from uwblink.importers.column_map import DISTANCE_UNITS, EVENT, ISO, LAYOUTS, POSITIONS, STAMP_UNITS
+from uwblink.importers.guess_columns import OF_MESSAGES, named_columns, placed, stamp_and_event
 from uwblink.importers.stamps import how_counted, stamps_of
 from uwblink.importers.table import Table
 from uwblink.importers.trials import CLEARLY, SAMPLE, Reading, Sample, Trial
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.twr import STAMPS
-
-_END: Final = r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|dbm|db|ppm))*"
-_ID: Final = r"(_?(id|addr|address|mac|name))?"
-_RANGE: Final = r"(range|dist|distance)"
-_PATTERNS: Final = {
-    "time_s": r"(ros_?|host_?|unix_?|utc_?)?(time|timestamp|stamp|t|datetime|date|epoch)(_(utc|iso))?",
-    "from_id": rf"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|id_?from|id_?1){_ID}",
-    "to_id": rf"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|id_?to|id_?2){_ID}",
-    "tx1": r"(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
-    "rx1": r"(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
-    "tx2": r"(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
-    "rx2": r"(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
-    "tx3": r"(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
-    "rx3": r"(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
-    "fpp1": r"(fpp?|fp_?power|first_?path(_?power)?)_?1",
-    "fpp2": r"(fpp?|fp_?power|first_?path(_?power)?)_?2?",
-    "rxp1": r"(rxp|rx_?power|rssi|total_?power|pr)_?1",
-    "rxp2": r"(rxp|rx_?power|rssi|total_?power|pr)_?2?",
-    "skew1": r"(skew|cfo|carrier|clock_?offset)_?1",
-    "skew2": r"(skew|cfo|carrier|clock_?offset)_?2?",
-    "gt_range_m": rf"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|actual)_?{_RANGE}|ground_?truth",
-    "range_m": rf"(device_?|measured?_?|uwb_?|est(imated)?_?)?{_RANGE}",
-    "sequence": r"(seq|sequence)(_?(no|num|nr|number|id))?",
-    "message": r"(msg|message|frame)(_?(no|num|nr|number|type|id))?",
-    "tx": r"tx",
-    "rx": r"rx",
-    "fpp": r"(fpp?|fp_?power|first_?path(_?power)?)",
-    "rxp": r"(rxp|rx_?power|rssi|total_?power)",
-    "skew": r"(skew|cfo|carrier|clock_?offset)",
-} | {name: rf"{name[:-4]}_?{name[-3]}".replace("_", "_?") for name in POSITIONS}
-_OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sequence", "message")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +37,17 @@ class Guess:
 def guess_map(path: Path) -> Guess:
     """Look at a table and return the map that it would be read with; raises `ImportTableError`."""
     with Table(path) as table:
-        columns = _columns(table.names)
-        numbers = table.read(numbers=columns.values())[0]
-    cells = {name: numbers[header][:100_000] for name, header in columns.items()}
+        columns = named_columns(table.names)
+        columns = stamp_and_event(table, columns) or columns
+        numbers = table.read(numbers=[header for name, header in columns.items() if name != EVENT])[0]
+    cells = {name: numbers[header][:100_000] for name, header in columns.items() if name != EVENT}
     if not len(next(iter(cells.values()), np.empty(0))):
         raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(table.names)}")
-    layout = _layout(cells)
+    layout = "stamps" if EVENT in columns else _layout(cells)
+    columns, cells, unplaced = placed(columns, cells)
     top = [f'layout = "{layout}"  # {_WHY[layout]}' if layout in LAYOUTS else f"# {_WHY[layout]}"]
     units = _unit_lines(columns, cells)
-    if layout in ("exchanges", "messages"):
+    if layout in ("exchanges", "messages", "stamps"):
         stamps, unit = _stamp_lines(columns, cells, layout)
         top, units = top + stamps, unit + units
     named = [f"{name} = {json.dumps(header)}" for name, header in columns.items() if _belongs(name, layout)]
@@ -92,37 +64,28 @@ def guess_map(path: Path) -> Guess:
     ]
     lines += ["", "[units]", *units] if units else []
     lines += ["", "[constants]", *constants] if constants else []
+    lines += ["", f"# {unplaced}"] if unplaced else []
     lines += ["", f"# not used: {', '.join(map(json.dumps, left))[:300]}"] if left else []
+    lacking = [name for name in _NEEDED[layout] if name not in cells or not np.isfinite(cells[name]).any()]
+    lines += [f"# a column of numbers is still needed: {', '.join(lacking)}"] if lacking else []
     lines += ["# what was programmed into the devices is not in the table: [antenna_delays] says it"]
-    needed = {"exchanges": STAMPS[:4], "messages": ("tx", "rx"), "ranges": ("range_m",), "nothing": ()}[layout]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and all(name in columns for name in needed))
+    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking)
 
 
+_NEEDED: Final = {
+    "exchanges": STAMPS[:4],
+    "messages": ("tx", "rx"),
+    "stamps": ("message",),
+    "ranges": ("range_m",),
+    "nothing": (),
+}
 _WHY: Final = {
     "exchanges": "a row has the stamps of a whole exchange",
     "messages": "a row has one stamp of a sender and one of a receiver",
+    "stamps": "a row has one stamp, and says whether it is of sending or of receiving",
     "ranges": "there are ranges and no stamps",
     "nothing": "neither stamps nor ranges were recognised: rename columns below",
 }
-
-
-def _columns(names: Iterable[str]) -> dict[str, str]:
-    """Return which column each of our names is, raw ones before others, first ones before later ones."""
-    found: dict[str, str] = {}
-    listed = sorted(names, key=lambda name: "raw" not in name.lower())
-    for ours, pattern in _PATTERNS.items():
-        whole = re.compile(f"({pattern}){_END}")
-        for header in listed:
-            plain = re.sub(r"[^a-z0-9]+", "_", header.lower()).strip("_")
-            if whole.fullmatch(plain) and listed.count(header) == 1 and _free(ours, header, found):
-                found[ours] = header
-                break
-    return found
-
-
-def _free(ours: str, header: str, found: dict[str, str]) -> bool:
-    """A column is one thing; only the names of messages may repeat those of exchanges, until the layout is known."""
-    return header not in [taken for name, taken in found.items() if (name in _OF_MESSAGES) == (ours in _OF_MESSAGES)]
 
 
 def _layout(cells: dict[str, Floats]) -> str:
@@ -134,18 +97,18 @@ def _layout(cells: dict[str, Floats]) -> str:
 
 
 def _belongs(name: str, layout: str) -> bool:
-    if layout == "messages":
+    if layout in ("messages", "stamps"):
         return name not in (*STAMPS, "fpp1", "fpp2", "rxp1", "rxp2", "skew1", "skew2")
-    return name not in _OF_MESSAGES and not (layout == "ranges" and name in STAMPS)
+    return name not in OF_MESSAGES and not (layout == "ranges" and name in STAMPS)
 
 
 def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str) -> tuple[list[str], list[str]]:
     """Return lines of the map on protocol and counter, and on the unit of the stamps, with their reasons."""
-    names = [name for name in (STAMPS if layout == "exchanges" else ("tx", "rx")) if name in cells]
+    names = [name for name in (STAMPS if layout == "exchanges" else ("tx", "rx", "stamp")) if name in cells]
     stamps: dict[str, Floats] = {name: cells[name] for name in names}
     whole = all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
     ended = {_suffix(columns[name], STAMP_UNITS) for name in names}
-    if layout == "messages":
+    if layout != "exchanges":
         unit = next(iter(ended - {None}), None) or ("ticks" if whole else "ns")
         bits, counter = how_counted({n: c * STAMP_UNITS[unit] for n, c in stamps.items()}, None, None)
         why = "whole numbers" if whole else "not whole numbers"

@@ -82,3 +82,77 @@ def test_the_public_table_of_single_sided_ranges(tmp_path):
     assert [found.columns[n] for n in ("tx1", "rx1", "tx2", "rx2")] == [f"{name}_ticks" for name in POLL[:4]]
     assert (found.columns["fpp2"], found.columns["gt_range_m"]) == ("fpp_dbm", "gt_range_m")
     assert (found.columns["time_s"], found.columns["range_m"]) == ("host_t_s", "device_range_m")
+
+
+@pytest.mark.parametrize(("event", "words"), [("event", ("tx", "rx")), ("direction", ("Sent", "Received"))])
+@pytest.mark.parametrize("clock", ["ticks", "device_timestamp", "stamp"])
+def test_a_row_a_stamp(tmp_path, event, words, clock):
+    rows = flights()
+    lines = []
+    for row in as_messages(wrapped(rows)):
+        head = {"timestamp": row["time_s"], "src": row["from_id"], "dst": row["to_id"], "msg_no": row["message"]}
+        lines += [
+            head | {clock: row[n], event: word, "seq": row["seq"]} for n, word in zip(("tx", "rx"), words, strict=True)
+        ]
+    path = write(tmp_path / "t.csv", lines)
+    guess = guess_map(path)
+    assert guess.complete
+    (tmp_path / "map.toml").write_text(guess.text)
+    found = load_map(tmp_path / "map.toml")
+    assert (found.layout, found.columns["stamp"], found.columns["time_s"]) == ("stamps", clock, "timestamp")
+    e = read_table(path, tmp_path / "map.toml").exchanges
+    order, expected = e.tx1.argsort(), sorted(rows, key=lambda row: row["tx1"] % 2**32)
+    assert [[int(getattr(e, n)[k]) for n in HEADER[3:9]] for k in order] == [
+        [row[n] % 2**32 for n in HEADER[3:9]] for row in expected
+    ]
+
+
+def test_messages_that_are_words_are_said_to_be_missing(tmp_path):
+    lines = [{"ticks": k, "event": ("tx", "rx")[k % 2], "src": 1, "dst": 2, "msg": "poll"} for k in range(40)]
+    guess = guess_map(write(tmp_path / "t.csv", lines))
+    assert not guess.complete
+    assert "# a column of numbers is still needed: message" in guess.text
+
+
+@pytest.mark.parametrize(
+    ("mine", "other"),
+    [
+        ("tag_{}", "anchor_{}"),
+        ("{}", "anchor_pos_{}_m"),
+        ("x_tag", "x_anchor"),
+        ("{}1", "{}2"),
+        ("gt_robot_{}", "p2{}"),
+    ],
+)
+def test_places_beside_ranges(tmp_path, mine, other):
+    def called(form, axis):
+        return form.format(axis) if "{}" in form else form.replace("x_", f"{axis}_")
+
+    rows = []
+    for k in range(30):
+        row = {"t": k, "tag_id": 1, "anchor_id": 2, "range": (9 + k * k) ** 0.5 + 0.25}
+        row |= {called(mine, axis): v for axis, v in zip("xyz", (k, 0, 1), strict=True)}
+        rows.append(row | {called(other, axis): v for axis, v in zip("xyz", (0, 3, 1), strict=True)})
+    path = write(tmp_path / "t.csv", rows)
+    guess = guess_map(path)
+    assert guess.complete
+    (tmp_path / "map.toml").write_text(guess.text)
+    found = read_table(path, tmp_path / "map.toml")
+    assert found.exchanges.range_m - found.exchanges.truth_m == pytest.approx(0.25)
+    assert (len(found.poses), found.poses.position_m.max()) == (31, 29)
+
+
+def test_places_that_cannot_be_used_are_left_out_and_it_is_said(tmp_path):
+    rows = [
+        {"t": k, "src": 1, "dst": 2, "dist_mm": 1000 * (9 + k * k) ** 0.5}
+        | dict(zip(("tag_x", "tag_y", "tag_z", "anchor_x", "anchor_y", "anchor_z"), (k, 0, 1, 0, 3, 1), strict=True))
+        for k in range(30)
+    ]
+    for drop, said in ((None, "ranges are 1e+03 of their distance"), ("anchor_z", "missing: to_z_m")):
+        path = write(tmp_path / "t.csv", [{n: v for n, v in row.items() if n != drop} for row in rows])
+        guess = guess_map(path)
+        assert said in guess.text
+        (tmp_path / "map.toml").write_text(guess.text)
+        found = read_table(path, tmp_path / "map.toml")
+        assert found.exchanges.range_m[0] == pytest.approx(3.0)
+        assert not len(found.poses)
