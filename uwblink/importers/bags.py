@@ -5,13 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from uwblink.errors import ImportTableError
+from uwblink.importers.json_mcap import JsonBag, has_json
 
 
-class Bag:
+class Bag(Protocol):
     """An open bag: its topics with the kinds of their messages, and the messages."""
+
+    path: Path
+
+    @property
+    def kinds(self) -> Mapping[str, str]:
+        """What kind of message each topic has, as `geometry_msgs/msg/PoseStamped`."""
+
+    def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
+        """Yield topic, kind, time in nanoseconds by the recorder, and message; raises `ImportTableError`."""
+
+
+class RosBag:
+    """A bag with the messages of ROS, whatever it is stored as."""
 
     def __init__(self, path: Path, reader: Any) -> None:
         """Wrap an open reader."""
@@ -42,7 +56,17 @@ class Bag:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Bag]:
-    """Open a bag; raises `ImportTableError` for what is none, also from within the block, and without rosbags."""
+    """Open a bag; raises `ImportTableError` for what is none, also from within the block.
+
+    Messages of ROS need rosbags; an MCAP file of JSON messages does not.
+    """
+    try:
+        json_bag = JsonBag(path) if has_json(path) else None
+    except OSError as error:
+        raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
+    if json_bag is not None:
+        yield json_bag
+        return
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
@@ -50,7 +74,7 @@ def opened(path: Path) -> Iterator[Bag]:
         raise ImportTableError(f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'") from error
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            yield Bag(path, reader)
+            yield RosBag(path, reader)
     except (AnyReaderError, OSError, ValueError) as error:
         if isinstance(error, ImportTableError):
             raise

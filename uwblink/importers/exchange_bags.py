@@ -1,5 +1,7 @@
 """Exchanges in bags of ROS 1, ROS 2 and MCAP: fields of messages by a map, as if they were columns of a table.
 
+The project's own MCAP files need no map: all ranges in them are taken, and what they have beside.
+
 A message becomes a row whose columns are its fields, `header.frame_id`; a time (`header.stamp`) is whole nanoseconds,
 and the numbers of an array are `stamps.0`, `stamps.1` ...
 `topic` and `log_time` are columns, too. From there on a bag is a table of JSON lines.
@@ -28,6 +30,13 @@ SUFFIXES: Final = (".bag", ".mcap", ".db3")
 LONGEST_ARRAY: Final = 16
 """Numbers of an array that become columns; longer ones are images and the like."""
 
+OWN: Final = "uwb.Range"
+OWN_COLUMNS: Final = {
+    "from_id": "initiator", "to_id": "target", "range_m": "range_m", "gt_range_m": "truth_m",
+    "fpp1": "fpp1_dbm", "fpp2": "fpp2_dbm", "skew1": "skew1_ppm", "skew2": "skew2_ppm",
+}  # fmt: skip
+"""What the project calls its ranges in MCAP files, and what is in them."""
+
 STAMP: Final = "header.stamp"
 LOGGED: Final = "log_time"
 
@@ -38,12 +47,25 @@ def read_exchange_bag(source: Path, map_file: Path | None = None) -> Contents:
         raise ImportTableError(f"{source}: no such bag")
     column_map = load_map(map_file) if map_file else ColumnMap()
     with TemporaryDirectory() as place, opened(source) as bag:
+        column_map = _own(bag, column_map)
         table = Path(place) / f"{source.name}.jsonl"
-        first = _write(table, _rows(bag, column_map, _topics(bag, column_map)))
+        try:
+            first = _write(table, _rows(bag, column_map, _topics(bag, column_map)))
+        except RecursionError as error:
+            raise ImportTableError(f"{source}: a message is nested too deeply") from error
         if first is None:
             raise ImportTableError(f"{source}: no message on the topics of the map")
         found = convert(read_rows([table], _timed(column_map, first)))
     return replace(found, meta={**found.meta, "source": "import bag", "imported_from": source.name})
+
+
+def _own(bag: Bag, column_map: ColumnMap) -> ColumnMap:
+    """Return the map of the project's own ranges where a map names no topic and a bag has some, else the map."""
+    own = [topic for topic, kind in bag.kinds.items() if kind == OWN]
+    if column_map.topics or not own:
+        return column_map
+    topics: dict[str, dict[str, float | str]] = {topic: {} for topic in own}
+    return replace(column_map, topics=topics, columns=OWN_COLUMNS | column_map.columns)
 
 
 def _topics(bag: Bag, column_map: ColumnMap) -> list[str]:
@@ -72,8 +94,9 @@ def _timed(column_map: ColumnMap, first: Mapping[str, Any]) -> ColumnMap:
 
 
 def _rows(bag: Bag, column_map: ColumnMap, topics: list[str]) -> Iterator[dict[str, Any]]:
-    for topic, _, time_ns, message in bag.messages(topics):
-        fields = _plain(message)
+    for topic, kind, time_ns, message in bag.messages(topics):
+        # What is not known is left out of the project's own messages.
+        fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == OWN else {}) | _plain(message)
         row = {**fields, "topic": topic, LOGGED: time_ns, **column_map.topics.get(topic, {})}
         yield from _elements(bag.path, row, column_map.each)
 
@@ -89,6 +112,11 @@ def _elements(path: Path, row: dict[str, Any], each: str | None) -> Iterable[dic
 
 def _plain(value: Any) -> Any:
     """Return a message as JSON has it; what JSON has no word for is None."""
+    if isinstance(value, dict):
+        whole = [part for part in value.values() if isinstance(part, int)]
+        if tuple(value) in (("sec", "nsec"), ("sec", "nanosec")) and len(whole) == len(value):
+            return whole[0] * 1_000_000_000 + whole[1]
+        return {name: _plain(one) for name, one in value.items()}
     names = getattr(value, "__dataclass_fields__", None)
     if names is not None:
         if "sec" in names and "nanosec" in names:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.bags import opened
+from uwblink.twr import LATEST_NS
 
 Row = tuple[int, str, list[float]]
 
@@ -31,8 +33,16 @@ def read_bag(path: Path, topics: Mapping[str, str] | None = None) -> Iterator[Ro
     with opened(path) as bag:
         wanted = _chosen(path, bag.kinds, topics)
         for topic, kind, _, message in bag.messages(wanted):
-            for time_ns, child, values in MESSAGES[kind](message):
+            for time_ns, child, values in _poses(path, topic, kind, message):
                 yield time_ns, wanted[topic] or child or body_of(topic), values
+
+
+def _poses(path: Path, topic: str, kind: str, message: Any) -> list[Row]:
+    try:
+        return list(MESSAGES[kind](message))
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        # JSON need not hold what its schema is called after.
+        raise ImportTableError(f"{path}: a message of {topic[:80]!r} is no {kind}") from error
 
 
 def body_of(topic: str) -> str:
@@ -88,11 +98,31 @@ def _transforms(message: Any) -> Iterator[tuple[int, str, list[float]]]:
         yield from _transform(one)
 
 
+def _of_json(message: Any, position: Any, attitude: Any) -> Iterator[Row]:
+    when = message["timestamp"]
+    values = [float(position[axis]) for axis in "xyz"] + [float(attitude[axis]) for axis in "xyzw"]
+    parts = [part for part in str(message.get("child_frame_id", "")).split("/") if part and part not in DRIVERS]
+    time_ns = int(when["sec"]) * 1_000_000_000 + int(when["nsec"])
+    if abs(time_ns) > LATEST_NS or not all(map(math.isfinite, values)):
+        raise ValueError
+    yield time_ns, parts[0] if parts else "", values
+
+
+def _pose_in_frame(message: Any) -> Iterator[Row]:
+    yield from _of_json(message, message["pose"]["position"], message["pose"]["orientation"])
+
+
+def _frame_transform(message: Any) -> Iterator[Row]:
+    yield from _of_json(message, message["translation"], message["rotation"])
+
+
 MESSAGES: Final[dict[str, Callable[[Any], Iterator[tuple[int, str, list[float]]]]]] = {
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": _with_covariance,
     "geometry_msgs/msg/TransformStamped": _transform,
     "nav_msgs/msg/Odometry": _with_covariance,
     "tf2_msgs/msg/TFMessage": _transforms,
+    "foxglove.PoseInFrame": _pose_in_frame,
+    "foxglove.FrameTransform": _frame_transform,
 }
 """The messages that carry poses, those first that are taken where a bag has several kinds."""

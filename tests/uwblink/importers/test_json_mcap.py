@@ -1,0 +1,147 @@
+"""MCAP files of JSON messages: the project's own, which come in again, and others', written by the library `mcap`."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from uwblink.errors import ImportTableError
+from uwblink.exporters import export_recording
+from uwblink.importers import read_source
+from uwblink.importers.poses import read_poses
+from uwblink.recording.contents import Contents
+from uwblink.recording.schema import Poses
+from uwblink.twr import Exchanges
+
+WHEN = 1_706_822_508_042_560_815
+
+
+@pytest.fixture
+def exported(tmp_path):
+    """A recording of two pairs and two bodies, some values not known, and the folder that it was exported to."""
+    rng = np.random.default_rng(3)
+    n = 40
+    tx1, reply, flight = (rng.integers(low, high, n) for low, high in ((0, 10**9), (10**7, 2 * 10**7), (100, 3000)))
+    exchanges = Exchanges.from_arrays(
+        np.where(np.arange(n) % 2, 1, 3), np.full(n, 2), time_ns=WHEN + np.arange(n) * 10**7,
+        tx1=tx1, rx1=tx1 + flight, tx2=tx1 + flight + reply, rx2=tx1 + 2 * flight + reply,
+        fpp1_dbm=rng.normal(-85, 3, n), fpp2_dbm=np.where(np.arange(n) < 30, np.nan, -84.5),
+        skew1_ppm=rng.normal(size=n), truth_m=rng.normal(4, 1, n),
+    )  # fmt: skip
+    attitude = rng.normal(size=(20, 4))
+    poses = Poses(
+        WHEN + np.arange(20) * 10**8, np.array(["drone", "car"] * 10), rng.normal(size=(20, 3)),
+        attitude / np.linalg.norm(attitude, axis=1)[:, None],
+    )  # fmt: skip
+    held = Contents(exchanges=exchanges, poses=poses)
+    held.save(tmp_path / "r.uwb")
+    export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
+    return held, tmp_path / "out" / "recording.mcap"
+
+
+def test_ranges_come_in_again_without_a_map(exported):
+    held, path = exported
+    found = read_source(path).exchanges
+    for name in (
+        "time_ns",
+        "initiator",
+        "target",
+        "range_m",
+        "truth_m",
+        "fpp1_dbm",
+        "fpp2_dbm",
+        "skew1_ppm",
+        "skew2_ppm",
+    ):
+        np.testing.assert_array_equal(getattr(found, name), getattr(held.exchanges, name), err_msg=name)
+    assert not found.tx1.any()
+
+
+def test_poses_come_in_again(exported):
+    held, path = exported
+    found = read_poses(path)
+    assert found.time_ns.tolist() == held.poses.time_ns.tolist()
+    assert found.body.tolist() == held.poses.body.tolist()
+    np.testing.assert_array_equal(found.position_m, held.poses.position_m)
+    np.testing.assert_allclose(found.quaternion, held.poses.quaternion, atol=1e-15)
+    only = read_poses(path, topics={"lorry": "/poses/car"})
+    assert set(only.body) == {"lorry"}
+
+
+def written(path, messages, schema="uwb_msgs.Range", compressed=False):
+    """Write messages by topic with the library of the format, in chunks."""
+    mcap = pytest.importorskip("mcap.writer", reason="mcap is not installed")
+    kind = mcap.CompressionType.ZSTD if compressed else mcap.CompressionType.NONE
+    with path.open("wb") as file:
+        writer = mcap.Writer(file, compression=kind, chunk_size=500)
+        writer.start()
+        number = writer.register_schema(schema, "jsonschema", b'{"type": "object"}')
+        for topic, contents in messages.items():
+            channel = writer.register_channel(topic, "json", number)
+            for k, content in enumerate(contents):
+                data = content if isinstance(content, bytes) else json.dumps(content).encode()
+                writer.add_message(channel, WHEN + k * 10**7, data, WHEN + k * 10**7)
+        writer.finish()
+    return path
+
+
+def test_others_messages_in_chunks_by_a_map(tmp_path):
+    rows = [
+        {"header": {"stamp": {"sec": 100 + k, "nsec": 5}}, "tag": 7, "to": {"anchor": 1 + k % 3}, "mm": 1000 + k}
+        for k in range(50)
+    ]
+    path = written(tmp_path / "t.mcap", {"/uwb": rows, "/other": [{"a": 1}]})
+    (tmp_path / "m.toml").write_text(
+        '[topics."/uwb"]\n[columns]\nfrom_id = "tag"\nto_id = "to.anchor"\nrange_m = "mm"\n[units]\ndistance = "mm"\n'
+    )
+    found = read_source(path, map_file=tmp_path / "m.toml").exchanges
+    assert found.time_ns.tolist() == [(100 + k) * 10**9 + 5 for k in range(50)]
+    assert found.target.tolist() == [1 + k % 3 for k in range(50)]
+    np.testing.assert_allclose(found.range_m, 1 + np.arange(50) / 1000, atol=1e-12)
+
+
+def posed(x=1.0, sec=1):
+    pose = {"position": {"x": x, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    return {"timestamp": {"sec": sec, "nsec": 0}, "pose": pose}
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (b"{", "is not JSON"),
+        (b"[" * 100_000, "is not JSON"),
+        ([1], "is not an object of JSON"),
+        ({"timestamp": 3, "pose": {}}, "is no foxglove.PoseInFrame"),
+        (posed(x="here"), "is no foxglove.PoseInFrame"),
+        (posed(x=float("nan")), "is no foxglove.PoseInFrame"),
+        (posed(sec=10**30), "is no foxglove.PoseInFrame"),
+    ],
+)
+def test_what_is_no_pose_is_one_line(tmp_path, message, said):
+    path = written(tmp_path / "t.mcap", {"/poses/a": [message]}, "foxglove.PoseInFrame")
+    with pytest.raises(ImportTableError, match=said):
+        read_poses(path)
+
+
+def test_messages_nested_deeply_are_one_line(tmp_path):
+    deep = b'{"a":' * 700 + b"1" + b"}" * 700
+    path = written(tmp_path / "t.mcap", {"/uwb": [deep]})
+    with pytest.raises(ImportTableError):
+        read_source(path)
+
+
+def test_cut_and_broken_files_are_one_line(exported, tmp_path):
+    _, path = exported
+    data = path.read_bytes()
+    for cut in range(9, len(data) - 40, 1013):
+        (tmp_path / "cut.mcap").write_bytes(data[:cut])
+        with pytest.raises(ImportTableError):
+            read_source(tmp_path / "cut.mcap")
+    longest = struct.pack("<BQ", 0x05, 2**63)
+    (tmp_path / "long.mcap").write_bytes(data[: data.index(b"uwbcal") + 6] + longest)
+    with pytest.raises(ImportTableError, match="ends within a record"):
+        read_source(tmp_path / "long.mcap")
+    small = written(tmp_path / "z.mcap", {"/uwb": [{"a": 1}] * 50}, compressed=True)
+    with pytest.raises(ImportTableError):
+        read_source(small)
