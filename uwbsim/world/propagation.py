@@ -50,20 +50,29 @@ class Link:
 
 def box_chords_m(obstacles: Sequence[Obstacle], a: Floats, b: Floats) -> Floats:
     """Return how much of each segment lies in each box, shape (n, boxes): the slab method (Kay and Kajiya 1986)."""
-    direction = b - a
-    length = np.linalg.norm(direction, axis=1)
+    way, start = b - a, np.ascontiguousarray(a.T)
+    length, along = np.linalg.norm(way, axis=1), np.ascontiguousarray(way.T)
     chords = np.zeros((len(a), len(obstacles)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for k, box in enumerate(obstacles):
-            near = (np.array(box.min_m) - a) / direction
-            far = (np.array(box.max_m) - a) / direction
-            # A segment along a face divides nothing by nothing: it is inside that slab or not at all.
-            inside = (a >= box.min_m) & (a <= box.max_m)
-            enter = np.where(direction == 0, np.where(inside, -np.inf, np.inf), np.minimum(near, far))
-            leave = np.where(direction == 0, np.where(inside, np.inf, -np.inf), np.maximum(near, far))
-            share = np.minimum(leave.min(axis=1), 1) - np.maximum(enter.max(axis=1), 0)
-            chords[:, k] = np.maximum(share, 0) * length
+    for k, box in enumerate(obstacles):
+        enter, leave = np.zeros(len(a)), np.ones(len(a))
+        for axis in range(3):
+            first, last = _slab(box.min_m[axis] - start[axis], box.max_m[axis] - start[axis], along[axis])
+            np.maximum(enter, first, out=enter)
+            np.minimum(leave, last, out=leave)
+        chords[:, k] = np.maximum(leave - enter, 0) * length
     return chords
+
+
+def _slab(low: Floats, high: Floats, along: Floats) -> tuple[Floats, Floats]:
+    """Return at which shares of their ways lines enter and leave a slab between `low` and `high` of their starts."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        near, far = low / along, high / along
+    enter, leave = np.minimum(near, far), np.maximum(near, far)
+    # A segment along a face divides nothing by nothing: it is inside that slab or not at all.
+    (beside,) = np.nonzero(along == 0)
+    inside = (low[beside] <= 0) & (high[beside] >= 0)
+    enter[beside], leave[beside] = np.where(inside, -np.inf, np.inf), np.where(inside, np.inf, -np.inf)
+    return enter, leave
 
 
 def ellipsoid_chord_m(shadow: Shadow, a: Floats, b: Floats) -> Floats:
