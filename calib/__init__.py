@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calib.estimation.new_tag import add_tag
     from calib.estimation.result import FitResult
     from calib.evaluation.localization import localize
+    from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
     from calib.ranges import Ranges
     from calib.report.campaign import run_campaign
@@ -35,6 +36,7 @@ __all__ = [
     "Calibration",
     "CorrectedRanges",
     "FitResult",
+    "OnboardSettings",
     "Ranges",
     "UnanswerableError",
     "add_tag",
@@ -47,6 +49,7 @@ __all__ = [
     "load_calibration",
     "load_ranges",
     "localize",
+    "localize_onboard",
     "register_loss",
     "register_report_section",
     "run_campaign",
@@ -60,6 +63,7 @@ _HOMES: Final = {
     "Calibration": "calib.calibration.model",
     "CorrectedRanges": "calib.calibration.model",
     "FitResult": "calib.estimation.result",
+    "OnboardSettings": "calib.evaluation.onboard",
     "Ranges": "calib.ranges",
     "UnanswerableError": "calib.errors",
     "add_tag": "calib.estimation.new_tag",
@@ -72,6 +76,7 @@ _HOMES: Final = {
     "load_calibration": "calib.calibration.model",
     "load_ranges": "calib.sources",
     "localize": "calib.evaluation.localization",
+    "localize_onboard": "calib.evaluation.onboard",
     "register_loss": "calib.estimation.losses",
     "register_report_section": "calib.report.layout",
     "run_campaign": "calib.report.campaign",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +14,10 @@ from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges
 
 DELAYS_NS: Final = {1: -0.3, 2: 0.1, 3: -0.1}
+ANCHOR_DELAYS_NS: Final = DELAYS_NS | {4: 0.2, 5: 0.0}
 PAIRS: Final = np.array([(1, 2), (2, 3), (3, 1)])
+ANCHORS: Final = (2, 3, 4, 5)
+AMONG_ANCHORS: Final = np.array([(1, 2), (1, 3), (1, 4), (1, 5), (2, 3), (3, 4), (4, 5), (5, 2)])
 NOISE_M: Final = 0.03
 REPLY_TICKS: Final = 20_000_000
 POSES_HZ: Final = 100
@@ -21,18 +25,21 @@ POSES_HZ: Final = 100
 
 @dataclass(frozen=True, slots=True)
 class SampleFlight:
-    """What `fit`, `evaluate`, `localize` and `examine` take instead of a recording."""
+    """What `fit`, `evaluate`, `localize`, `localize_onboard` and `examine` take instead of a recording."""
 
     exchanges: Exchanges
     poses: Poses
     tags: list[Tag]
     planted: dict[str, Any]
+    imu: Mapping[str, Any] = field(default_factory=dict)
+    height: Mapping[str, Any] = field(default_factory=dict)
 
 
-def sample_flight(count: int = 900, *, seed: int = 1) -> SampleFlight:
+def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> SampleFlight:
     """Return `count` exchanges of three tags that move about a room, 100 a second, as a recording would hold them.
 
-    Antenna delays are -0.3, 0.1 and -0.1 ns; ranges are 4 cm longer at the highest powers than at the lowest; the noise
+    With `anchors` tag 1 alone moves, and tags 2 to 5 stand fixed and range among themselves, too. Antenna delays are
+    -0.3, 0.1, -0.1, 0.2 and 0 ns; ranges are 4 cm longer at the highest powers than at the lowest; the noise
     is 3 cm. The same seed gives the same flight.
 
     >>> import calib
@@ -41,15 +48,18 @@ def sample_flight(count: int = 900, *, seed: int = 1) -> SampleFlight:
     """
     rng = np.random.default_rng(seed)
     time_ns = 1_000_000_000 + np.arange(count) * 10_000_000
-    pair = PAIRS[np.arange(count) % len(PAIRS)]
+    pairs, fixed = (AMONG_ANCHORS, ANCHORS) if anchors else (PAIRS, ())
+    pair = pairs[np.arange(count) % len(pairs)]
     initiator, target = pair.T
-    away = np.linalg.norm(_place(initiator, time_ns) - _place(target, time_ns), axis=1)
+    away = np.linalg.norm(_place(initiator, time_ns, fixed) - _place(target, time_ns, fixed), axis=1)
     power = rng.uniform(-95, -80, (2, count))
     lifted = np.mean(10 ** ((power + 82) / 10), axis=0)
-    delay = np.array([DELAYS_NS.get(tag, 0.0) for tag in range(4)])
+    delay = np.array([ANCHOR_DELAYS_NS.get(tag, 0.0) for tag in range(6)])
     measured_m = away + 0.04 * np.tanh(2 * lifted) + NOISE_M * rng.normal(size=count)
     measured_m = measured_m - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
-    return SampleFlight(_exchanges(time_ns, pair, measured_m, power), _poses(int(time_ns[-1])), _tags(), _planted())
+    tags = [Tag(int(tag), f"robot{tag}", (0.0, 0.0, 0.0)) for tag in np.unique(pair)]
+    poses = _poses(int(time_ns[-1]), tags, fixed)
+    return SampleFlight(_exchanges(time_ns, pair, measured_m, power), poses, tags, _planted(tags))
 
 
 def _exchanges(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Exchanges:
@@ -77,29 +87,25 @@ def _exchanges(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Ex
     )
 
 
-def _place(tag: Any, time_ns: Any) -> Floats:
-    """Where a tag is: each on its own slow figure about its own corner."""
+def _place(tag: Any, time_ns: Any, fixed: tuple[int, ...] = ()) -> Floats:
+    """Where a tag is: each on its own slow figure about its own corner, or in the corner."""
     phase = 2e-9 * time_ns + 2.0 * tag
     corner = 2.0 * np.stack([np.cos(2.1 * tag), np.sin(2.1 * tag), 0.3 * tag], axis=-1)
-    moved: Floats = corner + np.stack([np.sin(phase), np.cos(1.3 * phase), 0.5 * np.sin(0.7 * phase)], axis=-1)
+    away = np.stack([np.sin(phase), np.cos(1.3 * phase), 0.5 * np.sin(0.7 * phase)], axis=-1)
+    moved: Floats = corner + np.where(np.isin(tag, fixed)[..., None], 0.0, away)
     return moved
 
 
-def _poses(last_ns: int) -> Poses:
+def _poses(last_ns: int, tags: list[Tag], fixed: tuple[int, ...]) -> Poses:
     time_ns = np.arange(0, last_ns + 1_000_000_000, 1_000_000_000 // POSES_HZ)
-    bodies = sorted(DELAYS_NS)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(time_ns), 1))
     return Poses(
-        np.tile(time_ns, len(bodies)),
-        np.repeat([f"robot{tag}" for tag in bodies], len(time_ns)),
-        np.concatenate([_place(np.full(len(time_ns), tag), time_ns) for tag in bodies]),
-        np.tile(upright, (len(bodies), 1)),
+        np.tile(time_ns, len(tags)),
+        np.repeat([tag.body for tag in tags], len(time_ns)),
+        np.concatenate([_place(np.full(len(time_ns), tag.tag), time_ns, fixed) for tag in tags]),
+        np.tile(upright, (len(tags), 1)),
     )
 
 
-def _tags() -> list[Tag]:
-    return [Tag(tag, f"robot{tag}", (0.0, 0.0, 0.0)) for tag in sorted(DELAYS_NS)]
-
-
-def _planted() -> dict[str, Any]:
-    return {"delays_ns": {str(tag): delay for tag, delay in DELAYS_NS.items()}}
+def _planted(tags: list[Tag]) -> dict[str, Any]:
+    return {"delays_ns": {str(tag.tag): ANCHOR_DELAYS_NS[tag.tag] for tag in tags}}

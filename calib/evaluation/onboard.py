@@ -53,6 +53,10 @@ class OnboardSettings:
     `start_m` is where it begins, with a standard deviation of `start_std_m` an axis, instead of where its first ranges
     say; a wrong one is left after `reopen_s`, or as many ranges as a fix takes. `headings` are tried at once;
     inertial readings are averaged to `rate_hz`. `speed_m_s` is how fast it may move at a start.
+
+    >>> import calib
+    >>> calib.OnboardSettings(start_m=(0.0, 0.0, 1.0)).model
+    'imu'
     """
 
     model: str = "imu"
@@ -126,6 +130,13 @@ def localize_onboard(
     `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses`, `tags`, `imu` and
     `height` (as `uwblink.load` returns). Anchors are bodies whose poses stay in one place. Raises `UnanswerableError`
     where there are too few of them, no ranges, or no inertial readings for the model "imu".
+
+    >>> import calib
+    >>> known = calib.fit(calib.sample_flight(anchors=True)).calibration
+    >>> flight = calib.sample_flight(seed=2, anchors=True)
+    >>> (track,) = calib.localize_onboard(flight, known, calib.OnboardSettings(model="constant-velocity"))
+    >>> track.body, track.used, track.rmse_m < 0.2
+    ('robot1', 'ranges', True)
     """
     require_calibration(calibration)
     chosen = settings or OnboardSettings()
