@@ -80,7 +80,10 @@ class QuantileReply(Section):
 
 
 class PlanFile(Section):
-    """A plan from a CSV file with the columns time_s, initiator, target; `slots` is filled in on reading."""
+    """A plan from a CSV file with the columns time_s, initiator, target; `slots` is filled in on reading.
+
+    Slots after the end of the run are not flown, so that a long plan can be flown for a while.
+    """
 
     file: str
     slots: tuple[tuple[float, int, int], ...] = ()
@@ -365,8 +368,16 @@ class Scenario(Section):
                 if tag_id not in ids:
                     known = ", ".join(map(str, ids))
                     raise ValueError(f"ranging.plan: slot {k + 1} names tag {tag_id}, the tags are {known}")
-            if initiator == target or not 0 <= time_s <= self.run.duration_s:
-                raise ValueError(f"ranging.plan: slot {k + 1} is tag {initiator} to {target} at {time_s:g} s")
+            if initiator == target:
+                raise ValueError(f"ranging.plan: slot {k + 1} is of tag {initiator} with itself")
+            if not time_s >= 0:
+                raise ValueError(f"ranging.plan: slot {k + 1} is at {time_s:g} s, before the start")
+        first = min(time_s for time_s, _, _ in self.ranging.plan.slots)
+        if first > self.run.duration_s:
+            raise ValueError(
+                f"ranging.plan: its first slot is at {first:g} s, after the end of the run (run.duration_s = "
+                f"{self.run.duration_s:g}); fly longer"
+            )
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return the (initiator, target) pairs in the order in which they range."""

@@ -32,7 +32,7 @@ def schedule(scenario: Scenario) -> Schedule:
     """Return the exchanges that a scenario plans."""
     place = {tag.id: k for k, tag in enumerate(scenario.tags)}
     if not isinstance(scenario.ranging.plan, str):
-        rows = scenario.ranging.plan.slots
+        rows = [slot for slot in scenario.ranging.plan.slots if slot[0] <= scenario.run.duration_s]
         start, ids = np.array([r[0] for r in rows]), [(int(r[1]), int(r[2])) for r in rows]
         pairs = np.array([[place[a], place[b]] for a, b in ids], dtype=np.int64)
         return _schedule(start, pairs, pairs[:, 0])

@@ -102,12 +102,30 @@ def test_a_trajectory_that_is_too_short_is_refused(tmp_path):
         load(trajectory(tmp_path, 8))
 
 
-def test_a_plan_file_with_an_unknown_tag_is_refused(tmp_path):
-    (tmp_path / "plan.csv").write_text("time_s,initiator,target\n0.1,1,99\n")
+def planned(tmp_path, slots):
+    (tmp_path / "plan.csv").write_text("time_s,initiator,target\n" + slots)
     text = NOISELESS.read_text().replace("rate_hz = 160.0", 'rate_hz = 160.0\nplan = { file = "plan.csv" }')
     (tmp_path / "s.toml").write_text(text)
-    with pytest.raises(ScenarioError, match="slot 1 names tag 99"):
-        load(tmp_path / "s.toml")
+    return tmp_path / "s.toml"
+
+
+@pytest.mark.parametrize(
+    ("slots", "message"),
+    [
+        ("0.1,1,99\n", "slot 1 names tag 99"),
+        ("0.1,1,3\n0.2,1,1\n", "slot 2 is of tag 1 with itself"),
+        ("-0.1,1,3\n", r"slot 1 is at -0.1 s, before the start"),
+        ("9,1,3\n7,3,1\n", r"first slot is at 7 s, after the end of the run \(run.duration_s = 6\)"),
+    ],
+)
+def test_a_plan_file_that_cannot_be_is_refused(tmp_path, slots, message):
+    with pytest.raises(ScenarioError, match=message):
+        load(planned(tmp_path, slots), ["run.duration_s=6"])
+
+
+def test_of_a_long_plan_what_the_run_lasts_is_flown(tmp_path):
+    found = simulate(load(planned(tmp_path, "5.9,1,3\n6.1,3,1\n0.1,4,1\n"), ["run.duration_s=6"])).exchanges
+    assert found.initiator.tolist() == [4, 1]
 
 
 def test_common_random_numbers():
