@@ -41,7 +41,8 @@ def carrier_corrected(t: Intervals) -> Floats:
 
 def double_sided(t: Intervals) -> Floats:
     """ICRA 2023, eq. (2): the target's reply is rescaled by K = dt64/dt53."""
-    return (t.dt41 - _clock_ratio(t) * t.dt32) / 2
+    with np.errstate(invalid="ignore"):  # an infinite ratio of a reply of zero, as of stamps that are all the same
+        return (t.dt41 - _clock_ratio(t) * t.dt32) / 2
 
 
 def _clock_ratio(t: Intervals) -> Floats:
