@@ -11,6 +11,10 @@ class ScenarioError(UwbsimError, ValueError):
     """A scenario that cannot be run; the text names the file, the key, what was found."""
 
 
+class UnanswerableError(ScenarioError):
+    """A good recording that does not say enough for a twin: exit status 1."""
+
+
 class ParameterError(ScenarioError):
     """An argument that cannot be; `parameter` names it, and the text says what was found and what is allowed."""
 

@@ -8,7 +8,7 @@ from uwblink.cli.starting import start
 
 
 def main() -> NoReturn:
-    """Run the command; a user's mistake is one line on standard error and exit status 2, Ctrl-C one and 130."""
+    """Run the command; a mistake is one line and exit status 2, data that cannot answer 1, Ctrl-C 130."""
     start(_run)
 
 
@@ -16,6 +16,6 @@ def _run() -> NoReturn:
     # Here, so that Ctrl-C is answered while these are loaded.
     from uwblink.cli import shared
     from uwbsim.cli.commands import FLAGS, app
-    from uwbsim.errors import UwbsimError
+    from uwbsim.errors import UnanswerableError, UwbsimError
 
-    shared.run(app, UwbsimError, flags=FLAGS)
+    shared.run(app, UwbsimError, statuses={UnanswerableError: 1}, flags=FLAGS)

@@ -32,6 +32,12 @@ POWER_AT: Final = ("exchange", "reception")
 READ: Final = (1, 3)
 """Schema versions; in between is that of groups of tags with curves of their own."""
 
+NO_TWIN: Final = {
+    2: "groups: its tags have curves by group, and a scenario has one; fit one curve for all tags",
+    4: "pair_offsets: it knows constants of pairs, and a scenario has delays of tags; fit delays",
+}
+"""Schema versions that no scenario can have, and why."""
+
 LARGEST_DELAY_NS: Final = 1e4
 
 
@@ -88,10 +94,8 @@ def read_calibration(source: CalibrationSource) -> KnownDevices:
     version = table.get("schema_version")
     if version is None:
         raise ScenarioError(f"{where}: not a calibration (no schema_version)")
-    if version == 2:
-        raise ScenarioError(
-            f"{where}: groups: its tags have curves by group, and a scenario has one; fit one curve for all tags"
-        )
+    if version in NO_TWIN:
+        raise ScenarioError(f"{where}: {NO_TWIN[version]}")
     if version not in READ:
         raise ScenarioError(f"{where}: schema version {version!r}, this uwbcal reads {READ[0]} and {READ[1]}")
     _check_light(table, where)

@@ -18,7 +18,7 @@ from uwblink.recording.distances import antennas_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.twr import Exchanges, intervals, without_stamps
-from uwbsim.errors import ScenarioError
+from uwbsim.errors import ScenarioError, UnanswerableError
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.units import NS
 
@@ -173,18 +173,20 @@ def _ids(exchanges: Exchanges) -> tuple[Ints, Ints]:
 def _of_one_protocol(exchanges: Exchanges, where: str) -> tuple[Exchanges, RangingProtocol]:
     names, counts = np.unique(exchanges.protocol, return_counts=True)
     if not len(names):
-        raise ScenarioError(f"{where}: holds no exchanges; record or import some first")
+        raise UnanswerableError(f"{where}: holds no exchanges; record or import some first")
     name = str(names[np.argmax(counts)])
     return exchanges[np.flatnonzero(exchanges.protocol == name)], PROTOCOLS[name]
 
 
 def _check(flown: Flown, exchanges: Exchanges, where: str, fewest: int) -> None:
     if len(exchanges) < fewest:
-        raise ScenarioError(f"{where}: holds {len(exchanges)} exchanges, a twin needs {fewest} or more; record longer")
+        raise UnanswerableError(
+            f"{where}: holds {len(exchanges)} exchanges, a twin needs {fewest} or more; record longer"
+        )
     if not len(flown.poses):
-        raise ScenarioError(f"{where}: holds no poses; add motion capture with `uwblink poses`")
+        raise UnanswerableError(f"{where}: holds no poses; add motion capture with `uwblink poses`")
     if not np.any(_powered(exchanges)):
-        raise ScenarioError(f"{where}: no exchange has both first-path powers, and a twin is made from powers")
+        raise UnanswerableError(f"{where}: no exchange has both first-path powers, and a twin is made from powers")
 
 
 def _powered(exchanges: Exchanges) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 import uwbsim
 from tests.uwbsim.twins.worlds import known, world
 from uwblink import Poses, UwblinkError, load
+from uwbsim.cli import main
 from uwbsim.cli.commands import app
 
 
@@ -121,6 +122,17 @@ def test_recordings_without_a_twin(flight, what):
         uwbsim.twin(change(flight), known(world()))
 
 
+def test_a_recording_that_says_too_little_ends_with_status_1(tmp_path, monkeypatch, capsys):
+    uwbsim.simulate(uwbsim.load("scenarios/noiseless.toml", {"run.duration_s": 0.2})).save(tmp_path / "short.uwb")
+    (tmp_path / "c.json").write_text(json.dumps(known(world())))
+    words = ["uwbsim", "twin", tmp_path / "short.uwb", "-c", tmp_path / "c.json", "-o", tmp_path / "twin.toml"]
+    monkeypatch.setattr("sys.argv", [str(word) for word in words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    assert "exchanges, a twin needs 100 or more" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -128,6 +140,7 @@ def test_recordings_without_a_twin(flight, what):
         ({"delays_ns": {"x": 0.0}}, "calibration: delays_ns: found .*, expected a table with tag ids as keys"),
         ({"delays_ns": {"11": None}}, "calibration: delays_ns: 11: found None, expected a finite number"),
         ({"schema_version": 2}, "calibration: groups: its tags have curves by group"),
+        ({"schema_version": 4}, "calibration: pair_offsets: it knows constants of pairs"),
         ({"schema_version": 9}, "calibration: schema version 9, this uwbcal reads 1 and 3"),
         ({"schema_version": None}, "calibration: not a calibration"),
         ({"lift": "none"}, "calibration: lift: found 'none', allowed: mean-of-lifted, lift-of-mean"),
