@@ -27,16 +27,17 @@ WIDTH: Final = 12
 def localization_text(found: list[Localization], summary: Summary, settings: Settings) -> str:
     """Return the table that `calib localize` prints, a row a body, and what it rests on."""
     filters = list(summary.rmse_m)
-    lines = [f"{'RMSE of the position (m)':34s}" + "".join(f"{NAMES[name]:>{WIDTH}s}" for name in filters)]
+    first = max(34, *(len(one.source) + len(one.body) + 2 for one in found))
+    lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{NAMES[name]:>{WIDTH}s}" for name in filters)]
     for one in found:
         figures = "".join(f"{one.rmse_m[name].mean():{WIDTH}.3f}" for name in filters)
-        lines.append(f"{one.source + ' ' + one.body:34s}{figures}")
-    lines.append(f"{'mean':34s}" + "".join(f"{summary.rmse_m[name]:{WIDTH}.3f}" for name in filters))
+        lines.append(f"{one.source + ' ' + one.body:{first}s}{figures}")
+    lines.append(f"{'mean':{first}s}" + "".join(f"{summary.rmse_m[name]:{WIDTH}.3f}" for name in filters))
     if settings.seeds > 1:
         spread = "".join(f"{summary.spread_m[name]:{WIDTH}.3f}" for name in filters)
-        lines.append(f"{f'its spread over {settings.seeds} seeds':34s}{spread}")
+        lines.append(f"{f'its spread over {settings.seeds} seeds':{first}s}{spread}")
     less = "".join(f"{-100 * summary.reduction[name]:+{WIDTH - 2}.0f} %" for name in filters[1:])
-    lines.append(f"{'':{34 + WIDTH}s}{less}")
+    lines.append(f"{'against raw':{first + WIDTH}s}{less}")
     return "\n".join([*lines, *_rests_on(found, settings), _consistent(summary)])
 
 

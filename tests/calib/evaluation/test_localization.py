@@ -157,9 +157,13 @@ def test_it_says_what_it_rests_on(flights):
     flight, calibration = clean(flights["test1"])
     settings = Settings(seeds=2, velocity_std_mps=0.2)
     found = localize(flight, calibration, settings)
+    found = [replace(one, source="a recording with a name that is long.uwb") for one in found]
     text = localization_text(found, summarize(found), settings)
     for part in ("0.2 m/s", "over 2 seeds", "fixed standard deviations", "simulated flights: metres do not compare"):
         assert part in text
+    table = text.splitlines()[: len(found) + 4]
+    assert "against raw" in table[-1]
+    assert len({len(line) for line in table[:-1]}) == 1, "columns stand below their names"
     document = json.loads(json.dumps(localization_json(found)))
     assert len(document["scenarios"][0]["rmse_by_seed_m"]["raw"]) == 2
     assert set(document["summary"]["rmse_m"]) == {"raw", "calibrated", "variance"}, "nothing is known of reflections"
