@@ -64,15 +64,17 @@ class Ends:
     levels: PairLevels | None = None
     responses: GeometricResponses | None = None
     distance_m: Floats = field(init=False)
-    gain_db: Floats = field(init=False)
 
     def __post_init__(self) -> None:
-        """Work out what follows, once for all effects."""
+        """Work out what all effects need, once."""
         apart = self.antennas_m[1] - self.antennas_m[0]
-        distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
-        towards = apart / np.maximum(distance, SHORTEST_M)[:, None]
-        object.__setattr__(self, "distance_m", distance)
-        object.__setattr__(self, "gain_db", self.gain_towards_db(towards, -towards))
+        object.__setattr__(self, "distance_m", np.sqrt(np.einsum("ij,ij->i", apart, apart)))
+
+    @property
+    def gain_db(self) -> Floats:
+        """What the sender's power and the antennas add along the straight lines; worked out when asked for."""
+        towards = (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(self.distance_m, SHORTEST_M)[:, None]
+        return self.gain_towards_db(towards, -towards)
 
     def gain_towards_db(self, leaving: Floats, arriving: Floats) -> Floats:
         """Return what the sender's power and the antennas add to paths, (n,).
@@ -105,8 +107,10 @@ ChannelEffect = Callable[[Link, Ends], Link]
 
 def link_between(ends: Ends) -> Link:
     """Return the links of tags at known places, (n,), with every effect of `CHANNEL_EFFECTS` in its order."""
-    power = path_gain_db(ends.scenario.radio, ends.distance_m) + ends.gain_db
-    link = Link(ends.distance_m, np.zeros_like(ends.distance_m), power, power)
+    nothing = np.zeros_like(ends.distance_m)
+    # A response from geometry has the powers, too.
+    power = nothing if ends.responses is not None else path_gain_db(ends.scenario.radio, ends.distance_m) + ends.gain_db
+    link = Link(ends.distance_m, nothing, power, power)
     for name, effect in CHANNEL_EFFECTS.items():
         link = effect(link, ends)
         if name not in OWN_EFFECTS:

@@ -132,20 +132,28 @@ def _past(shadow: Shadow, start: Floats, way: Floats, length_m: Floats) -> Float
     axes = np.array(shadow.semi_axes_m)
     # Where the ellipsoid is a unit sphere, the nearest point decides.
     begin, along = start / axes, way / axes
-    p, q, r = np.maximum(_dot(along, along), 1e-12), _dot(begin, along), _dot(begin, begin)
+    p, q = np.maximum(_dot(along, along), 1e-12), _dot(begin, along)
     line = np.clip(-q / p, 0, 1)
     point = begin + line[:, None] * along
     radius = np.sqrt(_dot(point, point))
     aside = _aside(point * axes, way, int(np.argmin(axes)))
-    out_m, wide_m = (_extent_m(axes, direction) for direction in (aside, _cross(way, aside)))
     unit = fresnel_number(np.ones(len(way)), line, length_m)
-    out, wide = out_m * unit, wide_m * unit
+    out = _extent_m(axes, aside) * unit
+    gain = np.ones(len(way))
+    # The bodies are flat: many pass over them, in the light.
+    (rows,) = np.nonzero(out * (1 - radius) > LIT)
+    if not len(rows):
+        return gain
+    begin, way, aside, unit = begin[rows], way[rows], aside[rows], unit[rows]
+    p, q, out, radius = p[rows], q[rows], out[rows], radius[rows]
+    wide = _extent_m(axes, _cross(way, aside)) * unit
     near, opposite, across = edge_gain(np.stack([out * (1 - radius), out * (1 + radius), wide]))
     covered_share = (1 - np.minimum(near + opposite, 1.0)) * (1 - np.minimum(2 * across, 1.0))
-    root = np.sqrt(np.maximum(q**2 - p * (r - 1), 0))
+    root = np.sqrt(np.maximum(q**2 - p * (_dot(begin, begin) - 1), 0))
     inside = np.clip((-q + root) / p, 0, 1) - np.clip((-q - root) / p, 0, 1)
-    through = np.where(inside > 0, 10 ** (-inside * length_m * shadow.loss_db_per_m / 20), 0.0)
-    return np.asarray(1 - covered_share * (1 - through))
+    through = np.where(inside > 0, 10 ** (-inside * length_m[rows] * shadow.loss_db_per_m / 20), 0.0)
+    gain[rows] = 1 - covered_share * (1 - through)
+    return gain
 
 
 def _aside(point: Floats, way: Floats, flattest: int) -> Floats:
