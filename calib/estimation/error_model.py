@@ -19,6 +19,9 @@ from calib.estimation.problem import Problem
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
+DESCRIBED: Final = 400_000
+"""Ranges by whose errors, drawn by chance, a model is fitted beside a robust loss: more do not change what it says."""
+
 JUDGED: Final = 20_000
 """Ranges by which quantiles and the total sigma are put right; more would say nothing else."""
 
@@ -42,20 +45,22 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
     """Return what errors are made of; None where they have no spread.
 
     `residual_m` (n,) are fitted less true ranges, in order of time, `mixture` what they were fitted with; without one
-    it is fitted here, about a centre of its own.
+    it is fitted here, about a centre of its own, to `DESCRIBED` errors at most.
     """
     if robust_spread(residual_m) < LEAST_SPREAD_M:
         return None
     pair, names = problem.pairs.number, [f"{low}-{high}" for low, high in problem.pairs.ends.tolist()]
-    cell = problem.bins.number * CELLS // len(problem.bins.count)
+    cell, time_ns, centred = problem.bins.number * CELLS // len(problem.bins.count), problem.ranges.time_ns, residual_m
     location = 0.0
     if mixture is None:
-        mixture = _about_their_centre(residual_m, pair, cell)
+        rows = _described(len(residual_m))
+        pair, time_ns, centred = pair[rows], time_ns[rows], residual_m[rows]
+        mixture = _about_their_centre(centred, pair, cell[rows], len(names))
         location = -float(mixture.of("design")[0])
-    centred = residual_m - location
+        centred = centred - location
     # Powers may repeat; what is straight between two of them needs them apart.
     nodes = np.array([np.median(problem.lifted[cell == k]) for k in range(CELLS)]) + 1e-9 * np.arange(CELLS)
-    known = _of_pairs(mixture, problem.ranges.time_ns, pair)
+    known = _of_pairs(mixture, time_ns, pair)
     wild = _outliers(mixture, centred)
     model = ErrorModel(
         lifted=tuple(nodes.tolist()),
@@ -74,13 +79,22 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
     return _put_right(model, problem, residual_m)
 
 
-def _about_their_centre(residual_m: Floats, pair: Ints, cell: Ints) -> PairMixture:
+def _described(count: int) -> Ints | slice:
+    """Return the rows by which errors are described: all, or as many as it takes, in their order."""
+    if count <= DESCRIBED:
+        return slice(None)
+    # By chance, so that no schedule of pairs keeps in step; one is drawn of each of so many spans of rows.
+    edges = np.arange(DESCRIBED + 1) * count // DESCRIBED
+    return np.asarray(np.random.default_rng(0).integers(edges[:-1], edges[1:]))
+
+
+def _about_their_centre(residual_m: Floats, pair: Ints, cell: Ints, pairs: int) -> PairMixture:
     """Fit a mixture to residuals (n,) of another loss, about a centre that is fitted along."""
     errors = Errors(
         error=residual_m,
         design=np.ones((len(residual_m), 1)),
         place=pair * CELLS + cell,
-        pairs=int(pair.max()) + 1,
+        pairs=pairs,
         density=1 / (float(np.ptp(residual_m)) + 1e-9),
     )
     return fit_pair_mixture(errors, np.array([-float(np.median(residual_m))]), np.zeros((1, 1)))

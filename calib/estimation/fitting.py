@@ -141,7 +141,8 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         calibration = _calibration(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
         stds = std_taken_over(source, set(fixed) - set(pinned))
         calibration = replace(calibration, delays_std_ns=calibration.delays_std_ns | stds)
-        applied = calibration.apply(ranges)
+        # What errors are made of is known now, and of no use for the residuals.
+        applied = replace(calibration, errors=None).apply(ranges)
         residuals = applied.corrected_m - ranges.truth_m
         inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
         warnings = [

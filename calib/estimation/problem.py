@@ -152,13 +152,14 @@ def build_problem(
     known = matrix[:, pinned] @ np.array([fixed.get(tag, 0.0) for tag in np.array(everyone)[pinned].tolist()])
     tags: list[int] = np.array(everyone)[~pinned].tolist()
     pairs = pairs_of(ranges.initiator, ranges.target, everyone)
-    apart = _by_pairs(pairs) if unknowns.of_pairs else matrix[:, ~pinned]
+    # Without a copy where nothing is pinned: a column of millions is not cheap.
+    apart = _by_pairs(pairs) if unknowns.of_pairs else matrix[:, ~pinned] if pinned.any() else matrix
     directions, free = np.eye(apart.shape[1]), list[list[int]]()
     if unknowns.of_pairs:
         tags = list(range(len(pairs.ends)))
     elif tags:
         directions, free = identifiable_directions(apart, tags, ranges.initiator, ranges.target)
-    delays = apart @ directions
+    delays = apart @ directions if free else apart
     _something_left(unknowns, tags)
     if not minimum_norm:
         require_determined(free)
