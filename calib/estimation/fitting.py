@@ -115,6 +115,8 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     fixed = taken_over(source, ranges) | pinned
     refuse_impossible(ranges)
     loss = loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)
+    # Before the columns of a fit are there: sorting millions of ranges takes memory too.
+    skewed = list(one_way(ranges))
     # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
     # SciPy brings a linear algebra of its own, which is held to one thread only if it is there by now.
     import_module("scipy.linalg")
@@ -149,7 +151,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             *limits(ranges, problem, residuals, fixed),
             *_stopped(found),
             *doubted.sentences,
-            *one_way(ranges),
+            *skewed,
             *implausible(calibration.delays_ns, residuals),
             *_beyond(reference, alpha_dbm, problem),
             *warnings_of(ranges, applied, float(np.mean(inliers)), problem.free),

@@ -17,7 +17,7 @@ import numpy as np
 from calib.estimation.pairs import places_of
 from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.problem import Problem
-from calib.estimation.scores import Scores
+from calib.estimation.scores import Places, Scores
 from uwblink.arrays import Floats, Ints
 
 ERROR_RATE: Final = 0.005
@@ -65,8 +65,8 @@ class Family:
     kind: str
     names: list[str]
     weight: Floats
-    place: Ints
-    second: Ints | None = None
+    place: Places
+    second: Places | None = None
     signed: bool = False
 
 
@@ -116,12 +116,14 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
     the opposite sign with the other tag initiating, as a clock leaves it whose skew is not corrected.
     """
     tags, truth_m, bins = problem.ranges.tags(), problem.ranges.truth_m, problem.bins
-    first, second = places_of(tags, problem.ranges.initiator, problem.ranges.target)
+    ends = places_of(tags, problem.ranges.initiator, problem.ranges.target)
+    # All alternatives are there at once: half the memory.
+    first, second = (place.astype(np.int32) for place in ends)
     names, ones = [f"tag {tag}" for tag in tags], np.ones(len(first))
     named = [f"pair {low}-{high}" for low, high in problem.pairs.ends.tolist()]
     yield Family(kind="pair", names=named, weight=ones, place=problem.pairs.number)
     count = segments(seconds)
-    when = np.arange(len(first)) * count // len(first)
+    when = (np.arange(len(first)) * count // len(first)).astype(np.int32)
     yield Family(
         kind="time",
         names=[name for name in names for _ in range(count)],
@@ -138,7 +140,7 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
     yield Family(kind="skew", names=names, weight=ones, place=first, second=second, signed=True)
     far = (truth_m - np.median(truth_m)) / max(float(np.ptp(truth_m)), 1e-9)
     if np.ptp(truth_m) > 0:
-        yield Family(kind="scale", names=["all tags"], weight=far, place=np.zeros(len(far), dtype=np.int64))
+        yield Family(kind="scale", names=["all tags"], weight=far, place=np.zeros(len(far), dtype=np.int32))
 
 
 def segments(seconds: float) -> int:

@@ -23,7 +23,7 @@ from uwblink.arrays import Floats, Ints
 CELLS: Final = 8
 """Steps of power in which share and noise may differ."""
 
-ROWS_AT_ONCE: Final = 4096
+ROWS_AT_ONCE: Final = 8192
 """Rows whose slopes are taken together, so that what leads to them stays in the cache."""
 
 ROWS_A_PLACE: Final = 16

@@ -89,7 +89,7 @@ def robust_fit(
     ridge = np.zeros((matrix.shape[1],) * 2) if penalty is None else penalty
     x = start if start is not None else _absolute_start(matrix, error, ridge)
     function = LOSSES[loss]
-    reach = np.abs(matrix).max(axis=0)
+    reach = _reach(matrix)
     residual = error + matrix @ x
     width = scale or scale_of(residual)
     steps, moved, curvature = 0, 0.5 * NEWTON_M if near else np.inf, None
@@ -118,6 +118,11 @@ def robust_fit(
         steps,
         moved <= STILL_M,
     )
+
+
+def _reach(matrix: Floats) -> Floats:
+    """Return the largest entry of each column (m,), without a copy of the matrix."""
+    return np.asarray(np.maximum(matrix.max(axis=0), -matrix.min(axis=0)))
 
 
 def _descending(curvature: Floats) -> Floats | None:

@@ -10,14 +10,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 
+Places = NDArray[np.signedinteger[Any]]
+"""Numbers of places, in as few bytes as they take."""
+
 CHUNK: Final = 1024
 """Rows of a matrix worked on at once, so that they stay in the cache."""
+
+SUMMED_AT_ONCE: Final = 65_536
+"""Rows summed by place at once, so that what leads to the sums is small beside the matrix."""
 
 _NOTHING: Final = np.zeros((0, 0))
 
@@ -103,7 +110,7 @@ class Scores:
             found[:, where] = sums
         return found
 
-    def with_groups(self, weight: Floats, group: Ints, count: int) -> Floats:
+    def with_groups(self, weight: Floats, group: Places, count: int) -> Floats:
         """Return what links offsets to the parameters (count, parameters).
 
         An offset in metres that a group of ranges has, times a range's `weight` (n,); `group` (n,) says which group.
@@ -142,7 +149,7 @@ class Scores:
                 found[k] = part
         return found
 
-    def _in_groups(self, weight: Floats | None, group: Ints, count: int) -> list[Floats]:
+    def _in_groups(self, weight: Floats | None, group: Places, count: int) -> list[Floats]:
         """Return sums of slopes (n,), times a weight, by group and by the parameters of each sort (count, own)."""
         both = group if self.place is None else group * self.places + self.place
         tables = [
@@ -214,10 +221,16 @@ def _crossed(sums: Floats, first: Sort, second: Sort) -> Floats:
     return np.asarray(both, float).reshape(first.count, second.count)
 
 
-def sums_by_place(matrix: Floats, weight: Floats, place: Ints, count: int) -> Floats:
+def sums_by_place(matrix: Floats, weight: Floats, place: Places, count: int) -> Floats:
     """Return weighted rows of a matrix (n, m) summed by place (count, m); a row may go to more than one (n, k)."""
     from scipy.sparse import csc_array
 
+    if len(matrix) > SUMMED_AT_ONCE:
+        pieces = [slice(begin, begin + SUMMED_AT_ONCE) for begin in range(0, len(matrix), SUMMED_AT_ONCE)]
+        found = np.zeros((count, matrix.shape[1]))
+        for rows in pieces:
+            found += sums_by_place(matrix[rows], weight[rows], place[rows], count)
+        return found
     each = weight.size // max(len(matrix), 1)
     starts = np.arange(0, weight.size + 1, max(each, 1))
     return np.asarray(csc_array((weight.ravel(), place.ravel(), starts), shape=(count, len(matrix))) @ matrix)
