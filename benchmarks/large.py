@@ -24,7 +24,7 @@ def main() -> None:
     if len(sys.argv) > 1:
         print("| " + " | ".join(one_size(int(sys.argv[1]))) + " |", flush=True)
         return
-    print("| exchanges | true distances | joint Cauchy fit with intervals, and apply | together | peak memory |")
+    print("| exchanges | true distances | fit by the default loss with intervals, and apply | together | peak memory |")
     print("|---|---|---|---|---|")
     for size in SIZES:
         environment = dict(os.environ) | {"OPENBLAS_NUM_THREADS": "1"}
