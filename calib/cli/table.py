@@ -13,6 +13,9 @@ from calib.evaluation import CORRECTION_STAGES, ErrorStatistics, Evaluation
 WIDE = 110
 """Columns that the table never needs more than: where nobody looks, no figure must lose its last digits."""
 
+ROOMY = 92
+"""Columns from which there is room for two blanks between figures; a terminal of 80 has room for one."""
+
 SHORT = {"raw": "raw", "delays": "delay", "full": "full"}
 
 
@@ -22,8 +25,9 @@ def print_table(evaluation: Evaluation, console: Console) -> None:
     Last, the share in % that chi-square rejects, the spread of errors over the total sigma, and how many of them lie
     between the quantiles for 95 %.
     """
+    gap = 1 if console.width >= ROOMY else 0
     table = Table(
-        title="Range error in cm", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+        title="Range error in cm", title_justify="left", box=SIMPLE_HEAD, padding=(0, gap, 0, 0), pad_edge=False
     )
     table.add_column("pair", no_wrap=True)
     table.add_column("n", justify="right", no_wrap=True)

@@ -56,18 +56,21 @@ def twin(
     typer.echo(", ".join(map(str, (*files, page))))
 
 
-def _print(compared: Sequence[Compared]) -> None:
+def _print(compared: Sequence[Compared], width: int | None = None) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
     from uwbsim.pages import TWIN_COLUMNS
 
+    console = Console(width=width or (None if sys.stdout.isatty() else 150))
+    gap = 1 if console.width > 80 else 0
     table = Table(
-        box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title="measured / simulated", title_justify="left"
+        box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), title="measured / simulated", title_justify="left"
     )
     for k, name in enumerate(TWIN_COLUMNS):
-        table.add_column(name, justify="left" if k == 0 else "right", no_wrap=True)
+        # In a narrow terminal cells go on in a second line: cut off, they would lose what was simulated.
+        table.add_column(name, justify="left" if k == 0 else "right", overflow="fold")
     for one in compared:
         table.add_row(*(show(one) for show in TWIN_COLUMNS.values()))
-    Console(width=None if sys.stdout.isatty() else 150).print(table)
+    console.print(table)

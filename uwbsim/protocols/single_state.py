@@ -75,11 +75,11 @@ class Prediction:
     >>> import uwbsim
     >>> print(uwbsim.predict_state(uwbsim.State(protocol="ss", skew_ppm=2.0)))
     SS-TWR
-      bias                    +8.9916 cm
-      standard deviation       3.1788 cm
-        of transmit noise        0.0000 cm
-        of receive noise         3.1788 cm
-        of whole ticks           0.0000 cm
+      bias                       +8.9916 cm
+      standard deviation          3.1788 cm
+        of transmit noise         0.0000 cm
+        of receive noise          3.1788 cm
+        of whole ticks            0.0000 cm
         of carrier integrator     0.0000 cm
     """
 
@@ -96,9 +96,9 @@ class Prediction:
         """Return a line a figure, in cm."""
         lines = [
             self.title,
-            f"  bias                 {100 * self.bias_m:+10.4f} cm",
-            f"  standard deviation   {100 * self.std_m:10.4f} cm",
-            *(f"    of {name:17s} {100 * part:10.4f} cm" for name, part in self.parts_m.items()),
+            f"  bias                    {100 * self.bias_m:+10.4f} cm",
+            f"  standard deviation      {100 * self.std_m:10.4f} cm",
+            *(f"    of {name:19s}{100 * part:10.4f} cm" for name, part in self.parts_m.items()),
         ]
         return "\n".join(lines)
 

@@ -1,10 +1,13 @@
 """Statistics by pair and overall, against their definitions."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from calib.cli.table import print_table
 from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate, pair_rows, statistics
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
@@ -120,3 +123,10 @@ def test_an_evaluation_prints_on_a_screen():
     many = replace(found, pairs={f"{k}-{k + 1}": everything for k in range(100)})
     assert len(repr(many).splitlines()) < 50
     assert "60 more" in repr(many)
+
+
+def test_a_terminal_of_80_columns_has_room_for_every_figure():
+    said = io.StringIO()
+    print_table(evaluate(ranges(400), fit(ranges(4000)).calibration), Console(file=said, width=80))
+    assert "…" not in said.getvalue()
+    assert all(len(line) <= 80 for line in said.getvalue().splitlines()[:12])

@@ -12,6 +12,7 @@ from tests.uwbsim.twins.worlds import known, world
 from uwblink import Poses, UwblinkError, load
 from uwbsim.cli import main
 from uwbsim.cli.commands import app
+from uwbsim.cli.twins import _print
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +168,13 @@ def test_nothing_is_written_where_something_is_wrong(flight, tmp_path):
         assert message in str(done.exception)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "f.uwb", "t.html"]
     assert len(load(tmp_path / "f.uwb").poses) > 0
+
+
+def test_a_terminal_of_80_columns_loses_no_figure(found, capsys):
+    compared = found.compare(1)
+    said = []
+    for width in (80, 150):
+        _print(compared, width=width)
+        said.append(capsys.readouterr().out.split())
+    narrow, wide = ({word for word in words if word[-1].isdigit() and "/" not in word} for words in said)
+    assert wide <= narrow, wide - narrow
