@@ -197,6 +197,8 @@ def _why_no_truth(ranges: Ranges, poses: Poses | None, tags: Sequence[Tag]) -> s
     """Say how poses and exchanges lie in time, where no exchange has a true distance although there are poses."""
     if poses is None or not len(poses) or not len(ranges) or np.isfinite(ranges.truth_m).any():
         return ""
+    if not tags:
+        return "it does not say which tag sits on which body; give tags with 'uwblink poses --tags'"
     missing = sorted({t.body for t in tags} - set(np.unique(poses.body).tolist()))
     if missing:
         return f"no poses of body {missing[0]}"

@@ -25,10 +25,14 @@ NUMBERS: Final = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tai
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """How many ranges were corrected, and how many of them at powers beyond the fitted ones."""
+    """How many ranges were corrected, how many of them at powers beyond the fitted ones, how many without power.
+
+    A range without power is corrected by its delays alone where the calibration has curves, and has no sigma.
+    """
 
     count: int
     clamped: int
+    unpowered: int
 
 
 def apply(
@@ -84,7 +88,8 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
             meta={"calibration": calibration.provenance},
             force=force,
         )
-    return Applied(len(exchanges), int(np.count_nonzero(applied.clamped)))
+    powered = np.isfinite(applied.lifted)
+    return Applied(len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered)))
 
 
 def _table(exchanges: Exchanges, applied: CorrectedRanges) -> dict[str, NDArray[Any]]:

@@ -33,6 +33,10 @@ def apply(
 
     applied = calib.apply(recording, calib.load_calibration(calibration), output, to=to, force=force)
     typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
+    if applied.unpowered:
+        typer.echo(
+            f"warning: {applied.unpowered} without power: corrected by delays alone, and without sigma", err=True
+        )
 
 
 def export(

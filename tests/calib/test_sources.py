@@ -152,3 +152,10 @@ def test_arrays_that_do_not_fit_are_refused(wrong):
 def test_a_flight_has_its_poses(path):
     assert load_flight(path).moving_bodies() == ["robot1", "robot2", "robot3"]
     assert load_flight(sample_flight()).tags == load_flight(path).tags
+
+
+def test_poses_without_tags_are_said_to_lack_them():
+    flight = sample_flight()
+    bare = replace(flight, tags=[], exchanges=replace(flight.exchanges, truth_m=flight.exchanges.truth_m * np.nan))
+    with pytest.raises(UnanswerableError, match=r"does not say which tag sits on which body; .*--tags"):
+        calib.fit(bare)

@@ -108,3 +108,12 @@ def test_a_recording_without_exchanges_is_corrected_to_one_without(tmp_path):
         recording.append_tags(flight.tags)
     done = calib.apply(tmp_path / "f.uwb", calib.fit(flight).calibration, tmp_path / "c.uwb")
     assert (done.count, done.clamped) == (0, 0)
+
+
+def test_ranges_without_power_are_counted_apart(corrected):
+    folder, _, _, done = corrected
+    names, table = rows(folder / "c.uwb", "corrected")
+    beyond, unpowered = (np.array([row[names.index(n)] for row in table], float) for n in ("clamped", "sigma_m"))
+    assert (done.count, done.unpowered) == (600, 7)
+    assert done.unpowered == np.count_nonzero(np.isnan(unpowered))
+    assert done.clamped == np.count_nonzero(beyond[np.isfinite(unpowered)])
