@@ -20,7 +20,10 @@ from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
 DESCRIBED: Final = 400_000
-"""Ranges by whose errors, drawn by chance, a model is fitted beside a robust loss: more do not change what it says."""
+"""Ranges by whose errors, drawn by chance, a model is fitted beside a robust loss.
+
+All of 800 000 move shares of reflections by half a percentage point, and the centre by 0.4 mm.
+"""
 
 JUDGED: Final = 20_000
 """Ranges by which quantiles and the total sigma are put right; more would say nothing else."""
