@@ -11,6 +11,7 @@ NS: Final = 1e-9
 US: Final = 1e-6
 MS: Final = 1e-3
 MM: Final = 1e-3
+CM: Final = 1e-2
 PPM: Final = 1e-6
 
 PS_PER_S: Final = 1e12

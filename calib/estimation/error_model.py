@@ -103,6 +103,13 @@ def _about_their_centre(residual_m: Floats, pair: Ints, cell: Ints, pairs: int) 
     return fit_pair_mixture(errors, np.array([-float(np.median(residual_m))]), np.zeros((1, 1)))
 
 
+WIDEST_ODDS: Final = 4.0
+"""Variance of a pair's log odds of a reflection: two in three pairs between an eighth and eight times the common."""
+
+WIDEST_DETOUR: Final = 1.0
+"""Variance of the logarithm of a pair's mean detour: two in three between a third and three times the common."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PairsPredicted:
     """Log odds of each pair (pairs,) and of one not seen yet, at the middle step; detours over the common one."""
@@ -123,6 +130,9 @@ def _of_pairs(mixture: PairMixture, time_ns: Ints, pair: Ints) -> _PairsPredicte
     unknown = [factor / np.maximum(known, 1e-6) for known in (np.bincount(pair, by_share**2, pairs), reflected)]
     share, share_var, any_share, any_share_var = _drawn(mixture.of("pair_share"), unknown[0])
     mean, mean_var, any_mean, any_mean_var = _drawn(mixture.of("pair_mean"), unknown[1])
+    # What a few lasting reflections leave open is more than any room has, and the means of their exponentials explode.
+    share_var, any_share_var = np.minimum(share_var, WIDEST_ODDS), min(any_share_var, WIDEST_ODDS)
+    mean_var, any_mean_var = np.minimum(mean_var, WIDEST_DETOUR), min(any_mean_var, WIDEST_DETOUR)
     middle = float(np.mean(mixture.of("cell_share")))
     common = float(np.exp(mixture.of("mean")[0] + any_mean + any_mean_var / 2))
     return _PairsPredicted(

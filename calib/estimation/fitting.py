@@ -36,7 +36,7 @@ from calib.estimation.pairs import pairs_of
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.result import FitResult
-from calib.estimation.solver import Solved, solve
+from calib.estimation.solver import Solved, astray, solve
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
 from calib.ranges import Ranges
@@ -114,6 +114,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     ranges = load_ranges(data, need_power=not delays_only)
     fixed = taken_over(source, ranges) | pinned
     refuse_impossible(ranges)
+    chosen = loss
     loss = loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)
     # Before the columns of a fit are there: sorting millions of ranges takes memory too.
     skewed = list(one_way(ranges))
@@ -132,13 +133,13 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             unknowns=Unknowns(curve=not delays_only, constants=constants),
         )
         reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
-        found = solve(
-            problem,
-            loss,
-            None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT,
-            sequential=sequential,
-            reference=None if reference is None else _lifted(reference, alpha_dbm),
-        )
+        found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)
+        if astray(problem, found):
+            if chosen is None:
+                loss = SEQUENTIAL_LOSS
+                found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)
+            else:
+                found = replace(found, success=False)
         doubted = doubts(problem, found)
         calibration = _calibration(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
         stds = std_taken_over(source, set(fixed) - set(pinned))
@@ -170,6 +171,19 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
             warnings=warnings,
         )
+
+
+def _solved(
+    problem: Problem, loss: str, scale_ns: float | None, reference: float | None, alpha_dbm: float, *, sequential: bool
+) -> Solved:
+    """Return the optimum of a loss, whose settings are in the units of `fit`."""
+    return solve(
+        problem,
+        loss,
+        None if scale_ns is None else scale_ns * 1e-9 * SPEED_OF_LIGHT,
+        sequential=sequential,
+        reference=None if reference is None else _lifted(reference, alpha_dbm),
+    )
 
 
 def _too_few(ranges: Ranges) -> bool:

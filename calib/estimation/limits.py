@@ -12,8 +12,9 @@ from calib.estimation.confounding import explained_by_distance
 from calib.estimation.pairs import pairs_of
 from calib.estimation.problem import Problem
 from calib.ranges import NO_STAMPS, Ranges
-from calib.single_sided import LeftSkew
+from calib.single_sided import LeftSkew, corrected
 from uwblink.arrays import Floats
+from uwblink.protocols.table import single_sided
 from uwblink.ticks import SPEED_OF_LIGHT
 
 FEWEST: Final = 20
@@ -29,6 +30,11 @@ def limits(ranges: Ranges, problem: Problem, residuals_m: Floats, fixed: Mapping
         yield _without_stamps(bare, len(ranges), "constants" if unknowns.of_pairs else "delays")
     if ranges.left_skew is not None:
         yield told(ranges.left_skew)
+    elif np.isin(ranges.protocol, [name for name in single_sided() if not corrected(name)]).any():
+        yield (
+            "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
+            "cannot be said, and looks like antenna delays"
+        )
     if unknowns.of_pairs:
         yield (
             f"{_pairs(len(problem.pairs.ends))}: antenna delays stay unknown, other pairs cannot be corrected, and "

@@ -51,6 +51,10 @@ class Solved:
     mixture: PairMixture | None = None
 
 
+ASTRAY_M: Final = 0.3
+"""Beyond what any pair's reflections move its median."""
+
+
 def solve(
     problem: Problem, loss: str, scale_m: float | None, *, sequential: bool, reference: float | None = None
 ) -> Solved:
@@ -103,6 +107,25 @@ def solve(
         lasting=known.lasting,
         mixture=mixture,
     )
+
+
+def astray(problem: Problem, found: Solved) -> bool:
+    """Return whether a likelihood took all ranges of some pair for outliers, as far from robust loss may not end.
+
+    It climbs, and where few powers or distances leave the design nearly open it can climb to a top where one pair is
+    left out as a whole.
+    """
+    if found.mixture is None:
+        return False
+    robust, _ = _pilot(problem, "cauchy", None)
+    before, after = (_farthest_pair(problem, at) for at in (problem.error + problem.design @ robust, found.residuals))
+    return after > ASTRAY_M + 3 * before
+
+
+def _farthest_pair(problem: Problem, residual: Floats) -> float:
+    """Return the largest median residual of a pair, in metres either way."""
+    number = problem.pairs.number
+    return max(abs(float(np.median(residual[number == k]))) for k in np.unique(number).tolist())
 
 
 def _of_curve(prior: Floats, columns: slice) -> Floats:

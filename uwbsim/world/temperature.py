@@ -14,7 +14,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.random_streams import stream
 from uwbsim.scenario.devices import Constant, Devices, Profile, Ramp, Table, WarmUp
 from uwbsim.scenario.model import Scenario, Tag
-from uwbsim.units import NS_PER_S, PPM
+from uwbsim.units import CM, MM, NS_PER_S, PPM
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 TX_SHARE: Final = 0.44
@@ -63,8 +63,8 @@ def lengthening_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None
     devices = scenario.devices
     total: Floats | None = None
     for profile, slope, reference in (
-        (temperature_of(scenario, tag), own(tag, devices, "range_mm_per_k") * 1e-3, devices.reference_c),
-        (supply_of(scenario, tag), own(tag, devices, "range_cm_per_v") * 1e-2, devices.reference_v),
+        (temperature_of(scenario, tag), own(tag, devices, "range_mm_per_k") * MM, devices.reference_c),
+        (supply_of(scenario, tag), own(tag, devices, "range_cm_per_v") * CM, devices.reference_v),
     ):
         if profile is not None and slope:
             part = slope * (profile_at(profile, time_s) - reference)

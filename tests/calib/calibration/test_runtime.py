@@ -131,15 +131,21 @@ def test_a_tag_in_no_group_is_named():
             known.correct(ranges, -85.0, -85.0, 1, 7)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
-def test_it_is_fast_enough_for_a_loop(seed):
-    known = random_calibration(seed)
-    known.correct(3.0, -85.0, -86.0, 1, 2)
-    best = math.inf
+def best_s(work):
+    """Return the least time of a call in seconds; the best of twenty leaves out what else the machine does."""
+    times = []
     for _ in range(20):
         begin = time.perf_counter()
-        for _ in range(200):
-            known.correct(3.0, -85.0, -86.0, 1, 2)
-        best = min(best, (time.perf_counter() - begin) / 200)
-    # 3 to 5 us on an idle core; the best of twenty leaves out what else the machine does.
-    assert best < 20e-6
+        for _ in range(100):
+            work()
+        times.append((time.perf_counter() - begin) / 100)
+    return min(times)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_it_is_fast_enough_for_a_loop(seed):
+    """Side by side with columns of one range, which take ten times as long and more."""
+    known, one = random_calibration(seed), np.array([3.0])
+    known.correct(3.0, -85.0, -86.0, 1, 2)
+    alone = best_s(lambda: known.correct(3.0, -85.0, -86.0, 1, 2))
+    assert alone < 0.5 * best_s(lambda: known.correct(one, -85.0, -86.0, 1, 2))
