@@ -28,10 +28,10 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 	$(BIN)/calib report demo/train.uwb --tests demo/test1.uwb demo/test2.uwb -o demo/report.html --force
 
 test: setup ## run the whole test suite, on two cores
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
-	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term-missing
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=term-missing
 
 rooms: setup ## draw the rooms into docs/architecture.md from the imports
 	$(BIN)/python -m tests.rooms
@@ -41,7 +41,7 @@ lowest newest: ## run the whole test suite on the lowest versions that pyproject
 	$(PYTHON) -m tests.bounds $@ > .venv-$@/requirements.txt
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --upgrade -r .venv-$@/requirements.txt
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation .
-	.venv-$@/bin/python -m pytest -n 2 --dist loadfile
+	.venv-$@/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 fuzz: setup ## run commands on 2000 damaged files and options (10 minutes)
 	$(BIN)/python -m tests.fuzz.commands
