@@ -52,7 +52,7 @@ FLOORS = {
     ),
     "calib": (
         ("errors", "samples", "single_sided", "spread"),
-        ("ranges",),
+        ("information", "ranges"),
         ("calibration", "sources"),
         ("evaluation",),
         ("figures",),

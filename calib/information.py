@@ -1,0 +1,243 @@
+"""What an information matrix determines, direction by direction, and in words what it leaves free.
+
+An information matrix (the inverse of a covariance, J' W J of a fit) is singular along what the data do not say, and
+nearly so along what they hardly say. Whether a direction is known is judged in units in which an ignorant guess is good
+to about 1: an antenna delay is known to a nanosecond before anything is measured, so an estimate that is worse says
+nothing. `scale` of each unknown is that guess.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.errors import BadInputError
+from uwblink.arrays import Bools, Floats
+
+LOOSEST: Final = 0.5
+"""Largest standard deviation of a direction that counts as known, as a share of what is known without any data."""
+
+ROUNDING: Final = 1e-12
+"""Share of the largest eigenvalue below which an eigenvalue is rounding."""
+
+TAKES_PART: Final = 0.02
+"""Share of the largest part in a free direction from which an unknown is named."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """One column of an information matrix: what it is ("delay"), of what ("3"), and how far it is known without data.
+
+    Several columns may be the same thing of the same (the three coordinates of a position), and are named once.
+    """
+
+    kind: str
+    of: str
+    scale: float = 1.0
+
+    def __str__(self) -> str:
+        """Return both words."""
+        return f"{self.kind} of {self.of}" if self.of else self.kind
+
+
+@dataclass(frozen=True, slots=True)
+class FreeDirection:
+    """A combination of unknowns that the data leave free: its parts (n,), the largest 1, in the unknowns' own units.
+
+    `std` is how far it is known, in units of the part that is 1: infinite where not at all.
+    """
+
+    parts: Floats
+    std: float
+    words: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """What an information matrix determines.
+
+    `std` (n,) is infinite where the data do not determine an unknown, and `covariance` (n, n) is NaN in its row and
+    column. Combinations of such unknowns may be determined all the same: `std_of` and `covariance_of` say so.
+    """
+
+    unknowns: tuple[Unknown, ...]
+    std: Floats
+    covariance: Floats
+    free: tuple[FreeDirection, ...]
+    _spread: Floats
+    _loosest: float
+
+    @property
+    def determined(self) -> Bools:
+        """Which unknowns (n,) the data determine."""
+        return np.isfinite(self.std)
+
+    @property
+    def whole(self) -> bool:
+        """Whether everything is determined."""
+        return not self.free
+
+    def named(self, kind: str) -> tuple[str, ...]:
+        """Return of what a kind of unknown is not determined, each once and in order: tags whose delay is free."""
+        loose = zip(self.unknowns, self.determined.tolist(), strict=True)
+        return tuple(dict.fromkeys(u.of for u, known in loose if u.kind == kind and not known))
+
+    def std_of(self, combination: Floats) -> float:
+        """Return the standard deviation of a linear combination (n,) of the unknowns, infinite where it is free.
+
+        A combination counts as free where its standard deviation is more than `loosest` of what it was without data.
+        """
+        scaled = np.array([u.scale for u in self.unknowns]) * combination
+        found = float(np.linalg.norm(scaled @ self._spread))
+        return found if found <= self._loosest * float(np.linalg.norm(scaled)) else math.inf
+
+    def covariance_of(self, combinations: Floats) -> Floats:
+        """Return the covariance (k, k) of linear combinations (k, n), NaN in row and column of those that are free."""
+        scale = np.array([u.scale for u in self.unknowns])
+        root = (combinations * scale) @ self._spread
+        loose = ~np.isfinite([self.std_of(row) for row in combinations])
+        return _blanked(root @ root.T, loose)
+
+    def __str__(self) -> str:
+        """Return what is free, a line each."""
+        return "\n".join(direction.words for direction in self.free) or "everything is determined"
+
+
+def judge(information: Floats, unknowns: Sequence[Unknown], *, loosest: float = LOOSEST) -> Verdict:
+    """Return what a positive semi-definite information matrix (n, n) says of its unknowns.
+
+    A direction, or an unknown, counts as determined where its standard deviation is at most `loosest` times the scale
+    (of a direction: of its parts together). Raises `BadInputError` for a matrix that is none.
+
+    >>> import numpy as np
+    >>> from calib.information import Unknown, judge
+    >>> apart = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
+    >>> verdict = judge(1e4 * apart.T @ apart, [Unknown("delay", tag) for tag in "123"])
+    >>> print(verdict)
+    delay of 1 against delays of 2 and 3
+    >>> round(verdict.std_of(np.array([0.0, 1.0, -1.0])), 4)
+    0.0141
+    """
+    scale = _checked(information, unknowns, loosest)
+    values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+    largest = max(float(values[-1]), 0.0)
+    if values[0] < -math.sqrt(ROUNDING) * largest:
+        raise BadInputError(f"has the eigenvalue {values[0]:.3g}, expected none below 0", parameter="information")
+    # Rounding lifts a free direction to this at most; below it there is nothing, and what is nothing is made as loose.
+    nothing = values <= ROUNDING * len(values) * largest
+    spread = vectors / np.sqrt(np.where(nothing, max(ROUNDING * largest, 1e-300), values))
+    deviation = np.linalg.norm(spread, axis=1)
+    loose = deviation > loosest
+    free = nothing | (np.maximum(values, 0.0) < loosest**-2)
+    return Verdict(
+        unknowns=tuple(unknowns),
+        std=np.where(loose, math.inf, deviation * scale),
+        covariance=_blanked((spread @ spread.T) * scale[:, None] * scale, loose),
+        free=tuple(_directions(vectors[:, free], np.where(nothing, 0.0, values)[free], scale, unknowns)),
+        _spread=spread,
+        _loosest=loosest,
+    )
+
+
+def reduced(information: Floats, keep: Sequence[int] | Bools) -> Floats:
+    """Return the information (k, k) on some of the unknowns (indices or a mask), whatever the others are.
+
+    That is the Schur complement; what the others leave free stays free.
+    """
+    count = len(information)
+    mask = np.zeros(count, dtype=bool)
+    mask[np.asarray(keep)] = True
+    kept, rest = np.flatnonzero(mask), np.flatnonzero(~mask)
+    if not len(rest):
+        return np.array(information[np.ix_(kept, kept)])
+    size = np.sqrt(np.maximum(np.diag(information)[rest], 1e-300))
+    values, vectors = np.linalg.eigh(information[np.ix_(rest, rest)] / size[:, None] / size)
+    good = values > ROUNDING * len(rest) * max(float(values[-1]), 1e-300)
+    root = (information[np.ix_(kept, rest)] / size) @ vectors[:, good] / np.sqrt(values[good])
+    found = information[np.ix_(kept, kept)] - root @ root.T
+    return np.asarray((found + found.T) / 2)
+
+
+def _checked(information: Floats, unknowns: Sequence[Unknown], loosest: float) -> Floats:
+    count = len(unknowns)
+    if not count or np.shape(information) != (count, count):
+        found = f"has the shape {np.shape(information)}, expected {count} rows and columns, one an unknown"
+        raise BadInputError(found, parameter="information")
+    if not np.all(np.isfinite(information)):
+        raise BadInputError("holds a number that is not finite", parameter="information")
+    if np.abs(information - information.T).max() > 1e-6 * np.abs(information).max():
+        raise BadInputError("is not symmetric", parameter="information")
+    if not (math.isfinite(loosest) and loosest > 0):
+        raise BadInputError(f"found {loosest}, expected a positive number", parameter="loosest")
+    return np.array([unknown.scale for unknown in unknowns])
+
+
+def _blanked(covariance: Floats, loose: Bools) -> Floats:
+    found: Floats = np.array(covariance)
+    found[loose] = np.nan
+    found[:, loose] = np.nan
+    return found
+
+
+def _directions(free: Floats, values: Floats, scale: Floats, unknowns: Sequence[Unknown]) -> Iterator[FreeDirection]:
+    """Yield the directions (n, k) that are free, with eigenvalues (k,): each with as few unknowns as it can have."""
+    for found in _sparse(free):
+        parts = found * scale
+        largest = float(np.abs(parts).max())
+        along = (found @ free) / np.linalg.norm(found)
+        information = float(along**2 @ values)
+        std = math.inf if information <= 0 else largest / (math.sqrt(information) * float(np.linalg.norm(found)))
+        parts = parts / parts[np.argmax(np.abs(parts))]
+        yield FreeDirection(parts, std, _in_words(found, unknowns))
+
+
+def _sparse(free: Floats) -> Iterator[Floats]:
+    """Yield a basis of the span of `free` (n, k), each vector with one unknown of its own, the first ones preferred."""
+    left = free.T.copy()
+    while len(left):
+        size = np.linalg.norm(left, axis=0)
+        column = int(np.argmax(size > 0.5 * size.max()))
+        # The vector of the span with the largest part in that unknown; the rest is turned to have none.
+        turned = np.linalg.svd(left[:, [column]], full_matrices=True)[0].T @ left
+        yield from _cleared(turned[:1])
+        left = turned[1:]
+
+
+def _cleared(found: Floats) -> Iterator[Floats]:
+    for row in found:
+        yield np.where(np.abs(row) < 1e-9 * np.abs(row).max(), 0.0, row)
+
+
+def _in_words(direction: Floats, unknowns: Sequence[Unknown]) -> str:
+    """Return what moves together: "all delays together with all positions" and the like."""
+    named = np.abs(direction) > TAKES_PART * np.abs(direction).max()
+    return " with ".join(
+        _of_kind(kind, direction, named, unknowns)
+        for kind in dict.fromkeys(u.kind for u, part in zip(unknowns, named, strict=True) if part)
+    )
+
+
+def _of_kind(kind: str, direction: Floats, named: Bools, unknowns: Sequence[Unknown]) -> str:
+    """Return the part of one kind: all, or which, and which grow as others shrink."""
+    everyone = [k for k, unknown in enumerate(unknowns) if unknown.kind == kind]
+    moving = [k for k in everyone if named[k]]
+    names = list(dict.fromkeys(unknowns[k].of for k in moving))
+    whole = len(names) == len({unknowns[k].of for k in everyone}) > 1
+    if len(names) < len(moving):
+        return f"all {kind}s" if whole else _listed(kind, names)
+    up = [unknowns[k].of for k in moving if direction[k] * direction[moving[0]] > 0]
+    down = [name for name in names if name not in up]
+    if down:
+        return f"{_listed(kind, up)} against {_listed(kind, down)}"
+    return f"all {kind}s together" if whole else _listed(kind, names)
+
+
+def _listed(kind: str, names: Sequence[str]) -> str:
+    if names == [""]:
+        return kind
+    *most, last = names
+    return f"{kind}s of {', '.join(most)} and {last}" if most else f"{kind} of {last}"
