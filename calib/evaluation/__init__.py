@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from calib.evaluation.localization import FILTERS, PAPER_RMSE_M, Settings, summarize
+    from calib.evaluation.consistency import summarize
+    from calib.evaluation.localization import PAPER_RMSE_M
     from calib.evaluation.localization_display import (
         as_tum,
         localization_json,
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     )
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation
+    from calib.evaluation.tracking import FILTERS, Settings
 
 __all__ = [
     "CORRECTION_STAGES",
@@ -41,17 +43,17 @@ _HOMES: Final = {
     "CORRECTION_STAGES": "calib.evaluation.statistics",
     "ErrorStatistics": "calib.evaluation.statistics",
     "Evaluation": "calib.evaluation.statistics",
-    "FILTERS": "calib.evaluation.localization",
+    "FILTERS": "calib.evaluation.tracking",
     "PAPER_RMSE_M": "calib.evaluation.localization",
     "OnboardSettings": "calib.evaluation.onboard",
-    "Settings": "calib.evaluation.localization",
+    "Settings": "calib.evaluation.tracking",
     "as_tum": "calib.evaluation.localization_display",
     "localization_json": "calib.evaluation.localization_display",
     "localization_text": "calib.evaluation.localization_display",
     "localize_onboard": "calib.evaluation.onboard",
     "onboard_json": "calib.evaluation.localization_display",
     "onboard_text": "calib.evaluation.localization_display",
-    "summarize": "calib.evaluation.localization",
+    "summarize": "calib.evaluation.consistency",
     "write_onboard_tum": "calib.evaluation.localization_display",
     "write_tum": "calib.evaluation.localization_display",
 }

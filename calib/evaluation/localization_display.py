@@ -8,15 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.evaluation.localization import (
-    PAPER_RMSE_M,
-    Localization,
-    Settings,
-    Summary,
-    Track,
-    summarize,
-)
+from calib.evaluation.consistency import Summary, summarize
+from calib.evaluation.localization import PAPER_RMSE_M
 from calib.evaluation.onboard import OnboardSettings, OnboardTrack
+from calib.evaluation.tracking import Localization, Settings, Track
 from uwblink.arrays import Floats, Ints
 from uwblink.output import write_text
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from calib.calibration.model import Calibration, require_calibration
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.localization import nearest_attitude
 from calib.evaluation.multilateration import Fix, multilaterate
 from calib.evaluation.onboard_data import Readings, readings
 from calib.evaluation.onboard_filter import GRAVITY, InertialFilter, Noise, P
+from calib.evaluation.tracking_problem import nearest_attitude
 from calib.sources import Data
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m

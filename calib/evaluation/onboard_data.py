@@ -131,7 +131,7 @@ def _of_body(
 
 def _corrected(ranges: Ranges, calibration: Calibration) -> tuple[Floats, Floats, list[RangeErrors]]:
     """Return corrected ranges (n,), the noise of direct ones (n,), and what their errors are made of besides."""
-    from calib.evaluation.localization import range_errors
+    from calib.evaluation.tracking_filters import range_errors
 
     if not len(ranges):
         return np.zeros(0), np.zeros(0), []

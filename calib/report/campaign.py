@@ -19,8 +19,10 @@ from calib.estimation.fitting import fit
 from calib.estimation.losses import MIXTURE
 from calib.estimation.passive_listeners import OverheardDelay, heard_delays
 from calib.estimation.result import FitResult
-from calib.evaluation.localization import Localization, localize, summarize
+from calib.evaluation.consistency import summarize
+from calib.evaluation.localization import localize
 from calib.evaluation.statistics import Evaluation, evaluate
+from calib.evaluation.tracking import Localization
 from calib.ranges import Ranges, concatenate
 from calib.sources import Data, each, load_each, opened
 

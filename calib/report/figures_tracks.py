@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.evaluation.localization import Localization, summarize
+from calib.evaluation.consistency import summarize
+from calib.evaluation.tracking import Localization
 from calib.figures import COLOURS, label
 
 COLOUR_OF: Final = {

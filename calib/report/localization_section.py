@@ -5,7 +5,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Final
 
-from calib.evaluation.localization import PAPER_RMSE_M, Localization, Settings, Summary, summarize
+from calib.evaluation.consistency import Summary, summarize
+from calib.evaluation.localization import PAPER_RMSE_M
+from calib.evaluation.tracking import Localization, Settings
 from calib.report.blocks import Block, Heading, Picture, Table, Text
 
 MOST_TRACKS: Final = 3

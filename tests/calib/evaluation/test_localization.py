@@ -11,8 +11,10 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.fitting import fit
-from calib.evaluation.localization import Settings, fixed_std, localize, summarize
+from calib.evaluation.consistency import summarize
+from calib.evaluation.localization import fixed_std, localize
 from calib.evaluation.localization_display import as_tum, localization_json, localization_text, write_tum
+from calib.evaluation.tracking import Settings
 from calib.sources import Flight, load_flight
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate, write
