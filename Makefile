@@ -55,13 +55,19 @@ format: setup ## rewrite the code in the house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: setup ## measure speed and memory; prints the table of the README
+picture: setup ## draw the README's picture
+	$(BIN)/python -m benchmarks.picture
+
+bench: setup ## measure speed and memory; prints the first table of docs/speed.md
 	$(BIN)/python -m benchmarks
 
 bench-large: setup ## measure a calibration of 3.8 million exchanges (a minute, 3 GB)
 	$(BIN)/python -m benchmarks.large
 
-bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
+bench-workpicture: setup ## draw the README's picture
+	$(BIN)/python -m benchmarks.picture
+
+bench: setup ## measure engines, workers and Dask (2 minutes)
 	$(BIN)/python -m benchmarks.workbench
 
 bench-stream: setup ## measure how late streamed ranges are (15 s)

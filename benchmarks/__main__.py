@@ -1,4 +1,4 @@
-"""Measure the figures of the README and print them as a table.
+"""Measure the figures of docs/speed.md and print them as a table.
 
 Each figure is the median of several runs after one that is not counted. Whole commands run in
 processes of their own, so that their time and peak memory include start-up; the others are timed in

@@ -1,4 +1,4 @@
-"""The README's commands run as they stand there; its make targets exist."""
+"""The commands of the README and of its first pages run as they stand there; the make targets exist."""
 
 import json
 import os
@@ -12,21 +12,38 @@ import tomllib
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+FIRST_STEPS, BOARDS = ((ROOT / f"docs/tutorials/{name}.md").read_text("utf-8") for name in ("first-steps", "boards"))
+NUMBER = r"[+-]?\d+\.\d+|\d+"
 BIN = Path(sys.executable).parent
 TRAIN = "scenarios/icra2023/train.toml"
 
 
-def shell_commands(label=""):
-    blocks = re.findall(rf"^```sh{label}\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+def shell_commands(page, label=""):
+    blocks = re.findall(rf"^```sh{label}\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
     return [line for block in blocks for line in block.splitlines() if line.strip()]
 
 
-def test_every_shell_command_of_the_readme_works_in_order(tmp_path):
+def test_the_two_commands_of_the_readme_print_what_it_says(tmp_path):
+    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
+    environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+    printed = ""
+    for command in shell_commands(README):
+        printed += subprocess.check_output(command.split(), cwd=tmp_path, env=environment, text=True)
+    shown = re.search(r"^```text\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)[1]
+    assert re.sub(NUMBER, "#", printed).split() == re.sub(NUMBER, "#", shown).split()
+    # Versions of libraries move delays by less than their own intervals, and nothing else.
+    delays, said = (np.array(re.findall(r"delay (\S+) ns", text), dtype=float) for text in (printed, shown))
+    np.testing.assert_allclose(delays, said, atol=0.005)
+
+
+def test_every_shell_command_of_the_first_steps_works_in_order(tmp_path):
     for name in ("scenarios", "docs"):
         shutil.copytree(ROOT / name, tmp_path / name)
-    commands = shell_commands()
+    commands = shell_commands(FIRST_STEPS)
     assert {c.split()[0] for c in commands} == {"uwbsim", "uwblink", "calib"}
     environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
     for command in commands:
@@ -47,7 +64,7 @@ def test_every_shell_command_of_the_readme_works_in_order(tmp_path):
 def serving(folder, label, *files):
     """Run the README's server in a folder until the block ends; `files` are there when it begins."""
     environment = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
-    (serve,) = shell_commands(label)
+    (serve,) = shell_commands(BOARDS, label)
     server = subprocess.Popen(serve.split(), cwd=folder, env=environment, stdout=subprocess.DEVNULL)
     try:
         while not all((folder / name).exists() for name in files):
@@ -62,12 +79,12 @@ def serving(folder, label, *files):
 def test_the_commands_for_boards_work_on_served_ones(tmp_path):
     shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
     with serving(tmp_path, " serve", "poses.csv", "ports/tag20") as environment:
-        commands = shell_commands(" boards")
+        commands = shell_commands(BOARDS, " boards")
         assert len(commands) >= 8
         for command in commands:
             done = subprocess.run(command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True)
             assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
-        script = re.search(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)[1]
+        script = re.search(r"^```python\n(.*?)^```", BOARDS, flags=re.MULTILINE | re.DOTALL)[1]
         done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
         assert 2 < float(done.stdout) < 4
     assert not (tmp_path / "ports" / "tag10").exists()
@@ -78,7 +95,7 @@ def test_the_way_from_served_drones_to_a_calibration_works(tmp_path):
     for name in ("scenarios", "docs"):
         shutil.copytree(ROOT / name, tmp_path / name)
     with serving(tmp_path, " serve-drones", "motion.csv", "drones/tag6") as environment:
-        for command in shell_commands(" drones"):
+        for command in shell_commands(BOARDS, " drones"):
             done = subprocess.run(command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True)
             assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
     fitted = json.loads((tmp_path / "drones.json").read_text())["delays_ns"]
