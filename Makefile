@@ -30,6 +30,10 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 test: setup ## run the whole test suite, on two cores
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+docs: setup ## build the documentation site into docs/_build/html; warnings are errors (a minute)
+	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
 coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=term-missing
 
@@ -102,4 +106,4 @@ lock: setup ## write the versions now in .venv to requirements-dev.lock
 		$(BIN)/python -m pip freeze --disable-pip-version-check --exclude-editable; } > requirements-dev.lock
 
 clean: ## remove .venv, caches and the demo
-	rm -rf .venv .venv-lowest .venv-newest demo .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-lowest .venv-newest demo .mypy_cache .ruff_cache .pytest_cache .hypothesis docs/_build docs/generated

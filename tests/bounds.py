@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final
 
 PROJECT: Final = Path(__file__).parents[1] / "pyproject.toml"
-STYLE: Final = ("mypy", "ruff", "scipy-stubs")
-"""What looks at code and runs no test."""
+STYLE: Final = ("mypy", "ruff", "scipy-stubs", "furo", "myst-nb", "myst-parser", "sphinx")
+"""What looks at code or makes pages of it, and runs no test."""
 
 BOUND: Final = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(\[[a-z,]+\])?>=(?P<lowest>[0-9][0-9.]*)")
 

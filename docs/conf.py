@@ -1,0 +1,49 @@
+"""Settings of the documentation site; `make docs` builds it into docs/_build/html."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from docs.site.building import connect as setup  # noqa: E402, F401 - Sphinx calls `setup`
+from uwblink import __version__  # noqa: E402
+
+project = "uwbcal"
+author = "the uwbcal authors"
+release = __version__
+version = __version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design"]
+exclude_patterns = ["_build", "site", "examples", "maps", "figures"]
+myst_enable_extensions = ["deflist", "colon_fence"]
+myst_heading_anchors = 3
+# Code fences of the pages say after the language how the tests run them; MyST takes the first word alone.
+suppress_warnings = ["mystnb.unknown_mime_type"]
+
+# Single backticks in docstrings are code, as everywhere else in the project.
+default_role = "code"
+autodoc_member_order = "alphabetical"
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+python_use_unqualified_type_names = True
+maximum_signature_line_length = 88
+nitpicky = True
+
+nb_execution_mode = "force"
+nb_execution_timeout = 120
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+
+copybutton_exclude = ".linenos, .gp"
+highlight_language = "none"
+
+html_theme = "furo"
+html_title = f"uwbcal {release}"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {
+    "light_css_variables": {"color-brand-primary": "#0b5d8f", "color-brand-content": "#0b5d8f"},
+    "dark_css_variables": {"color-brand-primary": "#7cc4f0", "color-brand-content": "#7cc4f0"},
+}
