@@ -68,10 +68,7 @@ bench: setup ## measure speed and memory; prints the first table of docs/speed.m
 bench-large: setup ## measure a calibration of 3.8 million exchanges (a minute, 3 GB)
 	$(BIN)/python -m benchmarks.large
 
-bench-workpicture: setup ## draw the README's picture
-	$(BIN)/python -m benchmarks.picture
-
-bench: setup ## measure engines, workers and Dask (2 minutes)
+bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 	$(BIN)/python -m benchmarks.workbench
 
 bench-stream: setup ## measure how late streamed ranges are (15 s)

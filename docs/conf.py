@@ -5,8 +5,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from docs.site.building import connect as setup  # noqa: E402, F401 - Sphinx calls `setup`
-from uwblink import __version__  # noqa: E402
+from docs.site.building import connect as setup  # noqa: F401 - Sphinx calls `setup`
+from uwblink import __version__
 
 project = "uwbcal"
 author = "the uwbcal authors"
