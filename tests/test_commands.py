@@ -29,7 +29,7 @@ def test_usage_errors_have_status_2(command):
     assert subprocess.run([str(BIN / command), "--nonsense"], capture_output=True).returncode == 2
     assert subprocess.run([str(BIN / command), "nonsense"], capture_output=True).returncode == 2
     done = subprocess.run([str(BIN / command), "--version"], capture_output=True, text=True)
-    assert done.stdout.strip() == uwblink.__version__
+    assert done.stdout.splitlines()[0] == f"{command} {uwblink.__version__}"
 
 
 @pytest.mark.parametrize("package", ["uwbsim", "uwblink", "calib"])

@@ -3,65 +3,120 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
+
+from uwblink.cli.guide import choice, tags_of
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings with true distances (.uwb).")]
 CalibrationFile = Annotated[Path, typer.Option("-c", "--calibration", help="Calibration (.json).")]
 NewCalibration = Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print all figures as JSON, in SI units and ns.")]
-Force = Annotated[bool, typer.Option(help="Replace files that are there already.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
+WEIGHTS: Final = "How errors count"
+MODEL: Final = "What is fitted"
+OWN_LOSSES: Final = ("mixture", "cauchy", "huber", "soft_l1", "l2")
+
+
+def _losses() -> list[str]:
+    from calib.estimation import known_losses
+
+    return list(known_losses())
+
+
 Loss = Annotated[
     str | None,
     typer.Option(
-        help="mixture (the default: a likelihood with reflections by pair), cauchy (that of --sequential, and of less "
-        "than 15 ranges a pair), huber, soft_l1, l2 (least squares) or a registered one."
+        rich_help_panel=WEIGHTS,
+        help="mixture (the default): a likelihood with reflections by pair; cauchy: that of --sequential, and of less "
+        "than 15 ranges a pair; l2: least squares; or a registered one.",
+        **choice(*OWN_LOSSES, more=_losses),
     ),
 ]
 ReferencePower = Annotated[
     float | None,
     typer.Option(
-        help="Power in dBm at which the curve is zero, and the delays are stated (default: -82, the published alpha)."
+        rich_help_panel=MODEL,
+        help="Power in dBm at which the curve is zero, and the delays are stated (default: -82, the published alpha).",
     ),
 ]
 Scale = Annotated[
-    str, typer.Option(help="Error in ns of flight beyond which the loss discounts a range, or auto: from the data.")
+    str,
+    typer.Option(
+        metavar="NS|auto",
+        rich_help_panel=WEIGHTS,
+        help="Error in ns of flight beyond which the loss discounts a range, or auto: from the data.",
+    ),
 ]
 Lift = Annotated[
-    str, typer.Option(help="Power of an exchange from those of its two ends: mean-of-lifted or lift-of-mean.")
+    str,
+    typer.Option(
+        rich_help_panel=MODEL,
+        help="Power of an exchange from those of its two ends.",
+        **choice("mean-of-lifted", "lift-of-mean"),
+    ),
 ]
 Fix = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="TAG=NS", help="Delay of a tag that is known and stays as it is, as in 1=-0.36; may be repeated."
+        metavar="TAG=NS",
+        rich_help_panel=MODEL,
+        autocompletion=tags_of("{}="),
+        help="Delay of a tag that is known and stays as it is, as in 1=-0.36; may be repeated.",
     ),
 ]
 GroupFile = Annotated[
     Path | None,
-    typer.Option(help="Groups of tags that share curves (.toml with a table \\[groups]); by default all tags do."),
+    typer.Option(
+        rich_help_panel=MODEL,
+        help="Groups of tags that share curves (.toml with a table \\[groups]); by default all tags do.",
+    ),
 ]
 DelaysOnly = Annotated[
     bool,
-    typer.Option("--delays-only", help="Fit no curve: for ranges without power, or whose power follows distance."),
+    typer.Option(
+        "--delays-only",
+        rich_help_panel=MODEL,
+        help="Fit no curve: for ranges without power, or whose power follows distance.",
+    ),
 ]
 DelaysFrom = Annotated[
     Path | None,
-    typer.Option(help="Calibration whose delays are taken over (.json); with those of all tags the curve is left."),
+    typer.Option(
+        rich_help_panel=MODEL,
+        help="Calibration whose delays are taken over (.json); with those of all tags the curve is left.",
+    ),
 ]
 Constants = Annotated[
-    str, typer.Option(help="What a constant error belongs to: tag (antenna delays) or pair (each its own constant).")
+    str,
+    typer.Option(
+        rich_help_panel=MODEL,
+        help="What a constant error belongs to: tags (antenna delays), or pairs (each its own constant).",
+        **choice("tag", "pair"),
+    ),
 ]
 Sequential = Annotated[
     bool,
-    typer.Option("--sequential", help="Fit the delays first and then the curve to what they leave, as in ICRA 2023."),
+    typer.Option(
+        "--sequential",
+        rich_help_panel=MODEL,
+        help="Fit the delays first and then the curve to what they leave, as in ICRA 2023.",
+    ),
 ]
 TrimStatic = Annotated[
-    bool, typer.Option("--trim-static", help="Leave out spans of 2 s in which a pair's distance stays within 2 cm.")
+    bool,
+    typer.Option(
+        "--trim-static",
+        rich_help_panel=WEIGHTS,
+        help="Leave out spans of 2 s in which a pair's distance stays within 2 cm.",
+    ),
 ]
 MinimumNorm = Annotated[
     bool,
     typer.Option(
-        "--minimum-norm", help="Where the pairs leave delays free, fit the smallest ones that agree with the data."
+        "--minimum-norm",
+        rich_help_panel=MODEL,
+        help="Where the pairs leave delays free, fit the smallest ones that agree with the data.",
     ),
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -13,12 +13,28 @@ if TYPE_CHECKING:
     from calib import Calibration
 
 from calib.cli.arguments import CalibrationFile, Force, Recordings
+from uwblink.cli.guide import add, choice
+
+PANEL: Final = "Judge"
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    for command in (evaluate, localize, doctor, compare):
-        app.command()(command)
+    for command, *examples in (
+        (
+            evaluate,
+            "calib evaluate test.uwb -c calibration.json",
+            "calib evaluate test.uwb -c calibration.json --report r.html",
+        ),
+        (
+            localize,
+            "calib localize test.uwb -c calibration.json",
+            "calib localize test.uwb -c calibration.json --model imu",
+        ),
+        (doctor, "calib doctor flight.uwb"),
+        (compare, "calib compare before.json after.json"),
+    ):
+        add(app, command, *examples, panel=PANEL)
 
 
 def evaluate(
@@ -61,8 +77,9 @@ def localize(
     model: Annotated[
         str,
         typer.Option(
-            help="poses (velocity and attitude from motion capture, to weigh calibrations), or without any: imu, "
-            "constant-velocity, by ranges to fixed anchors and the height sensor."
+            help="What moves the estimate between ranges: velocity and attitude from motion capture (to weigh "
+            "calibrations), or without any, by ranges to fixed anchors and a height sensor, an IMU or nothing.",
+            **choice("poses", "imu", "constant-velocity"),
         ),
     ] = "poses",
     training: Annotated[

@@ -3,29 +3,54 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from calib.cli.arguments import CalibrationFile, Force
+from uwblink.cli.guide import add, choice, epilog
+
+PANEL: Final = "Use"
+
+MILUV: Final = "calib import miluv uwb_calib.json -o calibration.json"
 
 imports = typer.Typer(
-    help="Turn calibrations of other programs into ones that apply and evaluate take.", no_args_is_help=True
+    help="Turn calibrations of other programs into ones that apply and evaluate take.",
+    epilog=epilog(MILUV),
+    no_args_is_help=True,
 )
+
+
+def _exporters() -> list[str]:
+    from uwblink.exporters import EXPORTERS
+
+    return list(EXPORTERS)
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command()(apply)
-    app.command()(export)
-    app.add_typer(imports, name="import")
+    add(app, apply, "calib apply flight.uwb -c calibration.json -o corrected.uwb", panel=PANEL)
+    add(
+        app,
+        export,
+        "calib export calibration.json --to registers",
+        "calib export calibration.json --to c-header -o calibration.h",
+        panel=PANEL,
+    )
+    app.add_typer(imports, name="import", rich_help_panel=PANEL)
+    add(imports, import_miluv, MILUV, name="miluv")
 
 
 def apply(
     recording: Annotated[Path, typer.Argument(help="Recording to correct (.uwb).")],
     calibration: CalibrationFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb); a folder with --to.")],
-    to: Annotated[str | None, typer.Option(help="csv, parquet, mcap or rosbag2: a folder instead.")] = None,
+    to: Annotated[
+        str | None,
+        typer.Option(
+            help="A folder in this form instead.", **choice("csv", "parquet", "mcap", "rosbag2", more=_exporters)
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Write a recording again with its ranges corrected (range_m); all else stays as it was."""
@@ -43,7 +68,10 @@ def export(
     calibration: Annotated[Path, typer.Argument(help="Calibration to turn (.json).")],
     to: Annotated[
         str,
-        typer.Option(help="registers (DW1000 antenna delays), json, csv (delays in ns), miluv, ros-yaml or c-header."),
+        typer.Option(
+            help="registers: antenna delays of the DW1000; csv: delays in ns; c-header: a function for a robot's code.",
+            **choice("registers", "json", "csv", "miluv", "ros-yaml", "c-header"),
+        ),
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; else it is printed.")] = None,
     base: Annotated[
@@ -63,7 +91,6 @@ def export(
         typer.echo(f"{output}")
 
 
-@imports.command("miluv")
 def import_miluv(
     source: Annotated[Path, typer.Argument(help="MILUV's published calibration (.json).")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],

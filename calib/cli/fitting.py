@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -30,15 +30,26 @@ from calib.cli.arguments import (
     TrimStatic,
 )
 from calib.cli.flags import with_flags
+from uwblink.cli.guide import add, tags_of
 
 if TYPE_CHECKING:
     import calib
 
 
+PANEL: Final = "Calibrate"
+
+
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command()(fit)
-    app.command("add-tag")(add_tag)
+    add(
+        app,
+        fit,
+        "calib fit flight.uwb -o calibration.json",
+        "calib fit monday.uwb tuesday.uwb -o both.json --fix 1=-0.36",
+        "calib fit ranges.uwb -o delays.json --delays-only",
+        panel=PANEL,
+    )
+    add(app, add_tag, "calib add-tag new.uwb -c calibration.json --tag 7 -o seven.json", panel=PANEL, name="add-tag")
 
 
 def fit(
@@ -118,7 +129,7 @@ def delay_lines(found: calib.Calibration) -> Iterator[str]:
 def add_tag(
     recording: Annotated[Path, typer.Argument(help="Recording of the new tag with calibrated ones (.uwb).")],
     calibration: CalibrationFile,
-    tag: Annotated[int, typer.Option(help="Id of the tag to add.")],
+    tag: Annotated[int, typer.Option(help="Id of the tag to add.", autocompletion=tags_of())],
     output: NewCalibration,
     force: Force = False,
 ) -> None:

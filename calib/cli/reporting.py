@@ -27,14 +27,22 @@ from calib.cli.arguments import (
     Sequential,
     TrimStatic,
 )
+from calib.cli.evaluating import PANEL
 from calib.cli.flags import with_flags
+from uwblink.cli.guide import add
 
 MANY: Final = "--tests"
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the command."""
-    app.command()(report)
+    add(
+        app,
+        report,
+        "calib report train.uwb --tests test1.uwb test2.uwb -o report.html",
+        "calib report train.uwb -o report.html --pdf report.pdf --figures figures",
+        panel=PANEL,
+    )
 
 
 def spread(arguments: Sequence[str]) -> list[str]:

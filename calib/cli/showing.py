@@ -8,12 +8,14 @@ from typing import Annotated
 import typer
 
 from calib.cli.arguments import AsJson
+from calib.cli.fitting import PANEL
 from calib.cli.flags import with_flags
+from uwblink.cli.guide import add
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the command."""
-    app.command()(show)
+    add(app, show, "calib show calibration.json", panel=PANEL)
 
 
 def show(

@@ -6,34 +6,49 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from uwblink.cli.guide import add, choice, starting
 from uwblink.cli.shared import INTERRUPTED, AsJson, interrupts, print_json
 
 if TYPE_CHECKING:
     from uwblink.wire import RangeReport
 
-Port = Annotated[str, typer.Argument(help="Serial port, link to one, or pyserial URL.")]
+PANEL: Final = "Boards"
+
+
+def _plugged(incomplete: str) -> list[str]:
+    from uwblink.boards import boards_ports
+
+    return starting(incomplete, (port.device for port in boards_ports()))
+
+
+Port = Annotated[str, typer.Argument(help="Serial port, link to one, or pyserial URL.", autocompletion=_plugged)]
 Target = Annotated[int, typer.Argument(min=0, max=254, help="Id of the other board.")]
-ProtocolName = Annotated[str, typer.Option(help="ss or ds.")]
+ProtocolName = Annotated[str, typer.Option(help="Single-sided or double-sided ranging.", **choice("ss", "ds"))]
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command()(ports)
-    app.command()(info)
-    app.command()(twr)
-    app.command()(test)
-    app.command("set-delay")(set_delay)
-    app.command()(passive)
-    app.command()(send)
-    app.command()(cir)
+    for command, *examples in (
+        (ports, "uwblink ports --probe"),
+        (info, "uwblink info ports/tag10"),
+        (twr, "uwblink twr ports/tag10 20 -n 5", "uwblink twr ports/tag10 20 --protocol ss --json"),
+        (test, "uwblink test ports/tag10"),
+        (passive, "uwblink passive ports/tag20 on"),
+        (send, 'uwblink send ports/tag10 "hello"'),
+        (cir, "uwblink cir ports/tag10 20 --plot cir.png"),
+    ):
+        add(app, command, *examples, panel=PANEL)
+    add(app, set_delay, "uwblink set-delay ports/tag20 3000", panel=PANEL, name="set-delay")
 
 
 def ports(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to probe.")] = None,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to probe.", autocompletion=_plugged)
+    ] = None,
     probe: Annotated[bool, typer.Option("--probe", help="Ask the named ports, or all listed, for their id.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -175,7 +190,9 @@ def set_delay(
     typer.echo(f"{port}: response delay {delay_uus} ({delay_uus * 512 / 499.2 + 0.25641:.1f} us), until power is lost")
 
 
-def passive(port: Port, state: Annotated[str, typer.Argument(metavar="on|off")]) -> None:
+def passive(
+    port: Port, state: Annotated[str, typer.Argument(help="Whether to listen.", **choice("on", "off"))]
+) -> None:
     """Have a board listen to the exchanges of others, or stop to."""
     from uwblink import Board
     from uwblink.errors import RefusedError
@@ -202,7 +219,7 @@ def cir(
     target: Target,
     protocol: ProtocolName = "ds",
     plot: Annotated[Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")] = None,
-    force: Annotated[bool, typer.Option(help="Replace the picture if it exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the picture if it exists.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Range with another board and print the channel impulse response."""

@@ -3,31 +3,52 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
+from uwblink.cli.guide import add, choice, epilog
 from uwblink.cli.imports import ImportGroup
 from uwblink.cli.shared import AsJson, Force, print_json
 
-EXAMPLES = """Examples: \n
-uwblink import guess ranges.csv -o map.toml \n
-uwblink import csv ranges.csv --map map.toml -o ranges.uwb \n
-uwblink import csv folder_of_tables -o all.uwb \n
-uwblink import miluv cirObstacles_3_random_0 -o flight.uwb \n
-docs/importing.md explains every key of a map."""
+PANEL: Final = "Recordings"
+
+EXAMPLES: Final = epilog(
+    "uwblink import guess ranges.csv -o map.toml",
+    "uwblink import csv ranges.csv --map map.toml -o ranges.uwb",
+    "uwblink import csv folder_of_tables -o all.uwb",
+    "uwblink import miluv cirObstacles_3_random_0 -o flight.uwb",
+)
 
 imports = typer.Typer(cls=ImportGroup, help="Turn other files into recordings.", epilog=EXAMPLES, no_args_is_help=True)
 
 
+def _exporters() -> list[str]:
+    from uwblink.exporters import EXPORTERS
+
+    return list(EXPORTERS)
+
+
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command()(show)
+    add(app, show, "uwblink show flight.uwb", panel=PANEL)
     imports.callback()(_imports)
-    app.add_typer(imports, name="import")
-    app.command()(export)
-    app.command()(poses)
-    app.command()(replay)
+    app.add_typer(imports, name="import", rich_help_panel=PANEL)
+    add(app, export, "uwblink export flight.uwb --to csv -o tables", panel=PANEL)
+    add(
+        app,
+        poses,
+        "uwblink poses bench.uwb --from poses.csv --tags bench.toml",
+        "uwblink poses bench.uwb --from drone=drone.tum --offset auto",
+        panel=PANEL,
+    )
+    add(
+        app,
+        replay,
+        "uwblink replay bench.uwb -o again.uwb",
+        "uwblink replay bench.uwb --serve --link-dir ports",
+        panel=PANEL,
+    )
 
 
 def _imports() -> None:
@@ -55,7 +76,13 @@ def show(
 
 def export(
     recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
-    to: Annotated[str, typer.Option(help="csv, parquet, tum, mcap or rosbag2.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="Form of the files: tables, trajectories, or messages for Foxglove and ROS 2.",
+            **choice("csv", "parquet", "tum", "mcap", "rosbag2", more=_exporters),
+        ),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write.")],
     force: Force = False,
 ) -> None:

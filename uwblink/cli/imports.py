@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from rich.markup import escape
 from typer.core import TyperGroup
 
+from uwblink.cli.guide import epilog
 from uwblink.cli.shared import Force
 
 if TYPE_CHECKING:
@@ -35,17 +37,20 @@ class ImportGroup(TyperGroup):
         from uwblink.importers import IMPORTERS
 
         if cmd_name == "guess":
-            return _made("guess", "Look at a table and write the map that it would be imported with.", guess)
+            text = "Look at a table and write the map that it would be imported with."
+            return _made("guess", text, guess, "uwblink import guess ranges.csv -o map.toml")
         return _command(IMPORTERS[cmd_name]) if cmd_name in IMPORTERS else None
 
 
 def _command(row: Importer) -> Any:
-    return _made(row.name, row.help, _with_map(row) if row.map_help else _without_map(row))
+    source = f"measured{row.suffixes[0]}" if row.suffixes else "folder"
+    example = f"uwblink import {row.name} {source} -o measured.uwb"
+    return _made(row.name, row.help, _with_map(row) if row.map_help else _without_map(row), example)
 
 
-def _made(name: str, text: str, function: Callable[..., None]) -> Any:
+def _made(name: str, text: str, function: Callable[..., None], example: str) -> Any:
     app = typer.Typer(add_completion=False)
-    app.command(name, help=text)(function)
+    app.command(name, help=escape(text), epilog=epilog(example))(function)
     return typer.main.get_command(app)
 
 

@@ -6,35 +6,52 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from uwblink.cli.guide import add, choice
 from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
     from uwblink.boards import LivePage, Progress
 
+PANEL: Final = "Recording and streaming"
+LIVE: Final = "Live page"
 LINE_EVERY_S = 2.0
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the command."""
-    app.command()(record)
+    add(
+        app,
+        record,
+        "uwblink record ports/tag10 ports/tag20 -o bench.uwb --pairs all",
+        "uwblink record ports/* -o flight.uwb --plan plan.toml --live",
+        panel=PANEL,
+    )
 
 
 def record(
     ports: Annotated[list[str], typer.Argument(metavar="PORT...", help="Serial ports or pyserial URLs.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
     plan: Annotated[Path | None, typer.Option(help="Who ranges with whom (.toml).")] = None,
-    pairs: Annotated[str | None, typer.Option(help="all: every two boards; none: only listen.")] = None,
+    pairs: Annotated[
+        str | None, typer.Option(help="Every two boards, or none: only listen.", **choice("all", "none"))
+    ] = None,
     rate: Annotated[float | None, typer.Option(min=0.001, help="Exchanges a second in total (Hz).")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
     cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
-    live: Annotated[bool, typer.Option("--live", help="Serve a page about it to this computer's browser.")] = False,
-    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 0,
-    calibration: Annotated[Path | None, typer.Option(help="Show ranges corrected, too (.json); with --live.")] = None,
+    live: Annotated[
+        bool, typer.Option("--live", rich_help_panel=LIVE, help="Serve a page about it to this computer's browser.")
+    ] = False,
+    live_port: Annotated[
+        int, typer.Option(min=0, max=65535, rich_help_panel=LIVE, help="Port of the page; 0: a free one.")
+    ] = 0,
+    calibration: Annotated[
+        Path | None, typer.Option(rich_help_panel=LIVE, help="Show ranges corrected, too (.json).")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Play a ranging plan on boards and record everything they say."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import platform
 import re
 import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any, Final, NoReturn
 
 import typer
@@ -18,13 +19,16 @@ from uwblink.cli.starting import INTERRUPTED as INTERRUPTED
 from uwblink.errors import PluginWarning, UwblinkError
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Force = Annotated[bool, typer.Option(help="Replace the output if it exists.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
 """Parameters of uwblink whose flag is called otherwise; all others are spelt alike, with dashes."""
 
 Flags = Mapping[str, str]
 """What stands for a parameter on a command line, by its name, where it is spelt otherwise."""
+
+BESIDE: Final = ("numpy", "scipy", "duckdb", "pydantic", "simpy", "matplotlib")
+"""Distributions on whose versions results, files and figures depend."""
 
 _PARAMETER: Final = re.compile(r"`([a-z_]+)`")
 
@@ -34,15 +38,32 @@ MISTAKE: Final = 2
 
 def new_app(text: str) -> typer.Typer:
     """Return a command without sub-commands yet, whose help begins with `text`, and which knows `--version`."""
-    app = typer.Typer(help=text, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+    app = typer.Typer(help=text, no_args_is_help=True, pretty_exceptions_enable=False)
 
     @app.callback(invoke_without_command=True)
-    def top(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    def top(
+        ctx: typer.Context,
+        version: Annotated[
+            bool, typer.Option("--version", help="Print the versions of this and of what it uses.")
+        ] = False,
+    ) -> None:
         if version:
-            typer.echo(__version__)
+            typer.echo("\n".join(_versions(ctx.info_name or "uwbcal")))
             raise typer.Exit
 
     return app
+
+
+def _versions(command: str) -> Iterator[str]:
+    """Yield the version of a command, and on a line of its own those of what its results depend on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    yield f"{command.split()[-1]} {__version__}"
+    found = [f"Python {platform.python_version()}"]
+    for name in BESIDE:
+        with suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    yield ", ".join(found)
 
 
 def run(

@@ -12,35 +12,56 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from uwblink.cli.guide import add
+from uwblink.cli.recording import PANEL
 from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
     from uwblink import RangingPlan, StreamedRange
 
 SUFFIX: Final = ".uwb"
+BOARDS: Final = "Of boards"
+SENT: Final = "Where ranges go"
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the command."""
-    app.command()(stream)
+    add(
+        app,
+        stream,
+        "uwblink stream ports/tag10 ports/tag20 -c calibration.json",
+        "uwblink stream flight.uwb -c calibration.json --udp 127.0.0.1:9870",
+        panel=PANEL,
+    )
 
 
 def stream(
     source: Annotated[list[str], typer.Argument(metavar="SOURCE...", help="Ports of boards, or one recording (.uwb).")],
     calibration: Annotated[Path | None, typer.Option("-c", "--calibration", help="Correct by it (.json).")] = None,
-    plan: Annotated[Path | None, typer.Option(help="Who ranges with whom (.toml); else every two boards.")] = None,
-    rate: Annotated[float | None, typer.Option(min=0.001, help="Exchanges a second in total (Hz), of boards.")] = None,
+    plan: Annotated[
+        Path | None, typer.Option(rich_help_panel=BOARDS, help="Who ranges with whom (.toml); else every two.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.001, rich_help_panel=BOARDS, help="Exchanges a second in total (Hz).")
+    ] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until the end.")] = None,
     speed: Annotated[float, typer.Option(min=0.001, help="How much faster a recording plays; inf: at once.")] = 1.0,
-    udp: Annotated[str | None, typer.Option(help="HOST:PORT to send JSON datagrams to (PlotJuggler: 9870).")] = None,
+    udp: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", rich_help_panel=SENT, help="Send JSON datagrams there (PlotJuggler: 9870)."),
+    ] = None,
     foxglove: Annotated[
-        str | None, typer.Option(help="\\[HOST:]PORT to serve a WebSocket for Foxglove at (its own: 8765).")
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT", rich_help_panel=SENT, help="Serve a WebSocket for Foxglove there (its own: 8765)."
+        ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Recording of the boards to write as well (.uwb).")
+        Path | None,
+        typer.Option("-o", "--output", rich_help_panel=BOARDS, help="Recording of them to write as well (.uwb)."),
     ] = None,
     force: Force = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print no ranges.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", rich_help_panel=SENT, help="Print no ranges.")] = False,
 ) -> None:
     """Print ranges as they come, a line of JSON each, corrected where a calibration is given, and send them on."""
     from uwblink.boards import Progress

@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
+from uwblink.cli.guide import add
 from uwblink.cli.shared import interrupts
 from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
+
+PANEL: Final = "Scenarios"
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    for command in (run, serve, show, validate, schema):
-        app.command()(command)
+    for command, *examples in (
+        (
+            run,
+            "uwbsim run scenario.toml -o flight.uwb",
+            "uwbsim run scenario.toml -o short.uwb --set run.duration_s=60",
+        ),
+        (serve, "uwbsim serve scenario.toml --link-dir ports --poses poses.csv"),
+        (show, "uwbsim show scenario.toml -o scene.html"),
+        (validate, "uwbsim validate scenario.toml"),
+        (schema, "uwbsim schema > scenario.schema.json"),
+    ):
+        add(app, command, *examples, panel=PANEL)
 
 
 def run(
@@ -59,7 +72,7 @@ def serve(
     poses: Annotated[Path | None, typer.Option(help="Motion capture to write as it goes (.csv), in host time.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
     overrides: Overrides = None,
-    force: Annotated[bool, typer.Option(help="Replace the poses if they exist.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
     import uwbsim

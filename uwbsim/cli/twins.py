@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from uwblink.cli.guide import add
 from uwbsim.cli.arguments import AsJson, Force, progress
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 def add_to(app: typer.Typer) -> None:
     """Register the command."""
-    app.command()(twin)
+    add(app, twin, "uwbsim twin flight.uwb -c calibration.json -o twin.toml", panel="From measurements")
 
 
 def twin(

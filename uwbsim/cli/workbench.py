@@ -5,23 +5,43 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from uwblink.cli.guide import add, choice, several
 from uwblink.cli.shared import INTERRUPTED, interrupts
 from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
     import uwbsim
 
-Protocols = Annotated[str, typer.Option(help="Names, separated by commas, or all.")]
+PANEL: Final = "Protocols and studies"
+TIMING: Final = "Timing"
+TRUTH: Final = "Tags"
+NOISE: Final = "Noise of stamps"
+
+
+def _protocols() -> list[str]:
+    from uwblink import PROTOCOLS
+
+    return list(PROTOCOLS)
+
+
+Protocols = Annotated[
+    str, typer.Option(help="Names, separated by commas, or all.", **several(lambda: ["all", *_protocols()]))
+]
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    for command in (compare, predict, optimum, sweep):
-        app.command()(command)
+    for command, *examples in (
+        (compare, "uwbsim compare scenario.toml -o comparison -n 200000"),
+        (predict, "uwbsim predict --protocol ss-cfo --skew-ppm 10 --reply-delay-us 300"),
+        (optimum, "uwbsim optimum scenario.toml --protocols ds,ds-alt"),
+        (sweep, "uwbsim sweep plan.toml -o results", "uwbsim sweep plan.toml -o results --resume"),
+    ):
+        add(app, command, *examples, panel=PANEL)
 
 
 def compare(
@@ -75,20 +95,39 @@ def _print_outcomes(found: uwbsim.Comparison) -> None:
 
 
 def predict(
-    protocol: Annotated[str, typer.Option(help="ss, ss-cfo, ds, ds-alt, ds-sym, or a registered one.")] = "ds",
-    skew_ppm: Annotated[float, typer.Option(help="How much faster the initiator's clock runs.")] = 0.0,
-    reply_delay_us: Annotated[float, typer.Option(min=0.0, help="The target's reply, dt32.")] = 300.0,
-    final_delay_us: Annotated[float, typer.Option(min=0.0, help="The third message's delay, dt53.")] = 1538.7,
-    distance_m: Annotated[float, typer.Option(min=0.0, help="Distance.")] = 5.0,
-    speed_mps: Annotated[float, typer.Option(help="Speed apart.")] = 0.0,
-    drift_ppm_per_s: Annotated[float, typer.Option(help="Change of the relative skew.")] = 0.0,
-    tx_noise_ps: Annotated[float, typer.Option(min=0.0, help="Noise of transmit stamps.")] = 0.0,
-    rx_noise_ps: Annotated[float, typer.Option(min=0.0, help="Noise of receive stamps.")] = 150.0,
-    carrier_noise_ppm: Annotated[float, typer.Option(min=0.0, help="Noise of the carrier integrator.")] = 0.2,
-    carrier_bias_ppm: Annotated[float, typer.Option(help="Its bias.")] = 0.0,
-    delay_initiator_ns: Annotated[float, typer.Option(help="Antenna delay of the initiator.")] = 0.0,
-    delay_target_ns: Annotated[float, typer.Option(help="Antenna delay of the target.")] = 0.0,
-    whole_ticks: Annotated[bool, typer.Option("--whole-ticks", help="Stamps are whole ticks of 15.65 ps.")] = False,
+    protocol: Annotated[
+        str,
+        typer.Option(
+            help="Protocol, or a registered one.", **choice("ss", "ss-cfo", "ds", "ds-alt", "ds-sym", more=_protocols)
+        ),
+    ] = "ds",
+    skew_ppm: Annotated[
+        float, typer.Option(rich_help_panel=TRUTH, help="How much faster the initiator's clock runs.")
+    ] = 0.0,
+    reply_delay_us: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel=TIMING, help="The target's reply, dt32.")
+    ] = 300.0,
+    final_delay_us: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel=TIMING, help="The third message's delay, dt53.")
+    ] = 1538.7,
+    distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel=TRUTH, help="Distance.")] = 5.0,
+    speed_mps: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Speed apart.")] = 0.0,
+    drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Change of the relative skew.")] = 0.0,
+    tx_noise_ps: Annotated[float, typer.Option(min=0.0, rich_help_panel=NOISE, help="Noise of transmit stamps.")] = 0.0,
+    rx_noise_ps: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel=NOISE, help="Noise of receive stamps.")
+    ] = 150.0,
+    carrier_noise_ppm: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel=NOISE, help="Noise of the carrier integrator.")
+    ] = 0.2,
+    carrier_bias_ppm: Annotated[float, typer.Option(rich_help_panel=NOISE, help="Its bias.")] = 0.0,
+    delay_initiator_ns: Annotated[
+        float, typer.Option(rich_help_panel=TRUTH, help="Antenna delay of the initiator.")
+    ] = 0.0,
+    delay_target_ns: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Antenna delay of the target.")] = 0.0,
+    whole_ticks: Annotated[
+        bool, typer.Option("--whole-ticks", rich_help_panel=NOISE, help="Stamps are whole ticks of 15.65 ps.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Say mean and standard deviation of a range without simulating any."""

@@ -96,7 +96,9 @@ def test_only_warnings_of_plug_ins_become_lines(capsys):
 @pytest.mark.parametrize("package", ["uwblink", "uwbsim", "calib"])
 def test_python_m_is_the_command(package):
     found = subprocess.run([sys.executable, "-m", package, "--version"], capture_output=True, text=True, check=True)
-    assert re.fullmatch(r"[0-9]+\.[0-9]+\.[0-9]+\n", found.stdout)
+    first, beside = found.stdout.splitlines()
+    assert re.fullmatch(package + r" [0-9]+\.[0-9]+\.[0-9]+", first)
+    assert re.fullmatch(r"Python 3\.[0-9.]+, numpy [0-9.]+, .*duckdb [0-9.]+, .*", beside)
 
 
 def test_the_library_speaks_of_parameters_and_each_has_its_flag():
