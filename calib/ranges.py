@@ -40,6 +40,7 @@ class Ranges:
     `weight_initiator` and `weight_target` are the derivatives of the calibrated time of flight with
     respect to the two tags' antenna delays. `protocol` is "range" where a range came without stamps.
     `excluded` counts by reason what was left out; `planted` is what a simulation put in, for display only;
+    `recordings` are name and `fingerprint` of each that they come from, empty where they come from none;
     `left_skew` says what clock skew may have left in single-sided ranges, None where there are none.
     """
 
@@ -57,6 +58,7 @@ class Ranges:
     excluded: dict[str, int]
     planted: dict[str, Any] | None
     left_skew: LeftSkew | None = None
+    recordings: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def from_exchanges(
@@ -201,7 +203,9 @@ class Ranges:
         return replace(self[keep], excluded=self.excluded | {r: n for r, n in excluded.items() if n})
 
 
-COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted", "left_skew"})
+COLUMNS = tuple(
+    f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted", "left_skew", "recordings"}
+)
 
 
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
@@ -213,6 +217,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         excluded={r: sum(p.excluded.get(r, 0) for p in parts) for r in reasons},
         planted=parts[0].planted,
         left_skew=worst([p.left_skew for p in parts]),
+        recordings=tuple(one for p in parts for one in p.recordings),
         **columns,
     )
 

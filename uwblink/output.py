@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from uwblink.errors import OutputError, RecordingError, RecordingExistsError
+from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError
 
-__all__: Final = ["check_output", "whole", "write_bytes", "write_text"]
+__all__: Final = ["check_apart", "check_output", "whole", "write_bytes", "write_text"]
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
@@ -40,6 +40,24 @@ def whole(path: Path, *, force: bool) -> Iterator[Path]:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ()) -> None:
+    """Raise `ArgumentError` where one output would be written over another, or over what is read.
+
+    `outputs` are files and folders by the parameter that names them.
+    """
+    read = {path.resolve() for path in inputs}
+    taken: dict[Path, str] = {}
+    for name, path in outputs.items():
+        if path is None:
+            continue
+        place = path.resolve()
+        if place in read:
+            raise ArgumentError(f"{path}: is what is read; give another name", parameter=name)
+        if place in taken:
+            raise ArgumentError(f"{path}: is what `{taken[place]}` names already; give another name", parameter=name)
+        taken[place] = name
 
 
 def check_output(path: Path, *, force: bool) -> None:

@@ -42,9 +42,9 @@ class Comparison:
         return self.table()
 
     def table(self, first: str = "the first", second: str = "the second") -> str:
-        """Return a line a tag in ps, the common shift in cm, and the verdict; `first` and `second` name the two."""
+        """Return a line a tag in ns, the common shift in cm, and the verdict; `first` and `second` name the two."""
         lines = [
-            f"  tag {tag:3d}  {1e3 * difference:+8.1f} ps  ± {1e3 * self.std_ns[tag]:.1f}"
+            f"  tag {tag:3d}  {difference:+.4f} ns  ± {1.96 * self.std_ns[tag]:.4f} (95 %)"
             for tag, difference in self.difference_ns.items()
         ]
         lines.append(

@@ -11,9 +11,11 @@ import typer
 
 if TYPE_CHECKING:
     from calib import Calibration
+    from calib.evaluation import Evaluation
 
 from calib.cli.arguments import CalibrationFile, Force, Recordings
 from uwblink.cli.guide import add, choice
+from uwblink.cli.waiting import waiting
 
 PANEL: Final = "Judge"
 
@@ -55,10 +57,12 @@ def evaluate(
 
         check_output(report, force=force)
     known = calib.load_calibration(calibration)
-    parts = load_each(recordings, need_power=known.needs_power)
-    evaluation = calib.evaluate(parts, known)
-    if report:
-        calib.write_report(report, parts, known, force=force)
+    with waiting("evaluating"):
+        parts = load_each(recordings, need_power=known.needs_power)
+        evaluation = calib.evaluate(parts, known)
+        if report:
+            calib.write_report(report, parts, known, force=force)
+    tell_seen(evaluation)
     if as_json:
         typer.echo(json.dumps(evaluation.to_dict(), indent=1))
         return
@@ -69,6 +73,17 @@ def evaluate(
     print_table(evaluation, Console(width=None if sys.stdout.isatty() else WIDE))
     if report:
         typer.echo(f"report: {report}")
+
+
+def tell_seen(evaluation: Evaluation) -> None:
+    """Warn where a calibration was judged on what it was fitted to."""
+    if evaluation.seen:
+        names = ", ".join(evaluation.seen)
+        typer.echo(
+            f"warning: the calibration was fitted to {names}: errors there are smaller than where it is used; "
+            "judge it on recordings that the fit has not seen",
+            err=True,
+        )
 
 
 def localize(
@@ -104,7 +119,8 @@ def localize(
         _onboard(recordings, known, model, tum, as_json=as_json, force=force)
         return
     settings = Settings(velocity_std_mps=process_noise, seeds=seeds)
-    found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
+    with waiting("localizing"):
+        found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
     if tum:
         write_tum(found, tum, force=force)
     if as_json:
@@ -120,7 +136,8 @@ def _onboard(
     from calib.evaluation import OnboardSettings, localize_onboard, onboard_json, onboard_text, write_onboard_tum
 
     settings = OnboardSettings(model=model)
-    found = [one for path in recordings for one in localize_onboard(path, known, settings)]
+    with waiting("localizing"):
+        found = [one for path in recordings for one in localize_onboard(path, known, settings)]
     if tum:
         write_onboard_tum(found, tum, force=force)
     typer.echo(json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings))
@@ -140,15 +157,15 @@ def doctor(
     from uwblink import Recording
     from uwblink.recording import clock_skews
 
-    findings = [
-        replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in calib.examine(recordings)
-    ]
     skews = {}
-    for path in recordings:
-        with Recording.open(path) as recording:
-            skews[str(path)] = clock_skews(recording.exchanges())
+    with waiting("examining"):
+        found = calib.examine(recordings)
+        for path in recordings:
+            with Recording.open(path) as recording:
+                skews[str(path)] = clock_skews(recording.exchanges())
+    findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
-        clocks = {path: [asdict(one) | {"slope": one.slope} for one in found] for path, found in skews.items()}
+        clocks = {path: [asdict(one) | {"slope": one.slope} for one in some] for path, some in skews.items()}
         typer.echo(json.dumps({"findings": [asdict(f) for f in findings], "clock_skews": clocks}, indent=1))
         return
     if not findings:
@@ -157,10 +174,10 @@ def doctor(
         typer.echo(f"{finding.fault} (confidence {finding.confidence:.2f})")
         typer.echo(f"  evidence: {finding.evidence}")
         typer.echo(f"  remedy:   {finding.remedy}")
-    for name, found in skews.items():
-        if found:
+    for name, some in skews.items():
+        if some:
             typer.echo(f"clock skew in {name}, the second tag against the first")
-        for one in found:
+        for one in some:
             typer.echo(f"  {one}")
 
 
@@ -169,7 +186,7 @@ def compare(
     second: Annotated[Path, typer.Argument(help="Calibration whose differences are told (.json).")],
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
 ) -> None:
-    """Say whether two calibrations' delays differ by more than their standard errors explain (differences in ps)."""
+    """Say whether two calibrations' delays differ by more than their standard errors explain (differences in ns)."""
     import calib
 
     found = calib.compare(calib.load_calibration(first), calib.load_calibration(second))

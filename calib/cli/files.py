@@ -9,6 +9,7 @@ import typer
 
 from calib.cli.arguments import CalibrationFile, Force
 from uwblink.cli.guide import add, choice, epilog
+from uwblink.cli.waiting import waiting
 
 PANEL: Final = "Use"
 
@@ -56,7 +57,8 @@ def apply(
     """Write a recording again with its ranges corrected (range_m); all else stays as it was."""
     import calib
 
-    applied = calib.apply(recording, calib.load_calibration(calibration), output, to=to, force=force)
+    with waiting("correcting"):
+        applied = calib.apply(recording, calib.load_calibration(calibration), output, to=to, force=force)
     typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
     if applied.unpowered:
         typer.echo(

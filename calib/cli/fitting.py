@@ -31,6 +31,7 @@ from calib.cli.arguments import (
 )
 from calib.cli.flags import with_flags
 from uwblink.cli.guide import add, tags_of
+from uwblink.cli.waiting import waiting
 
 if TYPE_CHECKING:
     import calib
@@ -89,9 +90,10 @@ def fit(
         constants=constants,
     )
     check_output(output, force=force)
-    ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not delays_only)
     try:
-        result = calib.fit(ranges, **options)
+        with waiting("fitting"):
+            ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not delays_only)
+            result = calib.fit(ranges, **options)
     except calib.UnanswerableError as error:
         if as_json:
             typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
@@ -138,7 +140,8 @@ def add_tag(
     from uwblink.output import check_output
 
     check_output(output, force=force)
-    found = calib.add_tag(recording, calib.load_calibration(calibration), tag)
+    with waiting("fitting"):
+        found = calib.add_tag(recording, calib.load_calibration(calibration), tag)
     found.save(output, force=force)
     half = 1.96 * found.delays_std_ns[tag]
     typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")

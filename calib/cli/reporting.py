@@ -27,7 +27,7 @@ from calib.cli.arguments import (
     Sequential,
     TrimStatic,
 )
-from calib.cli.evaluating import PANEL
+from calib.cli.evaluating import PANEL, tell_seen
 from calib.cli.flags import with_flags
 from uwblink.cli.guide import add
 
@@ -114,6 +114,8 @@ def report(
         return
     for path in filter(None, (output, pdf, figures)):
         typer.echo(f"report: {path}")
+    if tests:  # without any, the report itself says that the training was judged
+        tell_seen(campaign.evaluation)
     findings = [f"{name}: {finding.fault}" for name, finding in campaign.findings]
     for warning in [*campaign.fit.warnings, *findings]:
         typer.echo(f"warning: {with_flags(warning)}", err=True)

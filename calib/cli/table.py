@@ -66,8 +66,8 @@ def remarks(evaluation: Evaluation) -> Iterator[str]:
     if planted:
         rms = (sum(d**2 for d in planted.delay_error_ns.values()) / len(planted.delay_error_ns)) ** 0.5
         yield (
-            f"from what was planted: delays {1e3 * rms:.1f} ps rms, bias curve {1e3 * planted.curve_rms_m:.1f} mm, "
-            f"whole correction {1e3 * planted.correction_rms_m:.1f} mm rms"
+            f"from what was planted: delays {rms:.4f} ns rms, bias curve {100 * planted.curve_rms_m:.2f} cm, "
+            f"whole correction {100 * planted.correction_rms_m:.2f} cm rms"
         )
 
 

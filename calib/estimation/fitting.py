@@ -331,6 +331,7 @@ def _provenance(
     return more | {
         "writer": f"uwbcal {uwblink.__version__}",
         "recordings": ranges.source.split(", "),
+        "recording_ids": [found for _, found in ranges.recordings],
         "exchanges": len(ranges),
         "inliers": int(np.count_nonzero(inliers)),
         "excluded": ranges.excluded,

@@ -22,7 +22,7 @@ WIDTH: Final = 12
 def localization_text(found: list[Localization], summary: Summary, settings: Settings) -> str:
     """Return the table that `calib localize` prints, a row a body, and what it rests on."""
     filters = list(summary.rmse_m)
-    first = max(34, *(len(one.source) + len(one.body) + 2 for one in found))
+    first = max(30, *(len(one.source) + len(one.body) + 2 for one in found))
     lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{NAMES[name]:>{WIDTH}s}" for name in filters)]
     for one in found:
         figures = "".join(f"{one.rmse_m[name].mean():{WIDTH}.3f}" for name in filters)

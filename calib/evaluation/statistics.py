@@ -94,11 +94,15 @@ class PlantedComparison:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Evaluation:
-    """The outcome for all ranges and for each pair, named "smaller-larger"."""
+    """The outcome for all ranges and for each pair, named "smaller-larger".
+
+    `seen` names the recordings among those judged that the calibration was fitted to: errors there are too small.
+    """
 
     overall: ErrorStatistics
     pairs: dict[str, ErrorStatistics]
     planted: PlantedComparison | None
+    seen: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Return a table of errors in cm, a row a pair."""
@@ -110,7 +114,8 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib evaluate --json` prints; `planted` only where a simulation planted something."""
-        document = {
+        document: dict[str, Any] = {
+            "seen_by_fit": list(self.seen),
             "overall": _plain(asdict(self.overall)),
             "pairs": {name: _plain(asdict(group)) for name, group in self.pairs.items()},
         }
@@ -145,7 +150,14 @@ def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluatio
         _group(ranges, applied, everything, inside),
         {name: _group(ranges, applied, rows, inside) for name, rows in pair_rows(ranges).items()},
         beside_planted(ranges, applied, calibration),
+        _seen(ranges, calibration),
     )
+
+
+def _seen(ranges: Ranges, calibration: Calibration) -> tuple[str, ...]:
+    """Return the names of the recordings that the calibration was fitted to; older calibrations do not say."""
+    known = calibration.provenance.get("recording_ids")
+    return tuple(name for name, found in ranges.recordings if isinstance(known, list) and found in known)
 
 
 def beside_planted(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> PlantedComparison | None:

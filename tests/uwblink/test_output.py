@@ -2,8 +2,8 @@
 
 import pytest
 
-from uwblink.errors import OutputError, RecordingError, RecordingExistsError
-from uwblink.output import write_bytes, write_text
+from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError
+from uwblink.output import check_apart, write_bytes, write_text
 
 
 def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
@@ -39,3 +39,12 @@ def test_what_was_there_stays_where_the_disk_is_full(tmp_path, monkeypatch):
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(RecordingError, match="does not exist"):
         write_text(tmp_path / "no" / "a", "x", force=False)
+
+
+def test_no_output_is_written_over_another_or_over_what_is_read(tmp_path):
+    a, b = tmp_path / "a", tmp_path / "b"
+    check_apart({"output": a, "pdf": b, "figures": None}, [tmp_path / "c"])
+    with pytest.raises(ArgumentError, match=r"`pdf`: .*a: is what `output` names already"):
+        check_apart({"output": a, "pdf": tmp_path / "x" / ".." / "a"})
+    with pytest.raises(ArgumentError, match=r"`output`: .*a: is what is read"):
+        check_apart({"output": a}, [b, a])

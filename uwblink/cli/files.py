@@ -10,6 +10,7 @@ import typer
 from uwblink.cli.guide import add, choice, epilog
 from uwblink.cli.imports import ImportGroup
 from uwblink.cli.shared import AsJson, Force, print_json
+from uwblink.cli.waiting import waiting
 
 PANEL: Final = "Recordings"
 
@@ -62,7 +63,7 @@ def show(
     """Print what a recording holds."""
     from uwblink import Recording
 
-    with Recording.open(recording) as opened:
+    with waiting("counting"), Recording.open(recording) as opened:
         summary = opened.show()
     if as_json:
         print_json(summary.to_dict())
@@ -89,7 +90,8 @@ def export(
     """Write a recording as files that others read: tables, or the trajectories of its bodies."""
     from uwblink.exporters import export_recording
 
-    written = export_recording(recording, output, to=to, force=force)
+    with waiting("exporting"):
+        written = export_recording(recording, output, to=to, force=force)
     for name, rows in written.items():
         typer.echo(f"{output / name}: {rows} rows")
 
@@ -113,7 +115,8 @@ def poses(
 
     files = _files(source)
     topics = _pairs("topic", topic) if topic else None
-    found = add_poses(recording, files, offset=offset, tags_from=tags, body=body, topics=topics)
+    with waiting("adding poses"):
+        found = add_poses(recording, files, offset=offset, tags_from=tags, body=body, topics=topics)
     typer.echo(
         f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
         f"{found.covered} of {found.exchanges} exchanges have a true distance"
@@ -162,10 +165,11 @@ def replay(
             count = play(opened, _announce, speed=speed, link_dir=link_dir)
             typer.echo(f"{count} pieces played")
             return
-        decoded = decode_again(opened)
-        summary = summarize(opened, decoded)
-        if output:
-            rewrite(opened, decoded, output, force=force)
+        with waiting("decoding"):
+            decoded = decode_again(opened)
+            summary = summarize(opened, decoded)
+            if output:
+                rewrite(opened, decoded, output, force=force)
     if as_json:
         print_json(summary)
         return

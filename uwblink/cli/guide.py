@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import wraps
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,9 @@ from rich.markup import escape
 COMMA: Final = ","
 """What separates names in one word."""
 
+WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot")
+"""Parameters of commands that name what is written; all other paths are read."""
+
 WIDEST: Final = 20
 """Letters that names may take in the column of an option's values, in a terminal of 80 columns."""
 
@@ -20,7 +24,27 @@ def add(
     app: typer.Typer, command: Callable[..., None], *examples: str, panel: str | None = None, name: str | None = None
 ) -> None:
     """Register a command in a panel of the list of commands, with examples below its own help."""
-    app.command(name, rich_help_panel=panel, epilog=epilog(*examples))(command)
+    app.command(name, rich_help_panel=panel, epilog=epilog(*examples))(apart(command))
+
+
+def apart(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that refuses, before it does anything, to write over its own outputs and inputs."""
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        from uwblink.output import check_apart
+
+        outputs = {name: given[name] for name in WRITTEN if isinstance(given.get(name), Path)}
+        others = (value for name, value in given.items() if name not in outputs)
+        check_apart(outputs, [path for value in others for path in _paths(value)])
+        command(**given)
+
+    return run
+
+
+def _paths(value: Any) -> list[Path]:
+    several = value if isinstance(value, list | tuple) else [value]
+    return [one for one in several if isinstance(one, Path)]
 
 
 def epilog(*examples: str) -> str | None:

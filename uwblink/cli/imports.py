@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from uwblink.cli.guide import epilog
+from uwblink.cli.guide import apart, epilog
 from uwblink.cli.shared import Force
+from uwblink.cli.waiting import waiting
 
 if TYPE_CHECKING:
     from uwblink.importers import Importer
-
-LONG_BYTES: Final = 50_000_000
-"""From here on an import takes a second and more."""
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")]
 
@@ -50,7 +47,7 @@ def _command(row: Importer) -> Any:
 
 def _made(name: str, text: str, function: Callable[..., None], example: str) -> Any:
     app = typer.Typer(add_completion=False)
-    app.command(name, help=escape(text), epilog=epilog(example))(function)
+    app.command(name, help=escape(text), epilog=epilog(example))(apart(function))
     return typer.main.get_command(app)
 
 
@@ -65,7 +62,8 @@ def guess(
 
     if output is not None:
         check_output(output, force=force)
-    found = guess_map(table)
+    with waiting("reading"):
+        found = guess_map(table)
     if output is None:
         typer.echo(found.text, nl=False)
         return
@@ -102,23 +100,16 @@ def _argument(row: Importer) -> Any:
     return Annotated[list[Path], typer.Argument(help=f"{what} Several are one table.")]
 
 
-def _say_if_long(sources: list[Path]) -> None:
-    """Tell whoever waits at a terminal what is being read, where that takes seconds."""
-    size = sum(path.stat().st_size for path in sources if path.is_file())
-    if size > LONG_BYTES and sys.stderr.isatty():
-        typer.echo(f"reading {size / 1e6:.0f} MB ...", err=True)
-
-
 def _import(row: Importer, source: Path | list[Path], output: Path, map_file: Path | None, *, force: bool) -> None:
     from uwblink.display import printable
     from uwblink.importers import read_source
     from uwblink.output import check_output
 
     check_output(output, force=force)
-    _say_if_long(source if isinstance(source, list) else [source])
-    contents = read_source(source, importer=row.name, map_file=map_file)
-    contents.save(output, force=force)
-    counts = contents.counts()
+    with waiting("importing"):
+        contents = read_source(source, importer=row.name, map_file=map_file)
+        contents.save(output, force=force)
+        counts = contents.counts()
     typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in counts.items())}")
     for note in contents.meta.get("notes", ()):
         typer.echo(f"  {printable(note)}")

@@ -10,6 +10,7 @@ import typer
 
 from uwblink.cli.guide import add
 from uwblink.cli.shared import interrupts
+from uwblink.cli.waiting import waiting
 from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
 
 PANEL: Final = "Scenarios"
@@ -106,7 +107,8 @@ def show(
     from uwblink.output import check_output
 
     check_output(output, force=force)
-    uwbsim.show(uwbsim.load(scenario, overrides or ()), output, force=force)
+    with waiting("drawing"):
+        uwbsim.show(uwbsim.load(scenario, overrides or ()), output, force=force)
     typer.echo(f"{output}")
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from uwblink.cli.guide import add
+from uwblink.cli.waiting import waiting
 from uwbsim.cli.arguments import AsJson, Force, progress
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def twin(
     page = output.with_suffix(".html")
     for path in (output, page):
         check_output(path, force=force)
-    found = uwbsim.twin(recording, calibration)
+    with waiting("fitting"):
+        found = uwbsim.twin(recording, calibration)
     files = found.files(output)
     for path in files:
         check_output(path, force=force)

@@ -11,10 +11,14 @@ import typer
 
 from uwblink.cli.guide import add, choice, several
 from uwblink.cli.shared import INTERRUPTED, interrupts
+from uwblink.cli.waiting import waiting
 from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
     import uwbsim
+
+WHOLE: Final = 116
+"""Columns of a terminal from which the table of protocols has room for all of its own."""
 
 PANEL: Final = "Protocols and studies"
 TIMING: Final = "Timing"
@@ -85,13 +89,19 @@ def _print_outcomes(found: uwbsim.Comparison) -> None:
 
     from uwbsim.pages import COLUMNS
 
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    cells = [[show(outcome) for show in COLUMNS.values()] for outcome in found.outcomes]
+    heads = [name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors") for name in COLUMNS]
+    narrow = console.width < WHOLE
+    if narrow:
+        # A narrow terminal has no room for all columns: then each protocol is one.
+        heads, *cells = ([name, *row] for name, row in zip(COLUMNS, zip(*cells, strict=True), strict=True))
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for k, name in enumerate(COLUMNS):
-        head = name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors")
-        table.add_column(head, justify="left" if k == 0 else "right", no_wrap=True)
-    for outcome in found.outcomes:
-        table.add_row(*(show(outcome) for show in COLUMNS.values()))
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    for k, head in enumerate(heads):
+        table.add_column(head, justify="left" if k == 0 else "right", no_wrap=k == 0 or not narrow)
+    for row in cells:
+        table.add_row(*row)
+    console.print(table)
 
 
 def predict(
@@ -175,7 +185,8 @@ def optimum(
     loaded = uwbsim.load(scenario, overrides or ())
     if output:
         check_folder(output, [optimum_file(row.name) for row in rows], force=force)
-    found = [uwbsim.optimum(loaded, row, overhead_us * 1e-6) for row in rows]
+    with waiting("searching"):
+        found = [uwbsim.optimum(loaded, row, overhead_us * 1e-6) for row in rows]
     if output:
         write_optima(found, output, force=force)
     if as_json:
@@ -185,7 +196,7 @@ def optimum(
     for one in found:
         typer.echo(
             f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} us{100 * one.rms_m:9.2f} cm{1e6 * one.duration_s:7.0f} us"
-            f"{1e3 * one.second_rms_m:11.3f} mm" + ("  (the edge of what boards take)" if one.on_edge else "")
+            f"{100 * one.second_rms_m:11.4f} cm" + ("  (the edge of what boards take)" if one.on_edge else "")
         )
 
 

@@ -122,11 +122,12 @@ def sentences(found: Preview) -> list[str]:
         f"(one after the other at most {found.fastest_hz:.0f}); "
         f"frames on the air {100 * found.air_share:.1f} % of the time",
     ]
+    lines.append(f"{'pair':>10s}{'exchanges':>11s}{'Hz':>7s}{'metres':>17s}{'dBm':>18s}  SS-TWR's bias (cm)")
     for pair in found.pairs:
         lines.append(
-            f"  {pair.initiator:3d} -> {pair.target:3d}  {pair.exchanges:6d} exchanges  {pair.rate_hz:6.3g} Hz  "
-            f"{pair.distance_m[0]:5.2f} to {pair.distance_m[1]:5.2f} m  {pair.power_dbm[0]:6.1f} to "
-            f"{pair.power_dbm[1]:6.1f} dBm  bias by skew in SS-TWR {100 * pair.ss_bias_m:+.1f} cm"
+            f"{pair.initiator:3d} -> {pair.target:3d}{pair.exchanges:11d}{pair.rate_hz:7.3g}"
+            f"{pair.distance_m[0]:8.2f} to {pair.distance_m[1]:5.2f}{pair.power_dbm[0]:8.1f} to "
+            f"{pair.power_dbm[1]:6.1f}{100 * pair.ss_bias_m:+20.1f}"
         )
         if pair.audible < 0.9:
             lines.append(

@@ -39,7 +39,7 @@ def test_five_percent_are_rejected_of_clean_data():
 def test_json_has_stages_and_figures_for_all_and_each_pair():
     r = ranges()
     document = evaluate(r, fit(r).calibration).to_dict()
-    assert set(document) == {"overall", "pairs"}
+    assert set(document) == {"seen_by_fit", "overall", "pairs"}
     for group in (document["overall"], *document["pairs"].values()):
         for stage in ("raw", "delays", "full"):
             assert {"n", "mean_m", "median_m", "std_m", "robust_std_m"} <= set(group[stage])
