@@ -41,6 +41,21 @@ static int uwb_measured(double power_dbm) { return power_dbm > UWB_FAINTEST_DBM 
 
 static double uwb_lift(double power_dbm) { return pow(10.0, (power_dbm - UWB_ALPHA_DBM) / 10.0); }
 
+/* The lifted power of an exchange, whose powers are made whole: one that was not measured is taken to be the other's.
+   Returns 0 where neither was measured. */
+static int uwb_lifted(double *fpp1_dbm, double *fpp2_dbm, double *lifted)
+{
+    if (!uwb_measured(*fpp1_dbm) && !uwb_measured(*fpp2_dbm))
+        return 0;
+    if (!uwb_measured(*fpp1_dbm))
+        *fpp1_dbm = *fpp2_dbm;
+    if (!uwb_measured(*fpp2_dbm))
+        *fpp2_dbm = *fpp1_dbm;
+    *lifted = UWB_LIFT_OF_MEAN ? uwb_lift((*fpp1_dbm + *fpp2_dbm) / 2.0)
+                               : (uwb_lift(*fpp1_dbm) + uwb_lift(*fpp2_dbm)) / 2.0;
+    return 1;
+}
+
 /* Correct a range in metres by the powers of both ends in dBm (0 or NaN: not measured). Returns 0; 1 where the power is
    beyond the fitted ones; 2 where no power was measured (only the delays are corrected, sigma is NaN); -1 for a tag
    that has no delay (nothing is written). sigma_m may be NULL. */
@@ -58,14 +73,8 @@ static int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, int ini
     *corrected_m = range_m + 0.5 * first + 0.5 * second;
     if (sigma_m)
         *sigma_m = NAN;
-    if (!uwb_measured(fpp1_dbm) && !uwb_measured(fpp2_dbm))
+    if (!uwb_lifted(&fpp1_dbm, &fpp2_dbm, &lifted))
         return 2;
-    if (!uwb_measured(fpp1_dbm))
-        fpp1_dbm = fpp2_dbm;
-    if (!uwb_measured(fpp2_dbm))
-        fpp2_dbm = fpp1_dbm;
-    lifted = UWB_LIFT_OF_MEAN ? uwb_lift((fpp1_dbm + fpp2_dbm) / 2.0)
-                              : (uwb_lift(fpp1_dbm) + uwb_lift(fpp2_dbm)) / 2.0;
     bias = UWB_AT_RECEPTIONS ? (UWB_BIAS(uwb_lift(fpp1_dbm)) + UWB_BIAS(uwb_lift(fpp2_dbm))) / 2.0 : UWB_BIAS(lifted);
     *corrected_m -= bias;
     if (sigma_m)
@@ -84,14 +93,8 @@ static int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, int targe
     double lifted, part = 0.0, noise, detour, away, square;
     int k = 0, pair = 0;
     *sigma_total_m = *mean_error_m = *tail_share = NAN;
-    if (!uwb_measured(fpp1_dbm) && !uwb_measured(fpp2_dbm))
+    if (!uwb_lifted(&fpp1_dbm, &fpp2_dbm, &lifted))
         return 2;
-    if (!uwb_measured(fpp1_dbm))
-        fpp1_dbm = fpp2_dbm;
-    if (!uwb_measured(fpp2_dbm))
-        fpp2_dbm = fpp1_dbm;
-    lifted = UWB_LIFT_OF_MEAN ? uwb_lift((fpp1_dbm + fpp2_dbm) / 2.0)
-                              : (uwb_lift(fpp1_dbm) + uwb_lift(fpp2_dbm)) / 2.0;
     while (k + 2 < UWB_ERROR_POWERS && lifted >= uwb_error_lifted[k + 1])
         k++;
     part = (lifted - uwb_error_lifted[k]) / (uwb_error_lifted[k + 1] - uwb_error_lifted[k]);
