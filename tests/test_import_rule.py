@@ -31,8 +31,8 @@ CONFINED = {
 # The rooms by floor, the ground first: a room imports only rooms of lower floors, so two on one floor never meet.
 FLOORS = {
     "uwblink": (
-        ("arrays", "display", "errors", "lazy", "toml"),
-        ("columns", "output", "plugins", "ticks"),
+        ("arrays", "display", "errors", "lazy", "text_files"),
+        ("columns", "output", "plugins", "ticks", "toml"),
         ("protocols",),
         ("twr",),
         ("wire",),

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from uwblink.text_files import read_text
+
 
 class TomlReader:
     """Reads one file and checks its values; raises `error`, whose text begins with the path and the key."""
@@ -15,21 +17,11 @@ class TomlReader:
     def __init__(self, path: Path, error: type[Exception], what: str = "file") -> None:
         """Read `path`, which holds a `what`."""
         self.path, self.error = path, error
-        self.text = self._text(what)
+        self.text = read_text(path, error, what)
         try:
             self.table: dict[str, Any] = tomllib.loads(self.text)
         except tomllib.TOMLDecodeError as problem:
             raise error(f"{path}: not valid TOML: {problem}") from problem
-
-    def _text(self, what: str) -> str:
-        if self.path.is_dir():
-            raise self.error(f"{self.path}: is a directory, expected a {what} (.toml)")
-        try:
-            return self.path.read_text(encoding="utf-8")
-        except FileNotFoundError as problem:
-            raise self.error(f"{self.path}: no such {what}") from problem
-        except (OSError, UnicodeDecodeError) as problem:
-            raise self.error(f"{self.path}: cannot be read as a {what} (.toml)") from problem
 
     def known(self, table: dict[str, Any], names: Iterable[str], prefix: str = "") -> None:
         """Raise for a key that is none of `names`."""

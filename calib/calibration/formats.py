@@ -17,6 +17,7 @@ from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.errors import BadInputError
 from uwblink.output import write_text
 from uwblink.recording.file import Recording
+from uwblink.text_files import read_text
 from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
 
 TX_SHARE: Final = 0.44
@@ -216,14 +217,13 @@ def read_miluv(path: Path) -> Calibration:
     Its bias curve is meant for each reception (`power_at="reception"`), ours for the mean of an exchange's lifted
     powers. What has no place here is kept, so that exporting gives it back.
     """
+    text = read_text(path, BadInputError, "calibration of MILUV (.json)")
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(text)
         delays = {int(tag): float(delay) for tag, delay in table["delays_ns"].items()}
         bias, sigma = (_curve(table[key]) for key in ("bias_spline_m", "std_spline_m"))
         speed = float(table.get("c_mps", SPEED_OF_LIGHT))
-    except FileNotFoundError as error:
-        raise BadInputError(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise BadInputError(f"{path}: not a MILUV calibration ({type(error).__name__}: {error})") from error
     rest = {key: value for key, value in table.items() if key not in ("delays_ns", "bias_spline_m", "std_spline_m")}
     order = list(table)

@@ -26,6 +26,7 @@ from uwblink.arrays import Bools, Floats
 from uwblink.display import as_text as table_text
 from uwblink.display import excerpt
 from uwblink.output import write_text
+from uwblink.text_files import read_text
 
 SCHEMA_VERSION: Final = 1
 GROUPED_VERSION: Final = 2
@@ -424,19 +425,9 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     >>> calib.load_calibration("nowhere.json")
     Traceback (most recent call last):
     ...
-    calib.errors.BadInputError: nowhere.json: no such calibration file
+    calib.errors.BadInputError: nowhere.json: no such calibration file (.json)
     """
-    source = Path(path)
-    try:
-        return Calibration.from_json(source.read_text(encoding="utf-8"), str(path))
-    except FileNotFoundError as error:
-        raise BadInputError(f"{path}: no such calibration file") from error
-    except IsADirectoryError as error:
-        raise BadInputError(f"{path}: is a directory, expected a calibration (.json)") from error
-    except UnicodeDecodeError as error:
-        raise BadInputError(f"{path}: not JSON (not UTF-8 text)") from error
-    except OSError as error:
-        raise BadInputError(f"{path}: cannot be read ({error.strerror})") from error
+    return Calibration.from_json(read_text(path, BadInputError, "calibration file (.json)"), str(path))
 
 
 def _rows_on_lines(text: str) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from uwblink.errors import ImportTableError
+from uwblink.text_files import read_text
 
 Vector = tuple[float, float, float]
 
@@ -48,10 +49,7 @@ def read_vectors(path: Path) -> dict[str, dict[int, Vector]]:
 
 
 def _lines(path: Path) -> list[tuple[int, int, str, str]]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ImportTableError(f"{path}: cannot be read as text ({error})") from error
+    text = read_text(path, ImportTableError)
     found = []
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):

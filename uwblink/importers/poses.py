@@ -19,6 +19,7 @@ from uwblink.errors import ImportTableError
 from uwblink.importers.pose_bags import Row, read_bag
 from uwblink.importers.pose_columns import LATEST_NS, NUMBERS, poses_of_lines, poses_of_table
 from uwblink.recording.schema import Poses
+from uwblink.text_files import read_text
 
 Reader = Callable[[Path, str | None], Iterable[Row]]
 
@@ -107,11 +108,8 @@ def _csv(path: Path, body: str | None) -> Iterable[Row]:
 def _tum(path: Path, body: str | None) -> Iterable[Row]:
     if body is None:
         raise ImportTableError(f"{path}: a TUM file does not say whose poses it holds; name it as `body`")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ImportTableError(f"{path}: cannot be read as text ({error})") from error
-    for number, line in enumerate(lines, start=1):
+    text = read_text(path, ImportTableError, "TUM file")
+    for number, line in enumerate(text.splitlines(), start=1):
         cells = line.split()
         if not cells or cells[0].startswith("#"):
             continue

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
+from uwblink.text_files import read_text
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
 
@@ -92,13 +92,13 @@ def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
     """
     tags = list(tags)
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = tomllib.loads(read_text(path, ScenarioError, "file of faults (.toml)"))
         faults = Faults.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise ScenarioError(f"{path}: {where}: {first['msg'][0].lower()}{first['msg'][1:]}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path}: cannot be read as a file of faults (.toml): {error}") from error
     for number, fault in enumerate(faults.faults):
         tag = getattr(fault, "tag", None)

@@ -13,6 +13,7 @@ from typing import Any, Final, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from uwblink.text_files import read_text
 from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
 from uwbsim.scenario.linked_files import fill_in
 from uwbsim.scenario.model import Scenario
@@ -75,20 +76,7 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
         return deepcopy(dict(source)), NO_FILE
     if isinstance(source, str) and "\n" in source:
         return _toml(source, NO_FILE), NO_FILE
-    return _parse(Path(source)), Path(source)
-
-
-def _parse(path: Path) -> dict[str, Any]:
-    if path.is_dir():
-        raise ScenarioError(f"{path}: is a directory, expected a scenario file (.toml)")
-    try:
-        return _toml(path.read_text(encoding="utf-8"), path)
-    except FileNotFoundError as error:
-        raise ScenarioError(f"{path}: no such scenario file") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: not a text file in UTF-8 (byte {error.start})") from error
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from error
+    return _toml(read_text(source, ScenarioError, "scenario file (.toml)"), Path(source)), Path(source)
 
 
 def _toml(text: str, path: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.text_files import read_text
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import load
@@ -140,15 +141,11 @@ def toml_value(value: Any) -> str:
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], str]:
+    text = read_text(path, ScenarioError, "file of a sweep (.toml)")
     try:
-        text = path.read_text(encoding="utf-8")
         return tomllib.loads(text), text
-    except FileNotFoundError as error:
-        raise ScenarioError(f"{path}: no such file") from error
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path}: not valid TOML: {error}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: cannot be read ({error})") from error
 
 
 def _known_keys(path: Path, head: Mapping[str, Any]) -> None:

@@ -10,13 +10,13 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from pydantic import ValidationError
 
 from uwblink.arrays import Floats
+from uwblink.text_files import read_text
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import Exchanges, delay_weights, raw_range
 from uwbsim.errors import ScenarioError
@@ -115,17 +115,7 @@ def _table(source: CalibrationSource, where: str) -> Mapping[str, Any]:
         return _parsed(str(source.to_json()), where)
     if not isinstance(source, str | os.PathLike):
         raise ScenarioError(f"calibration: found {source!r:.60}, expected a file (.json) or a calibration")
-    path = Path(source)
-    try:
-        return _parsed(path.read_text(encoding="utf-8"), where)
-    except FileNotFoundError as error:
-        raise ScenarioError(f"{where}: no such calibration file") from error
-    except IsADirectoryError as error:
-        raise ScenarioError(f"{where}: is a directory, expected a calibration (.json)") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{where}: not JSON (not UTF-8 text)") from error
-    except OSError as error:
-        raise ScenarioError(f"{where}: cannot be read ({error.strerror})") from error
+    return _parsed(read_text(source, ScenarioError, "calibration file (.json)"), where)
 
 
 def _parsed(text: str, where: str) -> Mapping[str, Any]:
