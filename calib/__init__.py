@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from calib.report.report import write_report
     from calib.samples import sample_flight
     from calib.sources import load_ranges
+    from calib.trajectories.fitting import fit_from_ranges
 
 __all__ = [
     "BadInputError",
@@ -46,6 +47,7 @@ __all__ = [
     "examine",
     "export",
     "fit",
+    "fit_from_ranges",
     "load_calibration",
     "load_ranges",
     "localize",
@@ -73,6 +75,7 @@ _HOMES: Final = {
     "examine": "calib.doctor.examine",
     "export": "calib.calibration.formats",
     "fit": "calib.estimation.fitting",
+    "fit_from_ranges": "calib.trajectories.fitting",
     "load_calibration": "calib.calibration.model",
     "load_ranges": "calib.sources",
     "localize": "calib.evaluation.localization",

@@ -23,7 +23,9 @@ CONFINED = {
     "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
     "pydantic": lambda path: path.startswith("uwbsim/"),
-    "threadpoolctl": lambda path: path in {"calib/estimation/fitting.py", "uwbsim/twins/fitting.py"},
+    "threadpoolctl": lambda path: (
+        path in {"calib/estimation/fitting.py", "calib/trajectories/fitting.py", "uwbsim/twins/fitting.py"}
+    ),
     "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/rosbag2.py"},
     "foxglove": lambda path: path == "uwblink/streaming/foxglove_server.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
@@ -57,7 +59,7 @@ FLOORS = {
         ("evaluation",),
         ("figures",),
         ("estimation",),
-        ("doctor",),
+        ("doctor", "trajectories"),
         ("report",),
         ("cli",),
     ),

@@ -16,6 +16,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print all figures as JSON,
 Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
 WEIGHTS: Final = "How errors count"
 MODEL: Final = "What is fitted"
+UNKNOWN: Final = "Without known distances (--truth ranges)"
 OWN_LOSSES: Final = ("mixture", "cauchy", "huber", "soft_l1", "l2")
 
 
@@ -118,5 +119,41 @@ MinimumNorm = Annotated[
         "--minimum-norm",
         rich_help_panel=MODEL,
         help="Where the pairs leave delays free, fit the smallest ones that agree with the data.",
+    ),
+]
+Truth = Annotated[
+    str,
+    typer.Option(
+        rich_help_panel=UNKNOWN,
+        help="recorded: from poses or a tape; ranges: not known, found together with the delays.",
+        **choice("recorded", "ranges"),
+    ),
+]
+PosesUntil = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS", rich_help_panel=UNKNOWN, help="How long positions of poses count (all along by default)."
+    ),
+]
+Attitudes = Annotated[
+    str | None,
+    typer.Option(
+        rich_help_panel=UNKNOWN,
+        help="Where attitudes come from: poses (the default), all along, or imu.",
+        **choice("poses", "imu", "none"),
+    ),
+]
+HeadingStd = Annotated[
+    float | None,
+    typer.Option(
+        metavar="DEGREES", rich_help_panel=UNKNOWN, help="What headings may be off by (3 by default; 0: nothing)."
+    ),
+]
+Anchors = Annotated[
+    str | None,
+    typer.Option(
+        rich_help_panel=UNKNOWN,
+        help="Places of bodies that stand still: given by the poses (the default), or sought.",
+        **choice("given", "sought"),
     ),
 ]

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from calib.cli.arguments import (
+    Anchors,
     AsJson,
+    Attitudes,
     CalibrationFile,
     Constants,
     DelaysFrom,
@@ -19,15 +21,18 @@ from calib.cli.arguments import (
     Fix,
     Force,
     GroupFile,
+    HeadingStd,
     Lift,
     Loss,
     MinimumNorm,
     NewCalibration,
+    PosesUntil,
     Recordings,
     ReferencePower,
     Scale,
     Sequential,
     TrimStatic,
+    Truth,
 )
 from calib.cli.flags import with_flags
 from uwblink.cli.guide import add, tags_of
@@ -48,6 +53,7 @@ def add_to(app: typer.Typer) -> None:
         "calib fit flight.uwb -o calibration.json",
         "calib fit monday.uwb tuesday.uwb -o both.json --fix 1=-0.36",
         "calib fit ranges.uwb -o delays.json --delays-only",
+        "calib fit flight.uwb -o found.json --truth ranges --poses-until 10",
         panel=PANEL,
     )
     add(app, add_tag, "calib add-tag new.uwb -c calibration.json --tag 7 -o seven.json", panel=PANEL, name="add-tag")
@@ -68,11 +74,17 @@ def fit(
     delays_only: DelaysOnly = False,
     delays_from: DelaysFrom = None,
     constants: Constants = "tag",
+    truth: Truth = "recorded",
+    poses_until: PosesUntil = None,
+    attitudes: Attitudes = None,
+    heading_std: HeadingStd = None,
+    anchors: Anchors = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
     """Fit the tags' antenna delays (ns) and the curves of bias and standard deviation over first-path power (m)."""
     import calib
+    from calib.cli.from_ranges import fitted_from_ranges, trajectory_options
     from calib.cli.options import fit_options
     from uwblink.output import check_output
 
@@ -89,11 +101,15 @@ def fit(
         delays_from=delays_from,
         constants=constants,
     )
+    unknown = trajectory_options(truth, poses_until, attitudes, heading_std, anchors)
     check_output(output, force=force)
     try:
-        with waiting("fitting"):
-            ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not delays_only)
-            result = calib.fit(ranges, **options)
+        if unknown is None:
+            with waiting("fitting"):
+                ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not delays_only)
+                result = calib.fit(ranges, **options)
+        else:
+            result = fitted_from_ranges(recordings, options, unknown, trim_static=trim_static)
     except calib.UnanswerableError as error:
         if as_json:
             typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
@@ -103,10 +119,10 @@ def fit(
         typer.echo(result.calibration.to_json(), nl=False)
         return
     found = result.calibration
-    typer.echo(f"{output}: {len(ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
+    typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
     for line in delay_lines(found):
         typer.echo(line)
-    for reason, count in ranges.excluded.items():
+    for reason, count in result.ranges.excluded.items():
         typer.echo(f"  left out: {count} exchanges, {reason}")
     for warning in result.warnings:
         typer.echo(f"warning: {with_flags(warning)}", err=True)

@@ -11,6 +11,8 @@ FLAGS: Final = {
     "groups": "--group",
     "scale_ns": "--scale",
     "reference_power_dbm": "--reference-power",
+    "poses_until_s": "--poses-until",
+    "heading_std_deg": "--heading-std",
     "velocity_std_mps": "--process-noise",
 }
 

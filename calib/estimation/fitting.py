@@ -141,7 +141,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             else:
                 found = replace(found, success=False)
         doubted = doubts(problem, found)
-        calibration = _calibration(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
+        calibration = calibration_of(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
         stds = std_taken_over(source, set(fixed) - set(pinned))
         calibration = replace(calibration, delays_std_ns=calibration.delays_std_ns | stds)
         # What errors are made of is known now, and of no use for the residuals.
@@ -222,7 +222,7 @@ def _beyond(reference: float | None, alpha_dbm: float, problem: Problem) -> list
     ]
 
 
-def _calibration(
+def calibration_of(
     problem: Problem,
     found: Solved,
     covariance: Floats,

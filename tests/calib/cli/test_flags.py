@@ -30,6 +30,8 @@ ONLY_FROM_PYTHON = {
     "section",
     "shares",
     "start_m",
+    "information",
+    "loosest",
 }
 
 

@@ -1,0 +1,1 @@
+"""Trajectories of moving bodies, found from ranges together with antenna delays and curves."""

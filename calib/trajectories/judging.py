@@ -1,0 +1,144 @@
+"""What the ranges say of delays and curve when trajectories are unknown too: intervals, and what stays open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from calib.estimation.gauge import stating
+from calib.estimation.intervals import blocks_of, intervals
+from calib.estimation.problem import Problem
+from calib.estimation.scores import inverse_of
+from calib.estimation.smoothing import unsure
+from calib.estimation.solver import Solved
+from calib.information import Unknown, Verdict, judge
+from calib.trajectories.arrow import Factored, normal_of
+from calib.trajectories.climbing import Climbed
+from calib.trajectories.likelihood import loss_of
+from uwblink.arrays import Floats
+
+PRIOR_NS: Final = 2.0
+"""Delays of boards of one kind differ by less: what a direction is known by where nothing else says anything."""
+
+GUESS_NS: Final = 0.2
+LOOSEST: Final = 0.5
+"""A direction of delays counts as determined if it is known to half of so much.
+
+Calibrated by simulation (docs/fit-from-ranges.md).
+"""
+
+LOOKED_AT: Final = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """A solution as a fit with known distances would have it, and the verdict on the delays of `problem.tags`.
+
+    `absorbed` says for the least known direction of delays how many times its variance grew because distances are not
+    known; `distance_std_m` (k,) are standard errors of some distances.
+    """
+
+    solved: Solved
+    verdict: Verdict | None
+    absorbed: float
+    distance_std_m: Floats
+
+    @property
+    def free_tags(self) -> list[int]:
+        """Return the tags whose delays are not determined."""
+        return [] if self.verdict is None else [int(tag) for tag in self.verdict.named("delay")]
+
+    def open_ends(self) -> list[str]:
+        """Return as a sentence what is not determined; none where everything is."""
+        if self.verdict is None or not self.free_tags:
+            return []
+        return [f"the ranges do not determine {'; '.join(str(self.verdict).splitlines())}"]
+
+
+def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judged:
+    """Return intervals and verdict of a solution whose delays are stated at the lifted power `reference`."""
+    _, local, border = climbed.rows.linear(climbed.state)
+    whole = Factored(normal_of(local, border, climbed.informed) + climbed.known.normal)
+    columns, size = climbed.columns.design, climbed.columns.border
+    schur = whole.schur + climbed.ridge
+    # What is left of a range's derivatives when trajectories, standing bodies and biases have taken what they can.
+    taken = np.zeros((size, columns))
+    taken[:columns] = np.eye(columns)
+    if size > columns:
+        taken[columns:] = -np.linalg.lstsq(schur[columns:, columns:], schur[columns:, :columns], rcond=1e-13)[0]
+    design = (border - local @ whole.reach) @ taken
+    held = (climbed.known.border - climbed.known.local @ whole.reach) @ taken
+    slope, _ = loss_of(climbed.mixture).slopes(climbed.rows.residuals(climbed.state))
+    scores = replace(climbed.mixture.scores, design=design, score=-slope)
+    precision = climbed.mixture.precision.copy()
+    precision[:columns, :columns] = climbed.ridge[:columns, :columns] + held.T @ held
+    pairs = len(problem.pairs.ends)
+    inverse = inverse_of(scores.information() + precision, pairs, 3)
+    stated = stating(problem, reference)
+    delays = problem.directions @ stated[: problem.rank]
+    blocks, seconds = blocks_of(problem.ranges.time_ns)
+    known = intervals(scores, inverse, precision, delays, problem.rank, blocks=blocks, seconds=seconds)
+    found = climbed.state.border[:columns]
+    shares = [_of_curve(climbed.ridge[:columns, :columns], curve) for _, curve in problem.curves()]
+    covariance = known.covariance / (1 - climbed.used) + unsure(inverse[:columns, :columns], found, shares)
+    solved = Solved(
+        parameters=stated @ found,
+        covariance=stated @ covariance @ stated.T,
+        residuals=climbed.rows.residuals(climbed.state) / np.sqrt(1 - climbed.used),
+        scale=float(np.sqrt(1 / np.median(climbed.informed))),
+        steps=climbed.steps,
+        success=climbed.settled,
+        scores=scores,
+        inverse=inverse,
+        delays=delays,
+        lasting=known.lasting,
+        mixture=climbed.mixture,
+    )
+    rank = problem.rank
+    if not rank:
+        return Judged(solved=solved, verdict=None, absorbed=1.0, distance_std_m=_spread(climbed, whole))
+    apart = problem.directions @ solved.covariance[:rank, :rank] @ problem.directions.T
+    with_truth = np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + climbed.ridge[:columns, :columns])
+    plain = np.linalg.pinv(_information(design, climbed.informed) + precision[:columns, :columns])
+    return Judged(
+        solved=solved,
+        verdict=_verdict(apart, problem),
+        absorbed=_absorbed(delays @ plain @ delays.T, delays @ with_truth @ delays.T),
+        distance_std_m=_spread(climbed, whole),
+    )
+
+
+def _verdict(covariance: Floats, problem: Problem) -> Verdict:
+    information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
+    information = (information + information.T) / 2
+    return judge(information, [Unknown("delay", str(tag), GUESS_NS) for tag in problem.tags], loosest=LOOSEST)
+
+
+def _information(design: Floats, informed: Floats) -> Floats:
+    return np.asarray((design * informed[:, None]).T @ design)
+
+
+def _absorbed(covariance: Floats, with_truth: Floats) -> float:
+    """Return the largest ratio of two covariances over all directions."""
+    values, vectors = np.linalg.eigh(with_truth)
+    kept = values > 1e-9 * values[-1]
+    root = vectors[:, kept] / np.sqrt(values[kept])
+    return float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
+
+
+def _spread(climbed: Climbed, whole: Factored) -> Floats:
+    """Return the standard errors of some distances, given delays and curve."""
+    _, rows, _ = climbed.rows.linear(climbed.state)
+    count = rows.shape[0]
+    some = np.unique(np.linspace(0, count - 1, LOOKED_AT).astype(np.int64))
+    few = np.asarray(rows[some].todense())
+    variance = np.einsum("kl,lk->k", few, whole.inverse_on(np.ascontiguousarray(few.T)))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _of_curve(prior: Floats, columns: slice) -> Floats:
+    found = np.zeros_like(prior)
+    found[columns, columns] = prior[columns, columns]
+    return found

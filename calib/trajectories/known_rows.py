@@ -1,0 +1,181 @@
+"""All that is known beside ranges, as rows that are linear in the unknowns: places, attitudes, forces, calm flight."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from calib.trajectories.arrow import Normal, normal_of
+from calib.trajectories.scene import Scene
+from calib.trajectories.splines import cubic, cubic_speed, straight
+from calib.trajectories.unknowns import Columns, State
+from uwblink.arrays import Floats, Ints
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+CALM_M_S2: Final = 5.0
+"""Accelerations that a body may have without surprise; it holds a trajectory where ranges fail for a while."""
+
+JERK_M_S3: Final = 8.0
+"""By how much accelerations change in a second, before the data say it better."""
+
+FAR_M: Final = 30.0
+"""Places are within so much of where they are thought to be at first; it holds what nothing else does."""
+
+BIAS_M_S2: Final = 0.4
+"""What an accelerometer's bias may be."""
+
+STANDS_M: Final = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Rows of one kind: columns (n, k) with values (n, k), columns of the border with values, aims (n,), and a std."""
+
+    column: Ints
+    value: Floats
+    border: Ints
+    border_value: Floats
+    aim: Floats
+    std: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class KnownRows:
+    """Rows `local @ x + border @ y - aim`, each over its standard error, and their normal equations."""
+
+    local: csr_array[Any]
+    border: Floats
+    aim: Floats
+    normal: Normal
+
+    def residuals(self, state: State) -> Floats:
+        """Return the residuals (k,) over their standard errors."""
+        return np.asarray(self.local @ state.local + self.border @ state.border - self.aim)
+
+
+def known_rows(scene: Scene, columns: Columns, start: State, jerk_m_s3: float = JERK_M_S3) -> KnownRows:
+    """Return what is known beside the ranges; `start` is where the bodies are thought to be."""
+    from scipy.sparse import csr_array
+
+    blocks = [block for block in _blocks(scene, columns, start, jerk_m_s3) if len(block.aim)]
+    parts: list[tuple[Ints, Ints, Floats]] = []
+    border, aims, begin = [], [], 0
+    for block in blocks:
+        count, rows = len(block.aim), np.arange(len(block.aim))
+        scale = 1 / block.std
+        width = block.column.shape[1]
+        parts.append((np.repeat(begin + rows, width), block.column.ravel(), (block.value * scale[:, None]).ravel()))
+        dense = np.zeros((count, columns.border))
+        np.add.at(dense, (rows[:, None], block.border), block.border_value * scale[:, None])
+        border.append(dense)
+        aims.append(block.aim * scale)
+        begin += count
+    row, column, value = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    local = csr_array((value, (row, column)), shape=(begin, columns.size))
+    dense = np.concatenate(border)
+    return KnownRows(local, dense, np.concatenate(aims), normal_of(local, dense, np.ones(begin)))
+
+
+def _blocks(scene: Scene, columns: Columns, start: State, jerk_m_s3: float) -> Iterator[Block]:
+    for body in range(len(scene.moving)):
+        for axis in range(3):
+            yield from _of_axis(scene, columns, start, body, axis)
+            yield smoothness(columns, body, axis, jerk_m_s3)
+        yield from _attitude(scene, columns, body)
+        yield from _forces(scene, columns, body)
+    for where in columns.stand:
+        yield _of_border(where, start.border[where], STANDS_M, columns)
+
+
+def _of_axis(scene: Scene, columns: Columns, start: State, body: int, axis: int) -> Iterator[Block]:
+    column = columns.place[:, body, axis]
+    three = np.column_stack([column[:-2], column[1:-1], column[2:]])
+    second = np.tile(np.array([1.0, -2.0, 1.0]) / columns.places.step_s**2, (len(three), 1))
+    calm = CALM_M_S2 if body not in _sensed(scene) else 10 * CALM_M_S2
+    yield _plain(three, second, np.zeros(len(three)), calm)
+    yield _plain(column[:, None], np.ones((len(column), 1)), start.local[column], FAR_M)
+    mine = scene.places.body == body
+    weights = cubic(columns.places, scene.places.time_s[mine])
+    yield _plain(column[weights.point], weights.share, scene.places.position_m[mine, axis], scene.places.std_m[mine])
+
+
+def smoothness(columns: Columns, body: int, axis: int, jerk_m_s3: float) -> Block:
+    """Return what holds the jerk of a body along an axis: third differences of its control points."""
+    """Return what holds the jerk of a body along an axis: third differences of its control points."""
+    column = columns.place[:, body, axis]
+    four = np.column_stack([column[k : len(column) - 3 + k] for k in range(4)])
+    third = np.tile(np.array([-1.0, 3.0, -3.0, 1.0]) / columns.places.step_s**3, (len(four), 1))
+    return _plain(four, third, np.zeros(len(four)), jerk_m_s3)
+
+
+def _attitude(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
+    known = scene.attitudes.get(scene.moving[body])
+    if known is None or known.exact:
+        return
+    for axis in range(3):
+        column = columns.turn[:, body, axis]
+        if np.isfinite(known.std_rad[axis]):
+            yield _plain(column[:, None], np.ones((len(column), 1)), np.zeros(len(column)), known.std_rad[axis])
+        step = known.wander_rad[axis] * np.sqrt(columns.turns.step_s)
+        pair = np.column_stack([column[:-1], column[1:]])
+        yield _plain(pair, np.tile([-1.0, 1.0], (len(pair), 1)), np.zeros(len(pair)), step)
+
+
+def _forces(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
+    """Mean accelerations are mean specific forces, turned, less the bias, and gravity: v2 - v1 = (R (f - b) + g) dt."""
+    sensed = scene.inertial.get(scene.moving[body])
+    if sensed is None:
+        return
+    late, early = (cubic_speed(columns.places, time) for time in (sensed.end_s, sensed.begin_s))
+    middle = straight(columns.turns, (sensed.begin_s + sensed.end_s) / 2)
+    lasts = (sensed.end_s - sensed.begin_s)[:, None]
+    share = np.concatenate([late.share, -early.share], axis=1) / lasts
+    points = np.concatenate([late.point, early.point], axis=1)
+    for axis in range(3):
+        column = [columns.place[points, body, axis]]
+        value = [share]
+        # A turn t of the attitude adds t x (R f) to the force.
+        for other, arm in _crossed(axis, sensed.force_m_s2):
+            column.append(columns.turn[middle.point, body, other])
+            value.append(-arm[:, None] * middle.share)
+        where = np.broadcast_to(columns.bias[body], (len(lasts), 3))
+        aim = sensed.force_m_s2[:, axis] - (GRAVITY[axis])
+        yield Block(
+            np.concatenate(column, axis=1),
+            np.concatenate(value, axis=1),
+            where,
+            sensed.turn[:, axis, :],
+            aim,
+            np.full(len(aim), sensed.std_m_s2),
+        )
+    yield _of_border(columns.bias[body], np.zeros(3), BIAS_M_S2, columns)
+
+
+GRAVITY: Final = (0.0, 0.0, 9.81)
+
+
+def _crossed(axis: int, vector: Floats) -> list[tuple[int, Floats]]:
+    """Return by which components of a turn t, times what, the component of t x v is made up."""
+    following, last = (axis + 1) % 3, (axis + 2) % 3
+    return [(following, vector[:, last]), (last, -vector[:, following])]
+
+
+def _sensed(scene: Scene) -> set[int]:
+    return {k for k, body in enumerate(scene.moving) if body in scene.inertial}
+
+
+def _plain(column: Ints, value: Floats, aim: Floats, std: float | Floats) -> Block:
+    nothing = np.zeros((len(aim), 0))
+    return Block(column, value, nothing.astype(np.int64), nothing, aim, np.broadcast_to(std, aim.shape))
+
+
+def _of_border(where: Ints, aim: Floats, std: float, columns: Columns) -> Block:
+    nothing = np.zeros((len(where), 0))
+    return Block(
+        nothing.astype(np.int64), nothing, where[:, None], np.ones((len(where), 1)), aim, np.full(len(where), std)
+    )

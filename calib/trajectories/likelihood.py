@@ -1,0 +1,47 @@
+"""What the errors of ranges are made of, for a search over trajectories: the mixture of `calib.estimation`, held."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
+from calib.estimation.problem import Problem
+from calib.estimation.reflections import Shape
+from calib.trajectories.range_losses import Reflecting
+from uwblink.arrays import Floats
+
+OUTLIERS_OVER_M: Final = 10.0
+
+
+def mixture_of(problem: Problem, error_m: Floats, start: Floats, ridge: Floats) -> PairMixture:
+    """Fit what errors (n,) of ranges against given distances are made of, with delays and curve from `start` (m,)."""
+    bins, pairs = problem.bins, problem.pairs
+    errors = Errors(
+        error=error_m,
+        design=problem.design,
+        place=pairs.number * CELLS + bins.number * CELLS // len(bins.count),
+        pairs=len(pairs.ends),
+        density=1 / OUTLIERS_OVER_M,
+    )
+    return fit_pair_mixture(errors, start, ridge)
+
+
+def loss_of(mixture: PairMixture) -> Reflecting:
+    """Return the mixture as a loss of residuals, with everything but the residuals as it was found."""
+    place = mixture.scores.place
+    if place is None:
+        raise ValueError("a mixture without places")
+    sigma = np.exp(mixture.of("pair_noise")[:, None] + mixture.of("cell_noise")).ravel()
+    share = 1 / (1 + np.exp(-mixture.of("pair_share")[:, None] - mixture.of("cell_share"))).ravel()
+    return Reflecting(
+        Shape(
+            sigma_m=sigma[place],
+            tail_share=share[place],
+            mean_m=np.exp(mixture.of("mean")[0] + mixture.of("pair_mean")).repeat(CELLS)[place],
+            least_m=float(np.exp(mixture.of("least")[0])),
+            outlier_share=float(1 / (1 + np.exp(-mixture.of("outliers")[0]))),
+            outlier_density=1 / OUTLIERS_OVER_M,
+        )
+    )

@@ -1,0 +1,56 @@
+"""`calib fit --truth ranges`, as one types it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.calib.trajectories.sines import flight
+from uwblink.recording.file import Recording
+
+BIN = Path(sys.executable).parent
+
+
+def fit(*words):
+    return subprocess.run([str(BIN / "calib"), "fit", *map(str, words)], capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("flight") / "f.uwb"
+    flown = flight(seconds=14.0)
+    with Recording.create(path, meta={}) as made:
+        made.append_tags(flown.tags)
+        made.append_poses(flown.poses)
+        made.append_exchanges(flown.exchanges)
+    return path
+
+
+def test_a_known_start_is_enough(recording, tmp_path):
+    done = fit(recording, "--truth", "ranges", "--poses-until", 6, "-o", tmp_path / "c.json")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(" delay ") == 6
+    written = json.loads((tmp_path / "c.json").read_text())
+    assert written["provenance"]["truth"] == "ranges"
+    with Recording.open(recording) as opened:
+        assert written["provenance"]["exchanges"] <= len(opened.exchanges())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--truth", "tape"), "--truth: found 'tape', allowed: recorded, ranges"),
+        (("--poses-until", "6"), "--poses-until: goes with a fit whose --truth is ranges"),
+        (("--truth", "ranges", "--loss", "huber"), "--loss: goes with known distances only"),
+        (("--truth", "ranges", "--trim-static"), "--trim-static: goes with known distances only"),
+        (("--truth", "ranges", "--anchors", "lost"), "--anchors: found 'lost', allowed: given, sought"),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(recording, tmp_path, words, said):
+    done = fit(recording, *words, "-o", tmp_path / "c.json")
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "c.json").exists()

@@ -1,0 +1,128 @@
+"""Flights for tests: bodies on sums of sines, ranges by plain geometry. Nothing here is shared with what is tested."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uwblink import Exchanges
+from uwblink.recording.schema import Poses, Tag
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
+
+DELAYS_NS = {1: -0.36, 2: 0.05, 3: 0.24, 4: -0.11, 5: -0.2, 6: 0.1}
+ARM = 0.24
+REPLY = 20_000_000
+PAIRS = np.array([(1, 3), (2, 5), (4, 6), (1, 4), (2, 6), (3, 5), (1, 5), (2, 3), (4, 5), (1, 6), (2, 4), (3, 6)])
+
+
+def place(body, t):
+    """Metres (n, 3) of body 0, 1 or 2 at seconds (n,): two sines an axis about a middle of its own."""
+    rng = np.random.default_rng(100 + body)
+    period, phase = rng.uniform(4.0, 11.0, (3, 2)), rng.uniform(0, 2 * np.pi, (3, 2))
+    middle = [2.2 * np.cos(2.1 * body), 2.2 * np.sin(2.1 * body), 1.2 + 0.2 * body]
+    size = np.array([0.8, 0.8, 0.5])
+    wave = np.sin(2 * np.pi * t[:, None, None] / period + phase).sum(axis=2)
+    return middle + 0.6 * size * wave
+
+
+def heading(body, t):
+    """Radians (n,)."""
+    return body + 1.2 * np.sin(2 * np.pi * t / (13.0 + 2 * body))
+
+
+def turn(angle, vector):
+    """Turn a vector (3,) about the vertical by angles (n,)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.column_stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], np.full_like(c, vector[2])])
+
+
+def arm(tag):
+    return np.array([ARM, -ARM, -0.05]) * (1 if tag % 2 else -1)
+
+
+@dataclass
+class Flight:
+    exchanges: Exchanges
+    poses: Poses
+    tags: list
+    distance_m: np.ndarray
+    planted: dict = field(default_factory=lambda: {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}})
+    imu: dict = field(default_factory=dict)
+
+
+def bias(lifted):
+    return 0.05 * np.sin(3 * lifted)
+
+
+def flight(seconds=24.0, rate=80, noise_m=0.04, reflected=0.08, seed=1, wander_deg=0.0, anchors=None, curve=bias):
+    """A flight whose poses have exact places and headings that are off by a sine of `wander_deg`.
+
+    `anchors` (k, 3) stand as tags 11 and on, with delays of their own, and range with each tag in turn.
+    """
+    rng = np.random.default_rng(seed)
+    n = int(seconds * rate)
+    t = 0.5 + np.arange(n) / rate
+    pair = PAIRS[np.arange(n) % len(PAIRS)].copy()
+    stand = {} if anchors is None else {11 + k: np.array(p, float) for k, p in enumerate(anchors)}
+    if stand:
+        rows = np.arange(n) % 3 > 0
+        pair[rows, 0] = 11 + np.arange(rows.sum()) % len(stand)
+        pair[rows, 1] = 1 + (np.arange(rows.sum()) * 5 // 3) % 6
+    delay = np.zeros(12 + len(stand))
+    for tag, value in DELAYS_NS.items():
+        delay[tag] = value
+    for k, tag in enumerate(stand):
+        delay[tag] = 0.1 * (-1) ** k
+
+    def antenna(ids):
+        found = np.zeros((n, 3))
+        for tag in np.unique(ids):
+            rows = ids == tag
+            body = (tag - 1) // 2
+            here = (
+                np.broadcast_to(stand[tag], (rows.sum(), 3))
+                if tag in stand
+                else (place(body, t[rows]) + turn(heading(body, t[rows]), arm(tag)))
+            )
+            found[rows] = here
+        return found
+
+    distance = np.linalg.norm(antenna(pair[:, 0]) - antenna(pair[:, 1]), axis=1)
+    fpp = -79 - 20 * np.log10(distance / 2) + rng.normal(0, 3, (2, n))
+    lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
+    error = curve(lifted) - curve(1.0) + noise_m * rng.normal(size=n)
+    error += np.where(rng.random(n) < reflected, rng.exponential(0.3, n), 0)
+    measured = distance + error - 0.5e-9 * SPEED_OF_LIGHT * (delay[pair[:, 0]] + delay[pair[:, 1]])
+    there_and_back = np.rint(2 * measured / SPEED_OF_LIGHT / TICK_S).astype(np.int64)
+    zero = np.zeros(n, np.int64)
+    stamps = {"tx1": zero, "rx1": zero, "tx2": zero + REPLY, "rx2": there_and_back + REPLY}
+    stamps |= {"tx3": zero + 2 * REPLY, "rx3": there_and_back + 2 * REPLY}
+    exchanges = Exchanges.from_arrays(
+        pair[:, 0],
+        pair[:, 1],
+        **stamps,
+        time_ns=np.rint(t * 1e9).astype(np.int64),
+        fpp1_dbm=fpp[0],
+        fpp2_dbm=fpp[1],
+    )
+    half = REPLY * TICK_S / 2
+    tags = [Tag(tag, f"robot{(tag - 1) // 2}", tuple(arm(tag))) for tag in DELAYS_NS]
+    tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in stand]
+    # Poses say where bodies are; ranges belong to the middle of their first two messages, which `half` is.
+    when = np.arange(0.0, seconds + 1.0, 0.02)
+    rows = []
+    for body in range(3):
+        off = np.radians(wander_deg) * np.sin(2 * np.pi * when / 17.0 + body)
+        yaw = heading(body, when - half) + off
+        upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
+        rows.append((np.full(len(when), f"robot{body}"), place(body, when - half), upright, when))
+    for tag, here in stand.items():
+        two = np.array([0.0, seconds])
+        rows.append((np.full(2, f"anchor{tag}"), np.tile(here, (2, 1)), np.tile([0, 0, 0, 1.0], (2, 1)), two))
+    poses = Poses.from_arrays(
+        np.rint(np.concatenate([r[3] for r in rows]) * 1e9).astype(np.int64),
+        np.concatenate([r[0] for r in rows]),
+        np.concatenate([r[1] for r in rows]),
+        np.concatenate([r[2] for r in rows]),
+    )
+    planted = {str(tag): float(delay[tag]) for tag in [*DELAYS_NS, *stand]}
+    return Flight(exchanges, poses, tags, distance, {"delays_ns": planted})

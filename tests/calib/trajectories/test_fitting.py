@@ -1,0 +1,71 @@
+"""Delays planted in flights whose distances nobody knows: sums of sines, seen by their ranges alone after a while."""
+
+import numpy as np
+import pytest
+
+import calib
+from tests.calib.trajectories.sines import DELAYS_NS, flight
+
+
+def errors_ns(result):
+    found = result.calibration
+    return np.array([found.delays_ns[tag] - delay for tag, delay in DELAYS_NS.items()])
+
+
+@pytest.fixture(scope="module")
+def flown():
+    return flight(wander_deg=3.0)
+
+
+@pytest.fixture(scope="module")
+def fitted(flown):
+    shares = []
+    result = calib.fit_from_ranges(flown, poses_until_s=8.0, progress=shares.append)
+    return result, shares
+
+
+def test_planted_delays_are_found_from_a_known_start(flown, fitted):
+    result, _ = fitted
+    std = np.array(list(result.calibration.delays_std_ns.values()))
+    assert result.success
+    # One flight of 24 s: a fit with all distances known leaves 18 ps.
+    assert np.abs(errors_ns(result) / std).max() < 3.5
+    assert 0.015 < std.max() < 0.06
+    rows = np.searchsorted(flown.exchanges.time_ns, result.ranges.time_ns)
+    away = result.ranges.truth_m - flown.distance_m[rows]
+    assert np.std(away) < 0.02
+    assert abs(np.mean(away)) < 0.01
+
+
+def test_what_a_fit_rests_on_is_said_and_progress_rises(fitted):
+    result, shares = fitted
+    known = result.calibration.provenance
+    assert known["truth"] == "ranges"
+    assert known["rests_on"]["known_s"] == pytest.approx(7.9, abs=0.11)
+    assert known["rests_on"]["moving"] == ["robot0", "robot1", "robot2"]
+    assert 0.005 < known["distance_std_m"] < 0.02
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_it_corrects_ranges_of_another_flight_as_any_calibration(fitted):
+    other = flight(seed=9)
+    truth = other.distance_m
+    applied = fitted[0].calibration.apply(calib.load_ranges(other))
+    # Reflected ranges aside, what is left of the bias is far below that of raw ones.
+    assert abs(np.median(applied.corrected_m - truth)) < 0.012
+    assert abs(np.median(applied.raw_m - truth)) > 0.012
+
+
+def test_nearly_exact_ranges_give_nearly_exact_delays():
+    result = calib.fit_from_ranges(flight(seconds=14.0, noise_m=0.0, reflected=0.0, wander_deg=0.0), poses_until_s=7.0)
+    # Stamps are whole ticks, 2.3 mm of range; control points every 0.4 s follow these sines to millimetres.
+    assert np.abs(errors_ns(result)).max() < 0.03
+
+
+def test_a_bad_parameter_is_named(flown):
+    wrong = {"attitudes": "guess", "anchors": "moved", "poses_until_s": -1.0, "heading_std_deg": np.nan}
+    for name, value in wrong.items():
+        with pytest.raises(calib.BadInputError) as raised:
+            calib.fit_from_ranges(flown, **{name: value})
+        assert raised.value.parameter == name
