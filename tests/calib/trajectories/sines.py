@@ -1,6 +1,7 @@
 """Flights for tests: bodies on sums of sines, ranges by plain geometry. Nothing here is shared with what is tested."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -43,10 +44,10 @@ def arm(tag):
 class Flight:
     exchanges: Exchanges
     poses: Poses
-    tags: list
+    tags: list[Tag]
     distance_m: np.ndarray
-    planted: dict = field(default_factory=lambda: {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}})
-    imu: dict = field(default_factory=dict)
+    planted: dict[str, Any] = field(default_factory=lambda: {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}})
+    imu: dict[str, Any] = field(default_factory=dict)
 
 
 def bias(lifted):
@@ -109,20 +110,20 @@ def flight(seconds=24.0, rate=80, noise_m=0.04, reflected=0.08, seed=1, wander_d
     tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in stand]
     # Poses say where bodies are; ranges belong to the middle of their first two messages, which `half` is.
     when = np.arange(0.0, seconds + 1.0, 0.02)
-    rows = []
+    poses_of: list[Any] = []
     for body in range(3):
         off = np.radians(wander_deg) * np.sin(2 * np.pi * when / 17.0 + body)
         yaw = heading(body, when - half) + off
         upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
-        rows.append((np.full(len(when), f"robot{body}"), place(body, when - half), upright, when))
+        poses_of.append((np.full(len(when), f"robot{body}"), place(body, when - half), upright, when))
     for tag, here in stand.items():
         two = np.array([0.0, seconds])
-        rows.append((np.full(2, f"anchor{tag}"), np.tile(here, (2, 1)), np.tile([0, 0, 0, 1.0], (2, 1)), two))
+        poses_of.append((np.full(2, f"anchor{tag}"), np.tile(here, (2, 1)), np.tile([0, 0, 0, 1.0], (2, 1)), two))
     poses = Poses.from_arrays(
-        np.rint(np.concatenate([r[3] for r in rows]) * 1e9).astype(np.int64),
-        np.concatenate([r[0] for r in rows]),
-        np.concatenate([r[1] for r in rows]),
-        np.concatenate([r[2] for r in rows]),
+        np.rint(np.concatenate([r[3] for r in poses_of]) * 1e9).astype(np.int64),
+        np.concatenate([r[0] for r in poses_of]),
+        np.concatenate([r[1] for r in poses_of]),
+        np.concatenate([r[2] for r in poses_of]),
     )
     planted = {str(tag): float(delay[tag]) for tag in [*DELAYS_NS, *stand]}
     return Flight(exchanges, poses, tags, distance, {"delays_ns": planted})

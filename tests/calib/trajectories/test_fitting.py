@@ -1,5 +1,7 @@
 """Delays planted in flights whose distances nobody knows: sums of sines, seen by their ranges alone after a while."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,7 @@ def flown():
 
 @pytest.fixture(scope="module")
 def fitted(flown):
-    shares = []
+    shares: list[float] = []
     result = calib.fit_from_ranges(flown, poses_until_s=8.0, progress=shares.append)
     return result, shares
 
@@ -64,7 +66,7 @@ def test_nearly_exact_ranges_give_nearly_exact_delays():
 
 
 def test_a_bad_parameter_is_named(flown):
-    wrong = {"attitudes": "guess", "anchors": "moved", "poses_until_s": -1.0, "heading_std_deg": np.nan}
+    wrong: dict[str, Any] = {"attitudes": "guess", "anchors": "moved", "poses_until_s": -1.0, "heading_std_deg": np.nan}
     for name, value in wrong.items():
         with pytest.raises(calib.BadInputError) as raised:
             calib.fit_from_ranges(flown, **{name: value})
