@@ -14,7 +14,7 @@ $(STAMP): pyproject.toml requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "uwbcal needs Python 3.11 or newer, and $(PYTHON) is $$($(PYTHON) --version 2>&1); try make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
@@ -98,9 +98,20 @@ fidelity: setup ## write docs/fidelity.md, simulated beside measured
 endurance: setup ## kill the recorder 50 times, and serve boards for 10 minutes
 	$(BIN)/python -m benchmarks.endurance
 
-lock: setup ## write the versions now in .venv to requirements-dev.lock
-	@{ echo "# Exact versions for development and CI; refresh with 'make lock'. Users install by the ranges in pyproject.toml."; \
-		$(BIN)/python -m pip freeze --disable-pip-version-check --exclude-editable; } > requirements-dev.lock
+LOCK = env UV_CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/uv pip compile pyproject.toml --quiet --group dev --all-extras \
+	--universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url --output-file requirements-dev.lock
+
+lock: setup ## add to requirements-dev.lock what pyproject.toml asks for now, with hashes; other versions stay
+	$(LOCK)
+
+upgrade: setup ## the same with the newest versions of everything
+	$(LOCK) --upgrade
+
+licences: setup ## write docs/licences.md: what licences everything in the lock has; fails for one that is incompatible
+	$(BIN)/python -m tests.licences
+
+installed: setup ## build wheel and sdist, install the wheel into an empty environment, run the README's commands there (3 minutes)
+	$(BIN)/python -m tests.installed
 
 clean: ## remove .venv, caches and the demo
 	rm -rf .venv .venv-lowest .venv-newest demo .mypy_cache .ruff_cache .pytest_cache .hypothesis docs/_build docs/generated

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from uwbsim.scenario.faults import load_faults
     from uwbsim.scenario.loading import load
     from uwbsim.scenario.model import Scenario
+    from uwbsim.scenario.shipped import shipped_scenarios
     from uwbsim.simulation.run import Simulated, simulate
     from uwbsim.simulation.through_wire import through_wire
     from uwbsim.sweep.design import load_design
@@ -49,6 +50,7 @@ __all__ = [
     "preview",
     "register_channel_effect",
     "run_sweep",
+    "shipped_scenarios",
     "show",
     "simulate",
     "through_wire",
@@ -76,6 +78,7 @@ _HOMES: Final = {
     "preview": "uwbsim.pages.scenario_summary",
     "register_channel_effect": "uwbsim.world.channel",
     "run_sweep": "uwbsim.sweep.runner",
+    "shipped_scenarios": "uwbsim.scenario.shipped",
     "show": "uwbsim.pages.scenario_page",
     "simulate": "uwbsim.simulation.run",
     "through_wire": "uwbsim.simulation.through_wire",

@@ -11,8 +11,19 @@ from typing import Annotated
 import typer
 
 from uwblink.cli import shared
+from uwblink.cli.guide import starting
 
-ScenarioFile = Annotated[Path, typer.Argument(help="Scenario file (.toml).")]
+
+def shipped(incomplete: str) -> list[str]:
+    """Return the scenarios that come along, for a shell; it completes files itself where nothing was typed yet."""
+    from uwbsim import shipped_scenarios
+
+    return starting(incomplete, shipped_scenarios()) if incomplete else []
+
+
+ScenarioFile = Annotated[
+    Path, typer.Argument(help="Scenario file (.toml), or the name of one that comes along.", autocompletion=shipped)
+]
 Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")]
 AsJson = shared.AsJson
 Force = shared.Force

@@ -1,4 +1,4 @@
-"""Commands on one scenario: run, serve, show, validate, schema."""
+"""Commands on one scenario: run, serve, show, validate, schema; and those that come along."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
+from rich.markup import escape
 
 from uwblink.cli.guide import add
-from uwblink.cli.shared import interrupts
+from uwblink.cli.shared import interrupts, print_json
 from uwblink.cli.waiting import waiting
-from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
+from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress, shipped
 
 PANEL: Final = "Scenarios"
 
@@ -19,9 +20,10 @@ PANEL: Final = "Scenarios"
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
     for command, *examples in (
+        (scenarios, "uwbsim scenarios", "uwbsim scenarios icra2023 -o scenarios"),
         (
             run,
-            "uwbsim run scenario.toml -o flight.uwb",
+            "uwbsim run icra2023/train -o train.uwb",
             "uwbsim run scenario.toml -o short.uwb --set run.duration_s=60",
         ),
         (serve, "uwbsim serve scenario.toml --link-dir ports --poses poses.csv"),
@@ -64,6 +66,35 @@ def run(
         f"{len(loaded.pairs())} pairs, {loaded.run.duration_s:g} s, "
         f"{len(simulated.faults)} failed"
     )
+
+
+def scenarios(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="Scenarios, or folders of them; else all.", autocompletion=shipped),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to copy them into.")] = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """List the scenarios that come along, or copy them to be changed."""
+    from uwbsim.scenario import copy_scenarios, listed
+
+    if output is not None:
+        for path in copy_scenarios(names or (), output, force=force):
+            typer.echo(path)
+        return
+    found = listed(names or ())
+    if as_json:
+        print_json(found)
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table.grid("name", "what it is", padding=(0, 2, 0, 0))
+    for row in found.items():
+        table.add_row(*map(escape, row))
+    Console(highlight=False).print(table)
 
 
 def serve(

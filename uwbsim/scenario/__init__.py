@@ -1,1 +1,23 @@
 """Scenarios: their models, and the way from a file to them."""
+
+from typing import TYPE_CHECKING, Final
+
+from uwblink.lazy import offer
+
+if TYPE_CHECKING:
+    from uwbsim.scenario.shipped import copy_scenarios, listed, shipped_scenarios
+
+__all__ = [
+    "copy_scenarios",
+    "listed",
+    "shipped_scenarios",
+]
+
+_HOMES: Final = {
+    "copy_scenarios": "uwbsim.scenario.shipped",
+    "listed": "uwbsim.scenario.shipped",
+    "shipped_scenarios": "uwbsim.scenario.shipped",
+}
+
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = offer(__name__, _HOMES)

@@ -17,6 +17,7 @@ from uwblink.text_files import read_text
 from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
 from uwbsim.scenario.linked_files import fill_in
 from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.shipped import found
 
 NO_FILE: Final = Path("scenario")
 """What messages name where a scenario has no file."""
@@ -30,6 +31,8 @@ Overrides = Sequence[str] | Mapping[str, Any]
 
 def load(source: Source, overrides: Overrides = (), seed: int | None = None) -> Scenario:
     """Read and validate a scenario from a file, from TOML text of more than one line, or from nested tables.
+
+    A name of `shipped_scenarios`, as icra2023/train, does for a file where there is none of that name.
 
     `overrides` change single values: a mapping of key paths to values, or words `key.path=value` with TOML values;
     `seed` replaces `run.seed`. Files that a scenario names lie beside its file, or in the working folder where it has
@@ -76,7 +79,8 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
         return deepcopy(dict(source)), NO_FILE
     if isinstance(source, str) and "\n" in source:
         return _toml(source, NO_FILE), NO_FILE
-    return _toml(read_text(source, ScenarioError, "scenario file (.toml)"), Path(source)), Path(source)
+    path = found(Path(source))
+    return _toml(read_text(path, ScenarioError, "scenario file (.toml) or name (see uwbsim scenarios)"), path), path
 
 
 def _toml(text: str, path: Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from uwblink.text_files import read_text
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import load
+from uwbsim.scenario.shipped import SUFFIX, shipped_scenarios
 
 KINDS: Final = ("compare", "calibrate")
 DESIGNS: Final = ("grid", "latin-hypercube", "list")
@@ -162,7 +163,8 @@ def _scenario(path: Path, head: Mapping[str, Any]) -> Path:
     name = head.get("scenario")
     if not isinstance(name, str):
         raise ScenarioError(f"{path}: sweep.scenario: missing, expected a scenario file, relative to this one")
-    return path.parent / name
+    beside = path.parent / name
+    return beside if beside.exists() else shipped_scenarios().get(name.removesuffix(SUFFIX), beside)
 
 
 def _word(path: Path, head: Mapping[str, Any], key: str, allowed: Sequence[str], default: str) -> str:

@@ -1,0 +1,80 @@
+"""What pip users meet: the wheel in an empty environment, and the README's commands there, without a checkout.
+
+`python -m tests.installed [FOLDER]` builds the wheel and installs it with its dependencies as pip chooses them.
+It prints what each step took, and how large the environment is.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Final
+
+from tests.builds import ROOT, built
+
+COMMANDS: Final = ("uwbsim", "uwblink", "calib")
+FIRST: Final = (
+    "uwbsim --version",
+    "uwbsim scenarios",
+    "uwbsim run icra2023/test1 -o short.uwb --set run.duration_s=5",
+    "uwblink show short.uwb",
+    "calib sample -o sample.uwb",
+    "calib fit sample.uwb -o sample.json",
+    "uwbsim schema",
+)
+"""What must go before anything is copied."""
+
+
+def readme_commands() -> list[str]:
+    """Return the commands of the README's plain blocks (`sh`), in order."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+    lines = [line.strip() for block in blocks for line in block.splitlines()]
+    return [line for line in lines if line.split(" ")[0] in COMMANDS]
+
+
+def timed(what: str, command: list[str], cwd: Path, path: str) -> None:
+    """Run a command, and print what it took; raises `SystemExit` with what it said where it fails."""
+    begun = time.monotonic()
+    # Nothing of a checkout may be found by way of the environment.
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    done = subprocess.run(command, cwd=cwd, env=clean | {"PATH": path}, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{what}: status {done.returncode}\n{done.stdout}{done.stderr}")
+    print(f"{time.monotonic() - begun:7.1f} s  {what}", flush=True)
+
+
+def size_mb(folder: Path) -> float:
+    """Return what the files below a folder take."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink()) / 1e6
+
+
+def main(folder: Path) -> int:
+    """Build, install, and run everything in a folder."""
+    wheel, _ = built(folder / "dist")
+    environment, work = folder / "env", folder / "work"
+    work.mkdir()
+    path = f"{environment / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    timed("an empty environment", [sys.executable, "-m", "venv", str(environment)], folder, path)
+    before = size_mb(environment)
+    python = str(environment / "bin" / "python")
+    timed("pip install of the wheel", [python, "-m", "pip", "install", "--quiet", str(wheel)], folder, path)
+    print(f"{size_mb(environment) - before:7.0f} MB in {environment.name} beyond pip itself")
+    for line in [*FIRST, "uwbsim scenarios -o scenarios", *readme_commands()]:
+        timed(line, shlex.split(line), work, path)
+    return 0
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        place = Path(sys.argv[1]).resolve()
+        place.mkdir(parents=True, exist_ok=True)
+        sys.exit(main(place))
+    with tempfile.TemporaryDirectory() as temporary:
+        sys.exit(main(Path(temporary)))

@@ -1,0 +1,165 @@
+"""The licences of everything that is installed: `python -m tests.licences` writes them into docs/licences.md.
+
+Names are those of requirements-dev.lock; licences are what the installed distributions say of themselves.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).parents[1]
+LOCK: Final = ROOT / "requirements-dev.lock"
+PAGE: Final = ROOT / "docs" / "licences.md"
+BEGIN, END = "<!-- licences:begin -->", "<!-- licences:end -->"
+
+PERMISSIVE: Final = frozenset(
+    {"0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSD", "CC0-1.0", "ISC", "MIT", "MIT-0", "MIT-CMU", "HPND"}
+    | {"any-OSI", "PSF-2.0", "Python-2.0", "Unlicense", "Zlib", "MPL-2.0"}
+)
+"""What may be installed beside a program under the MIT licence without a condition on that program."""
+
+LINKED: Final = frozenset({"LGPL-3.0", "LGPL-3.0-only", "LGPL-3.0-or-later"})
+"""What may be imported, unchanged and replaceable, by a program under another licence."""
+
+JUDGED: Final = {
+    "docutils": "its GPL is that of a mode for Emacs, which its wheel does not contain",
+}
+"""Distributions whose statement needs a look, and what the look found."""
+
+SPELT: Final = {
+    "mit license": "MIT",
+    "the mit license (mit)": "MIT",
+    "bsd license": "BSD",
+    "bsd 3-clause license": "BSD-3-Clause",
+    "bsd-3": "BSD-3-Clause",
+    "new bsd": "BSD-3-Clause",
+    "3-clause bsd": "BSD-3-Clause",
+    "apache software license": "Apache-2.0",
+    "apache license 2.0": "Apache-2.0",
+    "apache license, version 2.0": "Apache-2.0",
+    "apache 2.0": "Apache-2.0",
+    "apache": "Apache-2.0",
+    "isc license (iscl)": "ISC",
+    "isc license": "ISC",
+    "python software foundation license": "PSF-2.0",
+    "psf": "PSF-2.0",
+    "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
+    "gnu lesser general public license v3 (lgplv3)": "LGPL-3.0",
+    "gnu lesser general public license": "LGPL-3.0",
+    "lgplv3+": "LGPL-3.0-or-later",
+}
+"""Names that distributions gave licences before there was one spelling."""
+
+
+def names_of(lock: str) -> list[str]:
+    """Return the names in a lock, each once, in order."""
+    found = re.findall(r"^([A-Za-z0-9][A-Za-z0-9._-]*)==", lock, flags=re.MULTILINE)
+    return sorted({normal(name) for name in found})
+
+
+def normal(name: str) -> str:
+    """Return a distribution's name as all tools compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def licence_of(found: Distribution) -> str:
+    """Return the licence of a distribution as an SPDX expression, or what it says itself where that is none."""
+    told = found.metadata
+    if told["License-Expression"]:
+        return str(told["License-Expression"])
+    classified = [c.split(" :: ")[-1] for c in told.get_all("Classifier") or [] if c.startswith("License ::")]
+    words = [c for c in classified if c != "OSI Approved"] or [str(told["License"] or "").splitlines()[:1][0].strip()]
+    return " AND ".join(sorted({SPELT.get(word.lower(), word) for word in words}))
+
+
+def installed_with(names: list[str], extras: frozenset[str] = frozenset()) -> set[str]:
+    """Return the names of distributions that are installed with those of `names`, themselves included."""
+    waiting, known = [(normal(name), extras) for name in names], set()
+    while waiting:
+        name, wanted = waiting.pop()
+        if name in known:
+            continue
+        known.add(name)
+        try:
+            needs = distribution(name).requires or []
+        except PackageNotFoundError:
+            continue
+        waiting += [(normal(re.match(r"[\w.-]+", need)[0]), frozenset()) for need in needs if _counts(need, wanted)]
+    return known
+
+
+def _counts(need: str, wanted: frozenset[str]) -> bool:
+    """Return whether a requirement is not one of an extra that nobody asked for."""
+    extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)", need)
+    return extra is None or extra[1] in wanted
+
+
+def rows() -> list[tuple[str, str, str]]:
+    """Return name, licence and what it is for, of everything in the lock that is installed here."""
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        project = tomllib.load(file)["project"]
+    plain = installed_with([re.split(r"[><=\[]", row)[0] for row in project["dependencies"]])
+    extra = {
+        name: installed_with([re.split(r"[><=\[]", row)[0] for row in listed]) - plain
+        for name, listed in project["optional-dependencies"].items()
+    }
+    found = []
+    for name in names_of(LOCK.read_text(encoding="utf-8")):
+        try:
+            licence = licence_of(distribution(name))
+        except PackageNotFoundError:
+            licence = ELSEWHERE.get(name, "")
+        extras = [f"extra `{key}`" for key, members in extra.items() if name in members]
+        purpose = "always" if name in plain else ", ".join(extras) or "development"
+        found.append((name, licence, purpose))
+    return found
+
+
+ELSEWHERE: Final = {
+    "appnope": "BSD-2-Clause",
+    "cffi": "MIT-0",
+    "colorama": "BSD-3-Clause",
+    "pycparser": "BSD-3-Clause",
+}
+"""Licences of what is installed on other systems alone, as their projects state them."""
+
+
+def table(found: list[tuple[str, str, str]]) -> str:
+    """Return the rows as a table in Markdown."""
+    lines = ["| distribution | licence | installed |", "|---|---|---|"]
+    notes = {name: f" ({told})" for name, told in JUDGED.items()}
+    lines += [f"| {name} | {licence}{notes.get(name, '')} | {purpose} |" for name, licence, purpose in found]
+    return "\n".join(lines)
+
+
+def allowed(name: str, licence: str) -> bool:
+    """Return whether one of the alternatives of an expression, with all its parts, is compatible."""
+    if name in JUDGED:
+        return True
+    known = PERMISSIVE | LINKED
+    for alternative in re.split(r"\s+OR\s+", licence.replace("(", "").replace(")", "")):
+        parts = [re.sub(r"\s+WITH\s+.*", "", part) for part in re.split(r"\s+AND\s+", alternative)]
+        if all(part in known for part in parts):
+            return True
+    return False
+
+
+def main() -> int:
+    """Write the table into the page; says what may not stand there, and returns 1 then."""
+    found = rows()
+    text = PAGE.read_text(encoding="utf-8")
+    before, after = text[: text.index(BEGIN) + len(BEGIN)], text[text.index(END) :]
+    PAGE.write_text(f"{before}\n{table(found)}\n{after}", encoding="utf-8")
+    wrong = [row for row in found if not allowed(row[0], row[1])]
+    for name, licence, purpose in wrong:
+        sys.stderr.write(f"{name}: {licence or 'says no licence'} ({purpose})\n")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

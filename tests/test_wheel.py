@@ -1,0 +1,48 @@
+"""What pip users get: scenarios with the packages, the same bytes from every build, a tree that is complete."""
+
+import os
+import subprocess
+import tarfile
+import zipfile
+
+import pytest
+
+from tests.builds import ROOT, built
+from uwbsim import shipped_scenarios
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dist")
+    return built(folder)
+
+
+def test_the_wheel_has_the_scenarios_and_what_they_name(archives):
+    names = zipfile.ZipFile(archives[0]).namelist()
+    known = {f"uwbsim/scenarios/{name}.toml" for name in shipped_scenarios()}
+    assert len(known) > 15
+    assert known <= set(names)
+    assert "uwbsim/scenarios/antennas/monopole.csv" in names
+    tops = {name.split("/")[0] for name in names}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"uwbsim", "uwblink", "calib"}
+
+
+def test_the_sdist_has_what_make_demo_and_the_tests_need(archives):
+    with tarfile.open(archives[1]) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a checkout: nothing says what belongs to the tree")
+    tracked = {name for name in listed.stdout.splitlines() if not name.startswith((".github/", ".ci/"))}
+    assert sorted(tracked - names) == []
+
+
+def test_two_builds_are_the_same_bytes_wherever_the_tree_lies(archives, tmp_path):
+    with tarfile.open(archives[1]) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (tree,) = tmp_path.iterdir()
+    for path in tree.rglob("*.py"):  # another day, another hand
+        os.utime(path, (1, 1))
+    again = built(tmp_path / "dist", of=tree)
+    assert [path.name for path in again] == [path.name for path in archives]
+    assert [path.read_bytes() for path in again] == [path.read_bytes() for path in archives]

@@ -1,0 +1,70 @@
+"""Scenarios that come along, by name: found, listed, copied."""
+
+import doctest
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import uwbsim
+from uwbsim.scenario import copy_scenarios, listed, shipped, shipped_scenarios
+
+UWBSIM = Path(sys.executable).parent / "uwbsim"
+
+
+def test_the_examples_run():
+    assert doctest.testmod(shipped).failed == 0
+
+
+def test_every_one_is_told_of():
+    told = listed()
+    assert list(told) == list(shipped_scenarios()) == sorted(told)
+    assert all(4 < len(text) < 200 for text in told.values())
+
+
+def test_a_name_does_for_a_file_where_there_is_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    by_name = uwbsim.load("nlos_office/office")
+    assert by_name == uwbsim.load(shipped_scenarios()["nlos_office/office"])
+    assert uwbsim.load("noiseless.toml") == uwbsim.load("noiseless")
+    own = (shipped_scenarios()["noiseless"]).read_text().replace("seed = ", "seed = 7")
+    Path("noiseless.toml").write_text(own)
+    assert uwbsim.load("noiseless.toml").run.seed != uwbsim.load("noiseless").run.seed
+    with pytest.raises(uwbsim.ScenarioError, match=r"no such scenario file \(\.toml\) or name"):
+        uwbsim.load("icra2024/train")
+
+
+def test_a_sweep_may_name_one(tmp_path):
+    (tmp_path / "plan.toml").write_text(
+        "sweep = { scenario = 'noiseless', protocols = ['ds'], ranges = 10, seeds = 2 }\n"
+    )
+    assert uwbsim.load_design(tmp_path / "plan.toml").scenario == shipped_scenarios()["noiseless"]
+
+
+def test_copies_run_on_their_own(tmp_path):
+    written = copy_scenarios(["nlos_office"], tmp_path / "mine")
+    assert {path.relative_to(tmp_path).as_posix() for path in written} == {
+        "mine/nlos_office/office.toml",
+        "mine/antennas/monopole.csv",
+    }
+    assert uwbsim.load(written[0]) == uwbsim.load("nlos_office/office")
+    everything = copy_scenarios([], tmp_path / "all")
+    assert len(everything) == len(shipped_scenarios()) + 1
+    with pytest.raises(uwbsim.ScenarioError, match="nonsense: no such scenario; known are anchors"):
+        copy_scenarios(["icra2023", "nonsense"], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_command_copies_and_replaces_only_when_told(tmp_path):
+    def run(*words):
+        return subprocess.run([UWBSIM, "scenarios", *words], cwd=tmp_path, capture_output=True, text=True)
+
+    assert "icra2023/train" in run().stdout
+    assert run("icra2023", "-o", "s").stdout.splitlines() == [
+        f"s/icra2023/{n}.toml" for n in ("test1", "test2", "train")
+    ]
+    again = run("icra2023", "-o", "s")
+    assert again.returncode == 2
+    assert again.stderr == "error: s/icra2023/test1.toml: exists already; give another name, or --force to replace it\n"
+    assert run("icra2023", "-o", "s", "--force").returncode == 0
