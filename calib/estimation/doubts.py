@@ -50,15 +50,15 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
     ranges = problem.ranges
     blocks, seconds = blocks_of(ranges.time_ns)
     louder = _of_a_decibel(problem, found)
-    tested = families(problem, louder, seconds)
+    tested, kept = families(problem, louder, seconds), found.scores.design.kept
     judged = examine(
         found.scores,
         found.inverse,
         found.delays,
-        blocks,
+        kept(blocks),
         seconds,
         tested=list(tested),
-        shape_m=_of_another_shape(problem, found),
+        shape_m=kept(_of_another_shape(problem, found)),
     )
     covariance = plain + judged.widening_ns2
     matter, plain = [], covariance
@@ -145,7 +145,7 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
         return []
     if problem.design.shape[1] != found.scores.design.shape[1] or not np.ptp(problem.ranges.truth_m) > 0:
         return []
-    far = problem.ranges.truth_m - np.median(problem.ranges.truth_m)
+    far = found.scores.design.kept(problem.ranges.truth_m - np.median(problem.ranges.truth_m))
     link = found.scores.with_groups(far, np.zeros(len(far), dtype=np.int64), 1)[0]
     taken = link @ found.inverse
     known = float(found.scores.known() @ far**2 - taken @ link) / found.lasting.factor

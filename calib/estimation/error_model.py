@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.error_model import ErrorModel, PairErrors
-from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
+from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
 from calib.estimation.persistence import lasting_in_pairs
-from calib.estimation.problem import Problem
+from calib.estimation.problem import CELLS, Problem
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
@@ -53,7 +53,7 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
     if robust_spread(residual_m) < LEAST_SPREAD_M:
         return None
     pair, names = problem.pairs.number, [f"{low}-{high}" for low, high in problem.pairs.ends.tolist()]
-    cell, time_ns, centred = problem.bins.number * CELLS // len(problem.bins.count), problem.ranges.time_ns, residual_m
+    cell, time_ns, centred = problem.cell, problem.ranges.time_ns, residual_m
     location = 0.0
     if mixture is None:
         rows = _described(len(residual_m))
@@ -93,13 +93,7 @@ def _described(count: int) -> Ints | slice:
 
 def _about_their_centre(residual_m: Floats, pair: Ints, cell: Ints, pairs: int) -> PairMixture:
     """Fit a mixture to residuals (n,) of another loss, about a centre that is fitted along."""
-    errors = Errors(
-        error=residual_m,
-        design=np.ones((len(residual_m), 1)),
-        place=pair * CELLS + cell,
-        pairs=pairs,
-        density=1 / (float(np.ptp(residual_m)) + 1e-9),
-    )
+    errors = Errors.of(residual_m, np.ones((len(residual_m), 1)), pair * CELLS + cell, pairs)
     return fit_pair_mixture(errors, np.array([-float(np.median(residual_m))]), np.zeros((1, 1)))
 
 

@@ -36,7 +36,7 @@ from calib.estimation.pairs import pairs_of
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.result import FitResult
-from calib.estimation.solver import Solved, astray, solve
+from calib.estimation.solver import Solved, solve
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
 from calib.ranges import Ranges
@@ -134,7 +134,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         )
         reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
         found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)
-        if astray(problem, found):
+        if found.astray:
             if chosen is None:
                 loss = SEQUENTIAL_LOSS
                 found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)

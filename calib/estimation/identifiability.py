@@ -16,21 +16,20 @@ Clock ratios differ from 1 by parts per million, which lifts a free direction to
 """
 
 
-def identifiable_directions(
-    matrix: Floats, tags: list[int], initiator: Ints, target: Ints
-) -> tuple[Floats, list[list[int]]]:
-    """Return the directions that the rows of `matrix` (n, tags) determine, (tags, rank), and the tags left free.
+def identifiable_directions(square: Floats, tags: list[int], pairs: Ints) -> tuple[Floats, list[list[int]]]:
+    """Return the directions that ranges determine, (tags, rank), and the tags left free.
 
-    `initiator` and `target` (n,) are the ids of the rows. The free tags come in groups that shift together: tags that
-    range only with tags of another group (anchors against robots, a single pair) can shift by +a and -a without a
-    trace in any range. Where nothing is free, the directions are the tags themselves.
+    `square` (tags, tags) is that of the derivatives of ranges by the delays, `pairs` (pairs, 2) are the ids that range.
+    The free tags come in groups that shift together: tags that range only with tags of another group (anchors against
+    robots, a single pair) can shift by +a and -a without a trace in any range. Where nothing is free, the directions
+    are the tags themselves.
     """
-    values, vectors = np.linalg.eigh(matrix.T @ matrix)
+    values, vectors = np.linalg.eigh(square)
     loose = values < UNDETERMINED * values[-1]
     if not loose.any():
         return np.eye(len(tags)), []
     free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max() > 1e-3}
-    return np.asarray(vectors[:, ~loose]), _connected(free, set(zip(initiator.tolist(), target.tolist(), strict=True)))
+    return np.asarray(vectors[:, ~loose]), _connected(free, {(low, high) for low, high in pairs.tolist()})
 
 
 def require_determined(groups: list[list[int]]) -> None:

@@ -38,7 +38,7 @@ def intervals(
     """
     columns = scores.design.shape[1]
     reach = inverse[:columns]
-    pulls = scores.by_block(blocks, int(blocks[-1]) + 1) @ reach.T
+    pulls = scores.by_block(scores.design.kept(blocks), int(blocks[-1]) + 1) @ reach.T
     # What all delays share is the curve's constant: it would hide how long errors of single delays last.
     apart = delays - delays.mean(axis=0) if len(delays) > 1 else delays
     lasting = persistence(pulls @ apart.T, seconds, max(len(delays) - 1, 1))

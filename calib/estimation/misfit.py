@@ -111,19 +111,22 @@ class Tested:
 def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Family]:
     """Yield the alternatives: offsets of a pair, of a tag for a while or as its power changes, and those of arithmetic.
 
-    `louder_m` (n,) is what a decibel more would do to each range. Where no curve is fitted, errors of all tags may
+    Rows are in the order in which the problem's design keeps them; `louder_m` (n,), in the order of given ones, is what
+    a decibel more would do to each range. Where no curve is fitted, errors of all tags may
     change with power alike, which is no tag's fault. The last two are an error that grows with the distance, and one of
     the opposite sign with the other tag initiating, as a clock leaves it whose skew is not corrected.
     """
-    tags, truth_m, bins = problem.ranges.tags(), problem.ranges.truth_m, problem.bins
-    ends = places_of(tags, problem.ranges.initiator, problem.ranges.target)
+    kept, bins = problem.design.kept, problem.bins
+    tags, truth_m = problem.ranges.tags(), problem.ranges.truth_m
     # All alternatives are there at once: half the memory.
-    first, second = (place.astype(np.int32) for place in ends)
+    first, second = (
+        kept(place.astype(np.int32)) for place in places_of(tags, problem.ranges.initiator, problem.ranges.target)
+    )
     names, ones = [f"tag {tag}" for tag in tags], np.ones(len(first))
     named = [f"pair {low}-{high}" for low, high in problem.pairs.ends.tolist()]
-    yield Family(kind="pair", names=named, weight=ones, place=problem.pairs.number)
+    yield Family(kind="pair", names=named, weight=ones, place=kept(problem.pairs.number))
     count = segments(seconds)
-    when = (np.arange(len(first)) * count // len(first)).astype(np.int32)
+    when = kept((np.arange(len(first)) * count // len(first)).astype(np.int32))
     yield Family(
         kind="time",
         names=[name for name in names for _ in range(count)],
@@ -131,14 +134,14 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
         place=first * count + when,
         second=second * count + when,
     )
-    rank = np.linspace(-1, 1, len(bins.count))[bins.number]
+    rank = np.linspace(-1, 1, len(bins.count))[kept(bins.number)]
     if problem.unknowns.curve:
         yield Family(kind="power", names=names, weight=rank, place=first, second=second)
     size = float(np.sqrt(np.mean(louder_m**2)))
     if size > 0:
-        yield Family(kind="decibels", names=names, weight=louder_m / size, place=first, second=second)
+        yield Family(kind="decibels", names=names, weight=kept(louder_m) / size, place=first, second=second)
     yield Family(kind="skew", names=names, weight=ones, place=first, second=second, signed=True)
-    far = (truth_m - np.median(truth_m)) / max(float(np.ptp(truth_m)), 1e-9)
+    far = kept(truth_m - np.median(truth_m)) / max(float(np.ptp(truth_m)), 1e-9)
     if np.ptp(truth_m) > 0:
         yield Family(kind="scale", names=["all tags"], weight=far, place=np.zeros(len(far), dtype=np.int32))
 
@@ -161,10 +164,10 @@ def examine(
     """Hold a fit against alternatives.
 
     `inverse` (D, D) is that of information and penalty, `delays` (tags, m) turns the parameters of the design into
-    delays in ns, `blocks` (n,) number short blocks of time. `shape_m` (n,) is by how much ranges would be off, were the
+    delays in ns, `blocks` (n,) number short blocks of time; rows are in the order in which the design keeps them. `shape_m` (n,) is by how much ranges would be off, were the
     shape that the fit takes for the tail of reflections another one.
     """
-    count = int(blocks[-1]) + 1
+    count = int(blocks.max()) + 1
     own = scores.by_block(blocks, count)
     found, several, results = [], sum(len(family.names) for family in tested), {}
     nowhere = np.zeros(len(shape_m), dtype=np.int64)

@@ -13,7 +13,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.arguments import check_choice, check_tag
 from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.losses import LOSSES
-from calib.estimation.robust import robust_fit
+from calib.estimation.robust import robust_fit, sandwich
 from calib.sources import Data, load_ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -66,10 +66,11 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     delay = float(
         found.parameters[0] - fit_error_mixture(core, bins.number, len(bins.count)).location_m / np.mean(mine)
     )
+    covariance = sandwich(mine[:, None], found.residuals, LOSSES[loss], found.scale)
     added = {"tag": tag, "recording": ranges.source, "exchanges": int(np.count_nonzero(useful))}
     return replace(
         calibration,
         delays_ns=calibration.delays_ns | {tag: delay},
-        delays_std_ns=calibration.delays_std_ns | {tag: float(np.sqrt(found.covariance[0, 0]))},
+        delays_std_ns=calibration.delays_std_ns | {tag: float(np.sqrt(covariance[0, 0]))},
         provenance=calibration.provenance | {"added": [*calibration.provenance.get("added", []), added]},
     )

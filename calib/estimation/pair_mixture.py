@@ -15,18 +15,12 @@ from typing import Final
 
 import numpy as np
 
+from calib.estimation.design import Design, as_design
+from calib.estimation.problem import CELLS
 from calib.estimation.reflections import Shape, expected
-from calib.estimation.scores import Scores, Sort, Sums, inverse_of
+from calib.estimation.scores import Scores, Sort, Summing, Sums, inverse_of
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
-
-CELLS: Final = 8
-"""Steps of power in which share and noise may differ."""
-
-ROWS_AT_ONCE: Final = 8192
-"""Rows whose slopes are taken together, so that what leads to them stays in the cache."""
-
-ROWS_A_PLACE: Final = 16
 
 SLOPES: Final = ("noise", "share", "mean", "least", "outliers")
 """What a range has slopes by beside those of the design, in their order."""
@@ -107,22 +101,44 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Errors:
-    """What is fitted: `error + design @ x` (n,) metres, and the place of each range (n,): step of power within pair."""
+    """What is fitted: `error + design @ x` (n,) metres, in the order in which the design keeps rows.
+
+    `place` (blocks,) is that of the design's blocks: step of power within pair. Outliers have the `density`.
+    """
 
     error: Floats
-    design: Floats
+    design: Design
     place: Ints
     pairs: int
     density: float
 
-    @property
-    def pair(self) -> Ints:
-        """Return the pair of each range (n,)."""
-        return self.place // CELLS
+    @classmethod
+    def of(cls, error: Floats, matrix: Design | Floats, place: Ints, pairs: int) -> Errors:
+        """Return errors (n,) whose places (n,) are known, in the order in which they are given."""
+        design = as_design(matrix).blocked(place)
+        density = 1 / (float(np.ptp(error)) + 1e-9)
+        return cls(
+            error=design.kept(error),
+            design=design,
+            place=design.first_of(design.kept(place)),
+            pairs=pairs,
+            density=density,
+        )
 
-    def sample(self, rows: Ints | slice) -> Errors:
-        """Return some rows."""
-        return replace(self, error=self.error[rows], design=self.design[rows], place=self.place[rows])
+    def sample(self, rows: Ints) -> Errors:
+        """Return some rows, by their numbers as they were given."""
+        keep = self.design.chosen(rows)
+        design = self.design.sample(rows)
+        place = np.repeat(self.place, self.design.counts)[keep]
+        return replace(self, error=self.error[keep], design=design, place=design.first_of(place))
+
+    def parts(self, group: Ints, count: int, values: Floats) -> list[Floats]:
+        """Return values (n,) apart by groups of blocks, of which `group` (blocks,) are the numbers."""
+        found: list[list[Floats]] = [[values[:0]] for _ in range(count)]
+        bounds = self.design.starts.tolist()
+        for k, number in enumerate(group.tolist()):
+            found[number].append(values[bounds[k] : bounds[k + 1]])
+        return [np.concatenate(some) for some in found]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,8 +187,8 @@ class PairMixture:
         return self.parameters[self.layout.slices()[sort]]
 
     def slope(self, name: str) -> Floats:
-        """Return every range's slope by its own parameter of a kind of `SLOPES` (n,)."""
-        return self.scores.slopes[SLOPES.index(name)]
+        """Return every range's slope by its own parameter of a kind of `SLOPES` (n,), in the order of given rows."""
+        return self.scores.design.given(self.scores.slopes[SLOPES.index(name)])
 
     @property
     def tail_share(self) -> Floats:
@@ -229,17 +245,17 @@ def _levels(errors: Errors) -> Iterator[Errors]:
 def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats, lasting: float) -> tuple[Floats, Prior]:
     """Return first parameters, from robust spreads of the residuals, and what is known beforehand."""
     where = layout.slices()
-    residual = errors.error + errors.design @ start
+    residual = errors.error + errors.design.times(start)
     spread = _spread(residual)
     theta = np.zeros(where["pair_mean"].stop)
     theta[where["design"]] = start
     theta[where["mean"]] = np.log(4 * spread)
     theta[where["least"]] = np.log(0.5 * spread)
     theta[where["outliers"]] = OUTLIERS
-    cells = _parts(residual, errors.place % CELLS, layout.cells)
+    cells = errors.parts(errors.place % layout.cells, layout.cells, residual)
     theta[where["cell_noise"]] = np.log([0.9 * _spread(part) for part in cells])
     noise, odds = [], []
-    for part in _parts(residual, errors.pair, layout.pairs):
+    for part in errors.parts(errors.place // layout.cells, layout.pairs, residual):
         noise.append(_spread(part, spread))
         beyond = np.mean(part > 2.5 * noise[-1]) - np.mean(part < -2.5 * noise[-1]) if len(part) else 0.1
         odds.append(np.clip(1.6 * beyond, 0.01, 0.6))
@@ -258,11 +274,6 @@ def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats, lasting
         layout,
         None,
     )
-
-
-def _parts(values: Floats, place: Ints, count: int) -> list[Floats]:
-    order = np.argsort(place, kind="stable")
-    return np.split(values[order], np.searchsorted(place[order], np.arange(1, count)))
 
 
 def _spread(values: Floats, otherwise: float = 1e-3) -> float:
@@ -342,67 +353,73 @@ def _length(before: float, kept: float) -> float:
 
 def _sums(errors: Errors, layout: Layout, theta: Floats, *, squares: bool) -> tuple[Sums, float]:
     """Return the sums of all slopes at parameters, with those of `squares`, and the log likelihood."""
-    first, *others = _pieces(errors)
-    scores, log_density = _scores(errors.sample(first), layout, theta)
-    sums, likelihood = scores.sums(squares=squares), float(log_density.sum())
-    for rows in others:
-        scores, log_density = _scores(errors.sample(rows), layout, theta)
-        sums += scores.sums(squares=squares)
-        likelihood += float(log_density.sum())
-    return sums, likelihood
+    summing, likelihood = Summing(errors.design, len(SLOPES), squares=squares), 0.0
+    for blocks, rows, piece in _pieces(errors, layout, theta):
+        summing.add(blocks, rows, piece.score, piece.slopes)
+        likelihood += float(piece.log_density.sum())
+    return summing.sums(errors.place, layout.pairs * layout.cells, _sorts(layout)), likelihood
 
 
-def _pieces(errors: Errors) -> list[slice]:
-    """Return rows that are worked on together: few enough for the cache, but many more than their sums."""
-    size = max(ROWS_AT_ONCE, ROWS_A_PLACE * errors.pairs * CELLS)
-    return [slice(begin, begin + size) for begin in range(0, len(errors.error), size)]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Piece:
+    """The slopes of some ranges (n,), by the residual and in the order of `SLOPES`, and their log densities."""
+
+    score: Floats
+    slopes: tuple[Floats, ...]
+    log_density: Floats
+
+
+def _pieces(errors: Errors, layout: Layout, theta: Floats) -> Iterator[tuple[slice, slice, _Piece]]:
+    """Yield blocks, rows and slopes at parameters, for as many rows at once as the cache holds."""
+    part = {name: theta[rows] for name, rows in layout.slices().items()}
+    sigma = np.exp(part["pair_noise"][:, None] + part["cell_noise"]).ravel()[errors.place]
+    share = 1 / (1 + np.exp(-part["pair_share"][:, None] - part["cell_share"])).ravel()[errors.place]
+    mean = np.exp(part["mean"][0] + part["pair_mean"])[errors.place // layout.cells]
+    design, counts = errors.design, errors.design.counts
+    for blocks, rows in design.pieces:
+        shape = Shape(
+            sigma_m=np.repeat(sigma[blocks], counts[blocks]),
+            tail_share=np.repeat(share[blocks], counts[blocks]),
+            mean_m=np.repeat(mean[blocks], counts[blocks]),
+            least_m=float(np.exp(part["least"][0])),
+            outlier_share=float(1 / (1 + np.exp(-part["outliers"][0]))),
+            outlier_density=errors.density,
+        )
+        yield blocks, rows, _slopes(errors.error[rows] + design.piece_times(part["design"], blocks, rows), shape)
+
+
+def _slopes(residual: Floats, shape: Shape) -> _Piece:
+    """Return the slopes of the log likelihood at residuals (n,)."""
+    found = expected(residual, shape)
+    z, noise = residual / shape.sigma_m, found.noise_m / shape.sigma_m
+    core, tail = found.core, found.tail
+    both, tail_noise = core + tail, tail * noise
+    return _Piece(
+        score=-(core * z + tail_noise) / shape.sigma_m,
+        slopes=(
+            core * (z * z - 1) + tail * (noise * noise + found.noise_var - 1),
+            tail - shape.tail_share * both,
+            tail * ((residual - shape.least_m - found.noise_m) / shape.mean_m - 1),
+            tail_noise * (shape.least_m / shape.sigma_m),
+            (1 - shape.outlier_share) - both,
+        ),
+        log_density=found.log_density,
+    )
 
 
 def _all_scores(errors: Errors, layout: Layout, theta: Floats) -> Scores:
     """Return the slopes of all ranges at parameters."""
-    parts = [_scores(errors.sample(rows), layout, theta)[0] for rows in _pieces(errors)]
-    return replace(
-        parts[0],
+    found = np.empty((1 + len(SLOPES), len(errors.error)))
+    for _, rows, piece in _pieces(errors, layout, theta):
+        found[0, rows], found[1:, rows] = piece.score, piece.slopes
+    return Scores(
         design=errors.design,
-        score=np.concatenate([part.score for part in parts]),
-        slopes=tuple(np.concatenate(column) for column in zip(*(part.slopes for part in parts), strict=True)),
-        place=errors.place,
-    )
-
-
-def _scores(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, Floats]:
-    """Return the slopes of the log likelihood at parameters, and its value for every range (n,)."""
-    part = {name: theta[rows] for name, rows in layout.slices().items()}
-    residual = errors.error + errors.design @ part["design"]
-    sigma = np.exp(part["pair_noise"][:, None] + part["cell_noise"]).ravel()
-    share = 1 / (1 + np.exp(-part["pair_share"][:, None] - part["cell_share"])).ravel()
-    shape = Shape(
-        sigma_m=sigma[errors.place],
-        tail_share=share[errors.place],
-        mean_m=np.exp(part["mean"][0] + part["pair_mean"]).repeat(layout.cells)[errors.place],
-        least_m=float(np.exp(part["least"][0])),
-        outlier_share=float(1 / (1 + np.exp(-part["outliers"][0]))),
-        outlier_density=errors.density,
-    )
-    found = expected(residual, shape)
-    z, noise = residual / shape.sigma_m, found.noise_m / shape.sigma_m
-    score = -(found.core * z + found.tail * noise) / shape.sigma_m
-    slopes = (
-        found.core * (z * z - 1) + found.tail * (noise * noise + found.noise_var - 1),
-        found.tail - shape.tail_share * (found.core + found.tail),
-        found.tail * ((residual - shape.least_m - found.noise_m) / shape.mean_m - 1),
-        found.tail * noise * (shape.least_m / shape.sigma_m),
-        1 - found.core - found.tail - shape.outlier_share,
-    )
-    scores = Scores(
-        design=errors.design,
-        score=score,
-        slopes=slopes,
+        score=found[0],
+        slopes=tuple(found[1:]),
         place=errors.place,
         places=layout.pairs * layout.cells,
         sorts=_sorts(layout),
     )
-    return scores, found.log_density
 
 
 def _sorts(layout: Layout) -> tuple[Sort, ...]:

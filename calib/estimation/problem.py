@@ -8,20 +8,20 @@ from typing import Final
 
 import numpy as np
 
+from calib.calibration.bsplines import nonzero
 from calib.calibration.power_curves import (
     DEGREE,
     SIGMA_BINS,
     Bins,
-    basis,
     curvature,
     equal_bins,
     lifted_power,
     populated,
 )
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimation.design import Design, stable_order
 from calib.estimation.identifiability import identifiable_directions, require_determined
 from calib.estimation.pairs import Pairs, pairs_of
-from calib.estimation.robust import design
 from calib.estimation.unknowns import Unknowns
 from calib.ranges import Ranges
 from uwblink.arrays import Bools, Floats, Ints
@@ -38,7 +38,10 @@ SEGMENTS: Final = (10, 28)
 SAME_POWER: Final = 1e-6
 """Lifted powers that differ by no more are one."""
 
-ROWS_AT_ONCE: Final = 4096
+CELLS: Final = 8
+"""Steps of power in which share of reflections and noise may differ."""
+
+ROWS_AT_ONCE: Final = 8192
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +64,7 @@ class Problem:
     tags: list[int]
     directions: Floats
     error: Floats
-    design: Floats
+    design: Design
     lifted: Floats
     pairs: Pairs
     bins: Bins
@@ -85,13 +88,10 @@ class Problem:
         """Return how many parameters stand for delays."""
         return int(self.directions.shape[1])
 
-    def sample(self, rows: Ints) -> Problem:
-        """Return the problem of some rows only."""
-        chosen = ("error", "design", "lifted", "powered")
-        pairs = replace(self.pairs, number=self.pairs.number[rows])
-        return replace(
-            self, ranges=self.ranges[rows], pairs=pairs, **{name: getattr(self, name)[rows] for name in chosen}
-        )
+    @property
+    def cell(self) -> Ints:
+        """Return the step of power of each range (n,)."""
+        return self.bins.number * CELLS // len(self.bins.count)
 
     def penalties(self) -> list[Floats]:
         """Return the roughness of each group's curve as a matrix over all parameters; none where none is fitted."""
@@ -137,45 +137,53 @@ def build_problem(
     powered = np.isfinite(lifted)
     # What has no power stands at the middle of the others, where it bends nothing.
     lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
-    low, high = populated(np.sort(lifted))
+    ordered = np.sort(lifted)
+    low, high = populated(ordered)
     unknowns = (unknowns or Unknowns()).at_powers(varied=high - low > SAME_POWER)
     # Beyond the populated powers a curve is held constant: what it is there is not for these ranges to say.
     if not sequential and unknowns.curve:
         inside = (lifted >= low) & (lifted <= high)
         ranges, lifted, powered = ranges[inside], lifted[inside], powered[inside]
-    ordered = np.sort(lifted)
+        ordered = ordered[(ordered >= low) & (ordered <= high)]
     everyone = ranges.tags()
-    shares = _shares(ranges, groups, everyone)
-    matrix = design(ranges, everyone)
-    _known_tags(everyone, fixed)
-    pinned = np.array([tag in fixed or unknowns.of_pairs for tag in everyone])
-    known = matrix[:, pinned] @ np.array([fixed.get(tag, 0.0) for tag in np.array(everyone)[pinned].tolist()])
-    tags: list[int] = np.array(everyone)[~pinned].tolist()
     pairs = pairs_of(ranges.initiator, ranges.target, everyone)
-    # Without a copy where nothing is pinned: a column of millions is not cheap.
-    apart = _by_pairs(pairs) if unknowns.of_pairs else matrix[:, ~pinned] if pinned.any() else matrix
-    directions, free = np.eye(apart.shape[1]), list[list[int]]()
-    if unknowns.of_pairs:
-        tags = list(range(len(pairs.ends)))
-    elif tags:
-        directions, free = identifiable_directions(apart, tags, ranges.initiator, ranges.target)
-    delays = apart @ directions if free else apart
+    shares = _shares(ranges, groups, everyone)
+    _known_tags(everyone, fixed)
+    knots, averages = _splines(ordered, (low, high), unknowns)
+    bins = _bins(lifted, ordered)
+    kinds, kind = np.unique(_shares_of(pairs.ends, groups), axis=0, return_inverse=True)
+    raw = _raw(ranges, everyone, pairs, lifted, bins, knots, kind.ravel(), unknowns)
+    carriers = raw.shape[1] - len(kinds) * len(averages)
+    weights = raw.part(slice(0, carriers))
+    square = weights.normal(np.ones(len(lifted)))
+    tags, directions, free = list(range(len(pairs.ends))), np.eye(carriers), list[list[int]]()
+    known = np.zeros(len(lifted))
+    if not unknowns.of_pairs:
+        pinned = np.array([tag in fixed for tag in everyone])
+        if pinned.any():
+            known = weights @ np.array([fixed.get(tag, 0.0) for tag in everyone])
+        tags = np.array(everyone)[~pinned].tolist()
+        found = np.eye(len(tags))
+        if tags:
+            found, free = identifiable_directions(square[np.ix_(~pinned, ~pinned)], tags, pairs.ends)
+        directions = np.zeros((carriers, found.shape[1]))
+        directions[~pinned] = found
     _something_left(unknowns, tags)
     if not minimum_norm:
         require_determined(free)
-    knots, averages = _splines(ordered, (low, high), unknowns)
-    gauges = tuple(_making_up(delays, share) for share in shares)
+    reach = replace(weights, turn=directions)
+    gauges = tuple(_making_up(reach, share) for share in shares)
     centred = [gauge is not None and not sequential for gauge in gauges]
     centres = np.outer(np.array(centred, dtype=float), averages)
     return Problem(
         ranges=ranges,
         tags=tags,
-        directions=directions,
+        directions=directions if unknowns.of_pairs else directions[~pinned],
         error=ranges.raw_m - ranges.truth_m + known,
-        design=_columns(delays, lifted, knots, centres, shares),
+        design=replace(raw, turn=_turn(directions, kinds, centres)),
         lifted=lifted,
         pairs=pairs,
-        bins=_bins(lifted, ordered),
+        bins=bins,
         span=(low, high),
         knots=knots,
         centres=centres,
@@ -223,20 +231,13 @@ def _splines(ordered: Floats, span: tuple[float, float], unknowns: Unknowns) -> 
     return knots, (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (span[1] - span[0])
 
 
-def _by_pairs(pairs: Pairs) -> Floats:
-    """Return the derivative of ranges by a constant in ns of each pair (n, pairs)."""
-    matrix = np.zeros((len(pairs.number), len(pairs.ends)))
-    matrix[np.arange(len(matrix)), pairs.number] = SPEED_OF_LIGHT * 1e-9
-    return matrix
-
-
-def _making_up(delays: Floats, share: Floats | None) -> Floats | None:
+def _making_up(delays: Design, share: Floats | None) -> Floats | None:
     """Return the parameters that make up for a constant in a curve with a `share` in ranges (n,), None if none do."""
     if not delays.shape[1]:
         return None
-    aim = np.ones(len(delays)) if share is None else share
-    pull = delays.T @ aim
-    found = np.linalg.lstsq(delays.T @ delays, pull, rcond=1e-12)[0]
+    aim = delays.kept(np.ones(len(delays)) if share is None else share)
+    pull = delays.pull(aim)
+    found = np.linalg.lstsq(delays.normal(np.ones(len(delays))), pull, rcond=1e-12)[0]
     return np.asarray(found) if float(aim @ aim - pull @ found) < SPANNED * float(aim @ aim) else None
 
 
@@ -269,18 +270,78 @@ def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]], everyone: lis
     return [0.5 * np.isin(ranges.initiator, tags) + 0.5 * np.isin(ranges.target, tags) for tags in groups.values()]
 
 
-def _columns(delays: Floats, lifted: Floats, knots: Floats, centres: Floats, shares: list[Floats | None]) -> Floats:
-    """Return delays beside the splines of every group, filled in pieces to keep memory at one copy."""
-    rank, each = delays.shape[1], centres.shape[1]
-    columns = np.empty((len(lifted), rank + each * len(shares)))
-    columns[:, :rank] = delays
-    if not each:
-        return columns
+def _shares_of(ends: Ints, groups: Mapping[str, tuple[int, ...]]) -> Floats:
+    """Return how much of each group's curve is in the ranges of pairs of tags, (pairs, groups)."""
+    if not groups:
+        return np.ones((len(ends), 1))
+    return np.column_stack([0.5 * np.isin(ends, tags).sum(axis=1) for tags in groups.values()])
+
+
+def _raw(
+    ranges: Ranges,
+    everyone: list[int],
+    pairs: Pairs,
+    lifted: Floats,
+    bins: Bins,
+    knots: Floats,
+    kind: Ints,
+    unknowns: Unknowns,
+) -> Design:
+    """Return the derivatives of ranges by delays in ns (or constants of pairs) and by splines, of every kind of pair.
+
+    `kind` (pairs,) numbers those that have the same curve. Blocks are of one pair, step of power and piece of curve.
+    """
+    each = max(len(knots) - DEGREE - 1, 0)
+    first = _first_splines(lifted, knots) if each else np.zeros(len(lifted), dtype=np.int64)
+    several = max(each, 1)
+    key = (pairs.number * CELLS + bins.number * CELLS // len(bins.count)) * several + first
+    order = stable_order(key).astype(np.int32)
+    sizes = np.bincount(key)
+    which = np.flatnonzero(sizes)
+    pair, first = which // (CELLS * several), which % several
+    columns = [pair] if unknowns.of_pairs else list(np.searchsorted(everyone, pairs.ends[pair]).T)
+    carriers = len(pairs.ends) if unknowns.of_pairs else len(everyone)
+    values = np.empty((len(columns) + (DEGREE + 1) * bool(each), len(lifted)))
+    if each:
+        columns += [carriers + kind[pair] * each + first + k for k in range(DEGREE + 1)]
     for begin in range(0, len(lifted), ROWS_AT_ONCE):
         rows = slice(begin, begin + ROWS_AT_ONCE)
-        splines = basis(lifted[rows], knots)
-        for k, share in enumerate(shares):
-            part = centres[k] - splines
-            part = part if share is None else part * share[rows, None]
-            columns[rows, rank + k * each : rank + (k + 1) * each] = part
-    return columns
+        some = order[rows]
+        values[: 1 if unknowns.of_pairs else 2, rows] = _weights(ranges, some, unknowns)
+        if each:
+            values[-DEGREE - 1 :, rows] = nonzero(np.clip(lifted[some], knots[0], knots[-1]), knots, DEGREE)[1]
+    count = carriers + each * (int(kind.max()) + 1)
+    starts = np.concatenate([[0], np.cumsum(sizes[which])])
+    return Design(values, order, starts, np.column_stack(columns), np.eye(count)).in_short_blocks()
+
+
+def _first_splines(lifted: Floats, knots: Floats) -> Ints:
+    """Return the number of the first spline that is not zero at each lifted power (n,)."""
+    found = np.searchsorted(knots, np.clip(lifted, knots[0], knots[-1]), side="right") - 1
+    return np.asarray(np.clip(found, DEGREE, len(knots) - DEGREE - 2) - DEGREE)
+
+
+def _weights(ranges: Ranges, rows: Ints, unknowns: Unknowns) -> Floats:
+    """Return the derivatives of ranges by the delays of their lower and their higher tag in ns, or by a constant."""
+    metres = SPEED_OF_LIGHT * 1e-9
+    if unknowns.of_pairs:
+        return np.full((1, len(rows)), metres)
+    forth = ranges.initiator[rows] < ranges.target[rows]
+    first, second = metres * ranges.weight_initiator[rows], metres * ranges.weight_target[rows]
+    return np.array([np.where(forth, first, second), np.where(forth, second, first)])
+
+
+def _turn(directions: Floats, kinds: Floats, centres: Floats) -> Floats:
+    """Return what makes parameters of weights of tags and splines of kinds of pairs, (raw, m).
+
+    Splines enter with the opposite sign, less their centres: they sum to one everywhere, so a centre is a share of all.
+    """
+    (carriers, rank), (groups, each) = directions.shape, centres.shape
+    found = np.zeros((carriers + len(kinds) * each, rank + groups * each))
+    found[:carriers, :rank] = directions
+    for k, shares in enumerate(kinds):
+        rows = slice(carriers + k * each, carriers + (k + 1) * each)
+        for group, share in enumerate(shares):
+            columns = slice(rank + group * each, rank + (group + 1) * each)
+            found[rows, columns] = share * (centres[group] - np.eye(each))
+    return found

@@ -3,28 +3,23 @@
 Parameters come in two kinds. Those of the design (delays and curves) enter through the residual, so a range's slope by
 them is its `score` times its row. Of the others (a share of reflections by pair, a noise by power) a range has one of
 each sort: its slope by a sort is one of few numbers that sorts share, and which of the sort's parameters it belongs to
-follows from the range's place. No matrix of ranges by parameters is ever built: sums by place come first.
+follows from the range's place. No matrix of ranges by parameters is ever built: sums by block of the design come first.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.estimation.design import Design
 from uwblink.arrays import Floats, Ints
 
 Places = NDArray[np.signedinteger[Any]]
 """Numbers of places, in as few bytes as they take."""
-
-CHUNK: Final = 1024
-"""Rows of a matrix worked on at once, so that they stay in the cache."""
-
-SUMMED_AT_ONCE: Final = 65_536
-"""Rows summed by place at once, so that what leads to the sums is small beside the matrix."""
 
 _NOTHING: Final = np.zeros((0, 0))
 
@@ -33,7 +28,7 @@ _NOTHING: Final = np.zeros((0, 0))
 class Sort:
     """A sort of parameters, `count` of them: number `slope` of the slopes, and whose a place's ranges are (places,).
 
-    `whose` None says that all ranges share one.
+    `whose` None says that all ranges share one. Every one of the `count` has a place.
     """
 
     slope: int
@@ -46,10 +41,11 @@ class Scores:
     """Slopes at a point: `score` (n,) by the residual, `curvature` (n,) what a range knows of it, in 1/m and 1/m^2.
 
     Parameters are those of `design` (n, m), then those of `sorts`, in their order, with `slopes` of (n,) each; `place`
-    (n,) numbers the `places` of ranges. `curvature` None says that it is the square of the score.
+    (blocks,) numbers the `places` of the design's blocks. `curvature` None says that it is the square of the score.
+    Rows are in the order in which the design keeps them, here and in all that is asked of slopes.
     """
 
-    design: Floats
+    design: Design
     score: Floats
     curvature: Floats | None = None
     slopes: tuple[Floats, ...] = ()
@@ -77,35 +73,21 @@ class Scores:
 
     def information(self) -> Floats:
         """Return what the ranges know of the parameters: curvature of the design, squared slopes of the rest."""
+        if self.curvature is not None and not self.sorts:
+            return self.design.normal(self.curvature)
         return self.sums().information()
 
     def sums(self, *, squares: bool = True) -> Sums:
         """Return sums over the ranges, with those of `squares`, from which the information follows."""
-        slopes = range(len(self.slopes))
-        return Sums(
-            sorts=self.sorts,
-            design=self.score @ self.design,
-            slopes=np.array([self._by_place(slope) for slope in self.slopes]),
-            design_square=self._of_design() if squares else _NOTHING,
-            squares={
-                (k, other): self._by_place(self.slopes[k] * self.slopes[other])
-                for k in slopes
-                for other in range(k, len(slopes))
-            }
-            if squares
-            else {},
-            links=self._links() if squares else [],
-        )
+        summing = Summing(self.design, len(self.slopes), squares=squares)
+        for blocks, rows in self.design.pieces:
+            summing.add(blocks, rows, self.score[rows], [slope[rows] for slope in self.slopes])
+        return summing.sums(self.place, self.places, self.sorts, self.curvature)
 
     def by_block(self, blocks: Ints, count: int) -> Floats:
-        """Return slopes summed within blocks of time (blocks, parameters); blocks (n,) ascend."""
-        columns = self.design.shape[1]
-        found = np.zeros((count, self.size))
-        for begin in range(0, len(blocks), CHUNK):
-            rows = slice(begin, begin + CHUNK)
-            starts = np.flatnonzero(np.diff(blocks[rows], prepend=-1))
-            part = self.design[rows] * self.score[rows, None]
-            found[blocks[rows][starts], :columns] += np.add.reduceat(part, starts)
+        """Return slopes summed within blocks of time (blocks, parameters), of which `blocks` (n,) are the numbers."""
+        found = np.empty((count, self.size))
+        found[:, : self.design.shape[1]] = self.design.by_group(self.score, blocks, count)
         for sums, where in zip(self._in_groups(None, blocks, count), self.slices(), strict=True):
             found[:, where] = sums
         return found
@@ -115,49 +97,66 @@ class Scores:
 
         An offset in metres that a group of ranges has, times a range's `weight` (n,); `group` (n,) says which group.
         """
-        own = sums_by_place(self.design, self.known() * weight, group, count)
+        own = self.design.by_group(self.known() * weight, group, count)
         return np.hstack([own, *self._in_groups(self.score * weight, group, count)])
-
-    def _of_design(self) -> Floats:
-        if self.curvature is not None:
-            return weighted_square(self.design, self.curvature)
-        found = np.zeros((self.design.shape[1],) * 2)
-        for begin in range(0, len(self.score), CHUNK):
-            part = self.design[begin : begin + CHUNK] * self.score[begin : begin + CHUNK, None]
-            # A matrix times its own transpose takes half of the work.
-            found += part.T @ part
-        return found
-
-    def _by_place(self, values: Floats) -> Floats:
-        if self.place is None:
-            return np.array([values.sum()])
-        return np.asarray(np.bincount(self.place, values, minlength=self.places), float)
-
-    def _links(self) -> list[Floats]:
-        """Return score times each slope times rows of the design by place, by all where no sort needs more."""
-        placed = sorted({sort.slope for sort in self.sorts if sort.whose is not None})
-        weights = [self.score * slope for slope in self.slopes]
-        found = [
-            np.empty((0, 0)) if k in placed else (weight @ self.design)[None, :] for k, weight in enumerate(weights)
-        ]
-        if placed and self.place is not None:
-            # All of them at once, so that rows of the design are read once.
-            weight = np.column_stack([weights[k] for k in placed])
-            place = self.place[:, None] + self.places * np.arange(len(placed))
-            sums = sums_by_place(self.design, weight, place, self.places * len(placed))
-            for k, part in zip(placed, np.split(sums, len(placed)), strict=True):
-                found[k] = part
-        return found
 
     def _in_groups(self, weight: Floats | None, group: Places, count: int) -> list[Floats]:
         """Return sums of slopes (n,), times a weight, by group and by the parameters of each sort (count, own)."""
-        both = group if self.place is None else group * self.places + self.place
+        if not self.sorts:
+            return []
+        both = group * self.places
+        if self.place is not None:
+            both += np.repeat(self.place, self.design.counts)
         tables = [
             np.asarray(np.bincount(both, slope if weight is None else slope * weight, count * self.places), float)
             for slope in self.slopes
         ]
         by_place = [table.reshape(count, self.places).T for table in tables]
         return [_whose(sort, by_place[sort.slope]).T for sort in self.sorts]
+
+
+class Summing:
+    """Sums of slopes over the blocks of a design, piece by piece."""
+
+    def __init__(self, design: Design, slopes: int, *, squares: bool) -> None:
+        """Begin at nothing; with `squares`, products of slopes are summed too."""
+        self._design, self._slopes = design, slopes
+        blocks, self._own = design.columns.shape
+        size = self._own + slopes
+        self._plain = np.empty((blocks, size))
+        self._squares = np.empty((blocks, size, size)) if squares else None
+
+    def add(self, blocks: slice, rows: slice, score: Floats, slopes: list[Floats] | tuple[Floats, ...]) -> None:
+        """Sum slopes of the kept rows of some blocks."""
+        stacked = np.empty((self._plain.shape[1], len(score)))
+        np.multiply(self._design.values[:, rows], score, out=stacked[: self._own])
+        for k, slope in enumerate(slopes):
+            stacked[self._own + k] = slope
+        self._plain[blocks] = np.add.reduceat(stacked, self._design.starts[blocks] - rows.start, axis=1).T
+        if self._squares is not None:
+            self._design.squares_of(stacked, blocks, rows, self._squares)
+
+    def sums(self, place: Ints | None, places: int, sorts: tuple[Sort, ...], curvature: Floats | None = None) -> Sums:
+        """Return what was summed, by place; `place` (blocks,) is that of each block."""
+        own, design, each = self._own, self._design, range(self._slopes)
+        where = np.zeros(len(self._plain), dtype=np.int64) if place is None else place
+        plain, squares = self._plain, self._squares
+
+        def by_place(values: Floats) -> Floats:
+            return np.asarray(np.bincount(where, values, places), float)
+
+        slopes = np.array([by_place(plain[:, own + k]) for k in each])
+        total = design.grouped(plain[:, :own], np.zeros_like(where), 1)[0]
+        if squares is None:
+            return Sums(sorts=sorts, design=total, slopes=slopes, design_square=_NOTHING, squares={}, links=[])
+        return Sums(
+            sorts=sorts,
+            design=total,
+            slopes=slopes,
+            design_square=design.squared(squares[:, :own, :own]) if curvature is None else design.normal(curvature),
+            squares={(k, other): by_place(squares[:, own + k, own + other]) for k in each for other in each[k:]},
+            links=[design.grouped(squares[:, own + k, :own], where, places) for k in each],
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,17 +169,6 @@ class Sums:
     design_square: Floats
     squares: dict[tuple[int, int], Floats]
     links: list[Floats]
-
-    def __add__(self, other: Sums) -> Sums:
-        """Return the sums over the ranges of both."""
-        return replace(
-            self,
-            design=self.design + other.design,
-            slopes=self.slopes + other.slopes,
-            design_square=self.design_square + other.design_square,
-            squares={key: value + other.squares[key] for key, value in self.squares.items()},
-            links=[first + second for first, second in zip(self.links, other.links, strict=True)],
-        )
 
     def gradient(self) -> Floats:
         """Return the slope of the log likelihood by all parameters."""
@@ -209,7 +197,8 @@ def _whose(sort: Sort, sums: Floats) -> Floats:
         return np.asarray(sums.sum(axis=0, keepdims=True))
     if sums.ndim == 1:
         return np.asarray(np.bincount(sort.whose, sums, minlength=sort.count))
-    return sums_by_place(sums, np.ones(len(sums)), sort.whose, sort.count)
+    order = np.argsort(sort.whose, kind="stable")
+    return np.add.reduceat(sums[order], np.searchsorted(sort.whose[order], np.arange(sort.count)), axis=0)
 
 
 def _crossed(sums: Floats, first: Sort, second: Sort) -> Floats:
@@ -219,30 +208,6 @@ def _crossed(sums: Floats, first: Sort, second: Sort) -> Floats:
         return _whose(one, sums).reshape(first.count, second.count)
     both = np.bincount(first.whose * second.count + second.whose, sums, minlength=first.count * second.count)
     return np.asarray(both, float).reshape(first.count, second.count)
-
-
-def sums_by_place(matrix: Floats, weight: Floats, place: Places, count: int) -> Floats:
-    """Return weighted rows of a matrix (n, m) summed by place (count, m); a row may go to more than one (n, k)."""
-    from scipy.sparse import csc_array
-
-    if len(matrix) > SUMMED_AT_ONCE:
-        pieces = [slice(begin, begin + SUMMED_AT_ONCE) for begin in range(0, len(matrix), SUMMED_AT_ONCE)]
-        found = np.zeros((count, matrix.shape[1]))
-        for rows in pieces:
-            found += sums_by_place(matrix[rows], weight[rows], place[rows], count)
-        return found
-    each = weight.size // max(len(matrix), 1)
-    starts = np.arange(0, weight.size + 1, max(each, 1))
-    return np.asarray(csc_array((weight.ravel(), place.ravel(), starts), shape=(count, len(matrix))) @ matrix)
-
-
-def weighted_square(matrix: Floats, weight: Floats) -> Floats:
-    """Return the sum over rows of the weighted outer square of each, (m, m)."""
-    found = np.zeros((matrix.shape[1],) * 2)
-    for begin in range(0, len(matrix), CHUNK):
-        part = matrix[begin : begin + CHUNK]
-        found += (part * weight[begin : begin + CHUNK, None]).T @ part
-    return found
 
 
 def inverse_of(matrix: Floats, places: int = 0, sorts: int = 0) -> Floats:

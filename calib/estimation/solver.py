@@ -10,9 +10,10 @@ import numpy as np
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
 from calib.estimation.losses import LOSSES, MIXTURE
-from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
+from calib.estimation.design import Design
+from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
 from calib.estimation.persistence import Persistence, lasting_in_pairs
-from calib.estimation.problem import Problem
+from calib.estimation.problem import CELLS, Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of
 from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import reml_penalty, unsure
@@ -23,6 +24,12 @@ LASTING: Final = 1.5
 
 PILOT: Final = 6000
 """Rows of the sample on which a start is found; from there, a few Newton steps over all rows suffice."""
+
+ASTRAY_M: Final = 0.3
+"""Beyond what any pair's reflections move its median."""
+
+MEDIANS: Final = 100_000
+"""Ranges by which medians of pairs are told, if there are so many."""
 
 FIRST_SMOOTHNESS: Final = 1e-6
 """Of the pilot's curve, before the data are asked: a row's share of the penalty's trace."""
@@ -35,7 +42,9 @@ class Solved:
     `residuals` (n,) are fitted less true ranges, `scale` is that of the loss, in metres. `scores` are the slopes at the
     optimum by what determined the delays, with the `inverse` (D, D) of information and penalty; `delays` (tags, k)
     turns the parameters behind them into stated delays. `lasting` is how long errors last, `mixture` what they are made
-    of, where that was fitted.
+    of, where that was fitted. It is `astray` where it took all ranges of some pair for outliers, as far from a robust
+    loss may not end: a likelihood climbs, and where few powers or distances leave the design nearly open it can climb
+    to a top where one pair is left out as a whole.
     """
 
     parameters: Floats
@@ -49,10 +58,7 @@ class Solved:
     delays: Floats
     lasting: Persistence
     mixture: PairMixture | None = None
-
-
-ASTRAY_M: Final = 0.3
-"""Beyond what any pair's reflections move its median."""
+    astray: bool = False
 
 
 def solve(
@@ -70,16 +76,20 @@ def solve(
     robust = "cauchy" if loss == MIXTURE else loss
     start, steps = _pilot(problem, robust, scale_m)
     residual = problem.error + problem.design @ start
+    far = _farthest_pair(problem, residual)
     width = scale_m or scale_of(residual)
     near = quadratic_model(problem.design, residual, robust, width)
     ridge, start = reml_penalty(near, start, problem.penalties())
     mixture = None
     # Ranges without any error have no distribution to be likely under; the robust loss is exact there.
     if loss == MIXTURE and near.dispersion > 0:
-        mixture = fit_pair_mixture(_errors(problem), start, ridge / near.dispersion)
+        errors = Errors.of(
+            problem.error, problem.design, problem.pairs.number * CELLS + problem.cell, len(problem.pairs.ends)
+        )
+        mixture = fit_pair_mixture(errors, start, ridge / near.dispersion)
         lasting = lasting_in_pairs(mixture.slope("share"), problem.pairs.number, problem.ranges.time_ns)
         if lasting > LASTING:
-            again = fit_pair_mixture(_errors(problem), start, ridge / near.dispersion, lasting)
+            again = fit_pair_mixture(errors, start, ridge / near.dispersion, lasting)
             mixture = replace(again if again.success else mixture, steps=mixture.steps + again.steps)
         parameters, success, steps = mixture.of("design"), mixture.success, steps + mixture.steps
         scores, inverse, prior = mixture.scores, mixture.covariance, mixture.precision
@@ -94,10 +104,11 @@ def solve(
     columns = len(parameters)
     shares = [_of_curve(prior[:columns, :columns], curve) for _, curve in problem.curves()]
     covariance = known.covariance + unsure(inverse[:columns, :columns], parameters, shares)
+    residual = problem.error + problem.design @ parameters
     return Solved(
         parameters=stated @ parameters,
         covariance=stated @ covariance @ stated.T,
-        residuals=problem.error + problem.design @ parameters,
+        residuals=residual,
         scale=width,
         steps=steps,
         success=success,
@@ -106,26 +117,17 @@ def solve(
         delays=delays,
         lasting=known.lasting,
         mixture=mixture,
+        astray=mixture is not None and _farthest_pair(problem, residual) > ASTRAY_M + 3 * far,
     )
 
 
-def astray(problem: Problem, found: Solved) -> bool:
-    """Return whether a likelihood took all ranges of some pair for outliers, as far from robust loss may not end.
-
-    It climbs, and where few powers or distances leave the design nearly open it can climb to a top where one pair is
-    left out as a whole.
-    """
-    if found.mixture is None:
-        return False
-    robust, _ = _pilot(problem, "cauchy", None)
-    before, after = (_farthest_pair(problem, at) for at in (problem.error + problem.design @ robust, found.residuals))
-    return after > ASTRAY_M + 3 * before
-
-
 def _farthest_pair(problem: Problem, residual: Floats) -> float:
-    """Return the largest median residual of a pair, in metres either way."""
-    number = problem.pairs.number
-    return max(abs(float(np.median(residual[number == k]))) for k in np.unique(number).tolist())
+    """Return the largest median residual of a pair, in metres either way, of some of its ranges if they are many."""
+    kept = np.asarray(problem.design.order)[:: max(len(residual) // MEDIANS, 1)]
+    pair = problem.pairs.number[kept]
+    # A design keeps the ranges of a pair together.
+    parts = np.split(residual[kept], np.flatnonzero(np.diff(pair)) + 1)
+    return max(abs(float(np.median(part))) for part in parts)
 
 
 def _of_curve(prior: Floats, columns: slice) -> Floats:
@@ -135,26 +137,15 @@ def _of_curve(prior: Floats, columns: slice) -> Floats:
     return found
 
 
-def _errors(problem: Problem) -> Errors:
-    """Return what the mixture is fitted to."""
-    bins, pairs = problem.bins, problem.pairs
-    return Errors(
-        error=problem.error,
-        design=problem.design,
-        place=pairs.number * CELLS + bins.number * CELLS // len(bins.count),
-        pairs=len(pairs.ends),
-        density=1 / (float(np.ptp(problem.error)) + 1e-9),
-    )
-
-
-def _slopes(design: Floats, found: Solution, loss: str, ridge: Floats) -> tuple[Scores, Floats, Floats]:
+def _slopes(design: Design, found: Solution, loss: str, ridge: Floats) -> tuple[Scores, Floats, Floats]:
     """Return the slopes of a robust loss at its optimum, the inverse of its curvature, and its penalty's pull.
 
     The penalty counts as what is known beforehand (Wahba 1983; Nychka 1988), so that bands of a penalised curve hold
     its bias too.
     """
-    weight, slope = LOSSES[loss](found.residuals / found.scale)
-    score = -weight * found.residuals
+    residual = design.kept(found.residuals)
+    weight, slope = LOSSES[loss](residual / found.scale)
+    score = -weight * residual
     scores = Scores(design=design, score=score, curvature=slope)
     dispersion = float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope))
     return scores, inverse_of(scores.information() + ridge), dispersion * ridge
@@ -165,17 +156,16 @@ def _pilot(problem: Problem, loss: str, scale_m: float | None) -> tuple[Floats, 
     count = len(problem.error)
     # Any fixed choice will do that no schedule of pairs keeps in step with.
     rows = np.sort(np.random.default_rng(0).permutation(count)[:PILOT])
-    small = problem if len(rows) == count else problem.sample(rows)
-    some = slice(None, None, 3)
-    alone = robust_fit(small.design[some, : problem.rank], small.error[some], loss, scale_m)
-    start = np.concatenate([alone.parameters, np.zeros(problem.design.shape[1] - problem.rank)])
-    joint = robust_fit(small.design, small.error, loss, scale_m, _first_ridge(small), start)
+    # So few rows are quicker written out.
+    design, error, some = problem.design.sample(rows).written_out(), problem.error[rows], slice(None, None, 3)
+    alone = robust_fit(design[some, : problem.rank], error[some], loss, scale_m)
+    start = np.concatenate([alone.parameters, np.zeros(design.shape[1] - problem.rank)])
+    joint = robust_fit(design, error, loss, scale_m, _first_ridge(problem, len(rows)), start)
     return joint.parameters, alone.steps + joint.steps
 
 
-def _first_ridge(problem: Problem) -> Floats:
-    """Return a weak penalty, enough to hold stretches without data."""
-    count = len(problem.error)
+def _first_ridge(problem: Problem, count: int) -> Floats:
+    """Return a weak penalty for so many ranges, enough to hold stretches without data."""
     ridge = np.zeros((problem.design.shape[1],) * 2)
     for penalty in problem.penalties():
         ridge += FIRST_SMOOTHNESS * count / float(np.trace(penalty)) * penalty
@@ -189,29 +179,31 @@ def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None, ref
     The curves keep their constants and the delays are those of the first step, unless a `reference` is asked for.
     """
     rank, columns = problem.rank, problem.design.shape[1]
-    alone = robust_fit(problem.design[:, :rank], problem.error, loss, scale_m)
+    only = problem.design.part(slice(0, rank))
+    alone = robust_fit(only, problem.error, loss, scale_m)
     inside = (problem.lifted >= problem.span[0]) & (problem.lifted <= problem.span[1])
-    design, left = problem.design[inside, rank:], alone.residuals[inside]
-    first = robust_fit(design, left, loss, scale_m, _first_ridge(problem)[rank:, rank:])
+    of_curves = problem.design.part(slice(rank, columns))
+    design, left = of_curves.sample(inside), alone.residuals[inside]
+    first = robust_fit(design, left, loss, scale_m, _first_ridge(problem, len(inside))[rank:, rank:])
     near = quadratic_model(design, first.residuals, loss, first.scale)
     penalties = [penalty[rank:, rank:] for penalty in problem.penalties()]
     ridge, start = reml_penalty(near, first.parameters, penalties)
     curves = robust_fit(design, left, loss, first.scale, ridge, start, near=True)
     blocks, seconds = blocks_of(problem.ranges.time_ns)
     covariance = np.zeros((columns, columns))
-    scores, inverse, prior = _slopes(problem.design[:, :rank], alone, loss, np.zeros((rank, rank)))
+    scores, inverse, prior = _slopes(only, alone, loss, np.zeros((rank, rank)))
     known = intervals(scores, inverse, prior, problem.directions, rank, blocks=blocks, seconds=seconds)
     covariance[:rank, :rank] = known.covariance
-    of_curves = _slopes(design, curves, loss, ridge)
+    slopes = _slopes(design, curves, loss, ridge)
     nothing = np.zeros((0, columns - rank))
     covariance[rank:, rank:] = intervals(
-        *of_curves, nothing, 0, blocks=blocks_of(problem.ranges.time_ns[inside])[0], seconds=seconds
+        *slopes, nothing, 0, blocks=blocks_of(problem.ranges.time_ns[inside])[0], seconds=seconds
     ).covariance
     stated = stating(problem, reference)
     return Solved(
         parameters=stated @ np.concatenate([alone.parameters, curves.parameters]),
         covariance=stated @ covariance @ stated.T,
-        residuals=alone.residuals + problem.design[:, rank:] @ curves.parameters,
+        residuals=alone.residuals + of_curves @ curves.parameters,
         scale=alone.scale,
         steps=alone.steps + first.steps + curves.steps,
         success=alone.success and curves.success,

@@ -1,0 +1,262 @@
+"""Matrices of which a row has few entries that are not zero, kept as those few: what a fit is linear in.
+
+A range has a weight of the delay of either end and four cubic splines; of two dozen columns it touches six. Rows that
+touch the same columns stand together in blocks, so that sums over them are products of matrices six columns wide, and
+neither the matrix nor its squares are ever written out. A block's raw columns become parameters by a small matrix: it
+leaves out pinned delays, takes the splines' averages off and shares curves between groups of tags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.arrays import Bools, Floats, Ints
+
+ROWS_AT_ONCE: Final = 8192
+"""Rows worked on together, so that what leads to sums stays in the cache; no block has more."""
+
+MANY: Final = 64
+"""Rows a block from which blocks are worth a product of matrices each."""
+
+DIGIT: Final = 1 << 16
+
+
+@dataclass(frozen=True)
+class Design:
+    """A matrix (n, m): entry `values[j, k]` of its k-th kept row stands in raw column `columns[block, j]`.
+
+    Rows are kept in another order: `order` (n,) says which row each of them is, None where they are as given. `starts`
+    (blocks + 1,) bound the blocks, `turn` (raw, m) turns raw columns into parameters.
+    """
+
+    values: Floats
+    order: Ints | None
+    starts: Ints
+    columns: Ints
+    turn: Floats
+
+    @classmethod
+    def whole(cls, matrix: Floats) -> Design:
+        """Return a matrix (n, m) of which all entries count."""
+        count, columns = matrix.shape
+        starts = cut(np.array([0, count]))
+        own = np.tile(np.arange(columns), (len(starts) - 1, 1))
+        return cls(np.ascontiguousarray(matrix.T, dtype=np.float64), None, starts, own, np.eye(columns))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return the numbers of rows and of parameters."""
+        return int(self.values.shape[1]), int(self.turn.shape[1])
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.shape[0]
+
+    @cached_property
+    def counts(self) -> Ints:
+        """Return the number of rows of each block (blocks,)."""
+        return np.diff(self.starts)
+
+    @cached_property
+    def pieces(self) -> list[tuple[slice, slice]]:
+        """Return blocks and rows that are worked on together."""
+        edges, found, first = self.starts, [], 0
+        while first < len(edges) - 1:
+            last = max(int(np.searchsorted(edges, edges[first] + ROWS_AT_ONCE, side="right")) - 1, first + 1)
+            found.append((slice(first, last), slice(int(edges[first]), int(edges[last]))))
+            first = last
+        return found
+
+    def kept(self, given: NDArray[Any]) -> NDArray[Any]:
+        """Return values of rows (n,) in the order in which rows are kept."""
+        return given if self.order is None else given[self.order]
+
+    def given(self, kept: Floats) -> Floats:
+        """Return values of kept rows (n,) in the order in which rows were given."""
+        if self.order is None:
+            return kept
+        found = np.empty_like(kept)
+        found[self.order] = kept
+        return found
+
+    def __matmul__(self, x: Floats) -> Floats:
+        """Return the matrix times parameters (m,), in the order of given rows."""
+        return self.given(self.times(x))
+
+    def times(self, x: Floats) -> Floats:
+        """Return the matrix times parameters (m,), in the order of kept rows."""
+        found = np.empty(len(self))
+        for blocks, rows in self.pieces:
+            found[rows] = self.piece_times(x, blocks, rows)
+        return found
+
+    def piece_times(self, x: Floats, blocks: slice, rows: slice) -> Floats:
+        """Return the matrix times parameters (m,) at the kept rows of some blocks."""
+        own, values = (self.turn @ x)[self.columns[blocks]], self.values[:, rows]
+        if self._few_blocks(blocks, rows):
+            bounds = (self.starts[blocks.start : blocks.stop + 1] - rows.start).tolist()
+            found = np.empty(rows.stop - rows.start)
+            for k, weights in enumerate(own):
+                found[bounds[k] : bounds[k + 1]] = weights @ values[:, bounds[k] : bounds[k + 1]]
+            return found
+        counts, found = self.counts[blocks], np.zeros(rows.stop - rows.start)
+        for weights, value in zip(own.T, values, strict=True):
+            found += np.repeat(weights, counts) * value
+        return found
+
+    def _few_blocks(self, blocks: slice, rows: slice) -> bool:
+        return rows.stop - rows.start >= MANY * (blocks.stop - blocks.start)
+
+    def pull(self, kept: Floats) -> Floats:
+        """Return the sum over kept rows (n,) of values times rows of the matrix (m,)."""
+        sums = np.empty(self.columns.shape)
+        for blocks, rows in self.pieces:
+            weighed = self.values[:, rows] * kept[rows]
+            sums[blocks] = np.add.reduceat(weighed, self.starts[blocks] - rows.start, axis=1).T
+        raw = np.bincount(self.columns.ravel(), sums.ravel(), len(self.turn))
+        return np.asarray(raw @ self.turn)
+
+    def normal(self, kept: Floats) -> Floats:
+        """Return the sum over kept rows of weights (n,), of either sign, times outer squares of rows (m, m)."""
+        squares = np.empty((*self.columns.shape, self.columns.shape[1]))
+        for blocks, rows in self.pieces:
+            values = self.values[:, rows]
+            self._products(values * kept[rows], values, blocks, rows, squares)
+        return self.squared(squares)
+
+    def _products(self, left: Floats, right: Floats, blocks: slice, rows: slice, into: Floats) -> None:
+        bounds = (self.starts[blocks.start : blocks.stop + 1] - rows.start).tolist()
+        for k in range(blocks.stop - blocks.start):
+            own = slice(bounds[k], bounds[k + 1])
+            np.matmul(left[:, own], right[:, own].T, out=into[blocks.start + k])
+
+    def squares_of(self, stacked: Floats, blocks: slice, rows: slice, into: Floats) -> None:
+        """Put the products of stacked columns (k, n) of kept rows with each other into some blocks (blocks, k, k)."""
+        self._products(stacked, stacked, blocks, rows, into)
+
+    def squared(self, squares: Floats) -> Floats:
+        """Return sums by block of products of kept entries (blocks, k, k) as those of parameters (m, m)."""
+        size = len(self.turn)
+        place = self.columns[:, :, None] * size + self.columns[:, None, :]
+        raw = np.bincount(place.ravel(), squares.ravel(), size * size).reshape(size, size)
+        return np.asarray(self.turn.T @ raw @ self.turn)
+
+    def grouped(self, sums: Floats, group: Ints, count: int) -> Floats:
+        """Return sums by block of kept entries (blocks, k) as those by group of blocks and parameter (count, m)."""
+        size = len(self.turn)
+        place = group[:, None] * size + self.columns
+        raw = np.bincount(place.ravel(), sums.ravel(), count * size).reshape(count, size)
+        return np.asarray(raw @ self.turn)
+
+    def by_group(self, kept: Floats, group: Ints, count: int) -> Floats:
+        """Return kept values (n,) times rows of the matrix, summed by group of kept rows (n,): (count, m)."""
+        size = len(self.turn)
+        raw = np.zeros(count * size)
+        for blocks, rows in self.pieces:
+            weight, own, counts = kept[rows], group[rows] * size, self.counts[blocks]
+            for column, value in zip(self.columns[blocks].T, self.values[:, rows], strict=True):
+                raw += np.bincount(own + np.repeat(column, counts), weight * value, count * size)
+        return np.asarray(raw.reshape(count, size) @ self.turn)
+
+    def part(self, parameters: slice) -> Design:
+        """Return some columns of the matrix, without the entries that stand in none of them."""
+        turn = self.turn[:, parameters]
+        used = np.any(np.any(turn != 0, axis=1)[self.columns], axis=0)
+        return Design(self.values[used], self.order, self.starts, self.columns[:, used], turn)
+
+    def chosen(self, rows: Ints | Bools | slice) -> Ints:
+        """Return which of the kept rows some given ones are."""
+        chosen = np.zeros(len(self), dtype=bool)
+        chosen[rows] = True
+        return np.flatnonzero(chosen if self.order is None else chosen[self.order])
+
+    def sample(self, rows: Ints | Bools | slice) -> Design:
+        """Return some of the given rows, which ascend."""
+        chosen = np.zeros(len(self), dtype=bool)
+        chosen[rows] = True
+        keep = self.chosen(rows)
+        order = None if self.order is None else (np.cumsum(chosen) - 1)[self.order[keep]]
+        starts = np.searchsorted(keep, self.starts)
+        there = np.diff(starts) > 0
+        return Design(
+            self.values[:, keep], order, np.append(starts[:-1][there], len(keep)), self.columns[there], self.turn
+        )
+
+    def blocked(self, place: Ints) -> Design:
+        """Return the same matrix, with one place of given rows (n,) in each block."""
+        kept = self.kept(place)
+        steps = np.flatnonzero(kept[1:] != kept[:-1]) + 1
+        if np.isin(steps, self.starts).all():
+            return self
+        block = np.repeat(np.arange(len(self.counts)), self.counts)
+        key = kept * len(self.counts) + block
+        order = stable_order(key)
+        sizes = np.bincount(key, minlength=1)
+        which = np.flatnonzero(sizes)
+        starts = np.concatenate([[0], np.cumsum(sizes[which])])
+        old = order if self.order is None else self.order[order]
+        found = Design(self.values[:, order], old, starts, self.columns[which % len(self.counts)], self.turn)
+        return found.in_short_blocks()
+
+    def in_short_blocks(self) -> Design:
+        """Return the same matrix, with no block longer than what is worked on at once."""
+        starts = cut(self.starts)
+        if len(starts) == len(self.starts):
+            return self
+        old = np.searchsorted(self.starts, starts[:-1], side="right") - 1
+        return replace(self, starts=starts, columns=self.columns[old])
+
+    def first_of(self, kept: Ints) -> Ints:
+        """Return what the first row of each block has (blocks,)."""
+        return kept[self.starts[:-1]]
+
+    def written_out(self) -> Floats:
+        """Return the matrix (n, m)."""
+        found = np.empty(self.shape)
+        for block, (begin, end) in enumerate(zip(self.starts[:-1].tolist(), self.starts[1:].tolist(), strict=True)):
+            rows = slice(begin, end) if self.order is None else self.order[begin:end]
+            found[rows] = self.values[:, begin:end].T @ self.turn[self.columns[block]]
+        return found
+
+
+def as_design(matrix: Design | Floats) -> Design:
+    """Return a matrix as a design."""
+    return matrix if isinstance(matrix, Design) else Design.whole(matrix)
+
+
+def cut(starts: Ints) -> Ints:
+    """Return bounds of blocks with more between them, so that none is longer than what is worked on at once."""
+    counts = np.diff(starts)
+    parts = -(-counts // ROWS_AT_ONCE)
+    if not np.any(parts > 1):
+        return starts
+    within = _within(parts)
+    which = np.repeat(np.arange(len(counts)), parts)
+    return np.append(starts[which] + within * counts[which] // parts[which], starts[-1])
+
+
+def _within(parts: Ints) -> Ints:
+    """Return 0, 1, 2 ... anew for each number of parts."""
+    return np.asarray(np.arange(int(parts.sum())) - np.repeat(np.cumsum(parts) - parts, parts))
+
+
+def stable_order(key: Ints) -> Ints:
+    """Return what sorts keys from 0 (n,), equal ones in their order: by digits, much faster than by comparison."""
+    order = np.argsort((key % DIGIT).astype(np.uint16), kind="stable")
+    high = key // DIGIT
+    while high.any():
+        order = order[np.argsort((high[order] % DIGIT).astype(np.uint16), kind="stable")]
+        high = high // DIGIT
+    return order
+
+
+def rows_by_block(starts: Ints) -> Iterator[slice]:
+    """Yield the rows of each block."""
+    for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        yield slice(begin, end)
