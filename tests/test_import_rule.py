@@ -53,7 +53,7 @@ FLOORS = {
         ("cli",),
     ),
     "calib": (
-        ("errors", "samples", "single_sided", "spread"),
+        ("densities", "errors", "samples", "single_sided", "spread"),
         ("information", "ranges"),
         ("calibration", "sources"),
         ("evaluation",),

@@ -19,6 +19,7 @@ import numpy as np
 
 from calib.calibration.json_format import Reader
 from calib.calibration.power_curves import Curve
+from calib.densities import ROOT_2PI, densities
 from calib.errors import BadInputError
 from uwblink.arrays import Floats, Ints
 
@@ -127,18 +128,12 @@ class ErrorModel:
 
     def tail_given(self, error_m: Floats, shapes: ErrorShapes) -> tuple[Floats, Floats]:
         """Return the probabilities (n,) that ranges with known errors were reflected, and that they are outliers."""
-        from scipy.special import erfcx
-
-        error, noise = error_m - self.location_m, shapes.noise_m
-        z, away, ratio = error / noise, (error - self.least_m) / noise, noise / shapes.detour_m
-        inside = 1 - self.outlier_share
-        core = inside * (1 - shapes.tail_share) * np.exp(-0.5 * z**2) / (noise * np.sqrt(2 * np.pi))
-        at = away - ratio
-        near = 0.5 * np.exp(-0.5 * away**2) * erfcx(np.minimum(at, 30.0) / -np.sqrt(2))
-        tail = np.where(at < 5, near, np.exp(np.minimum(ratio * (0.5 * ratio - away), 50.0)))
-        tail = inside * shapes.tail_share * tail / shapes.detour_m
+        error, inside = error_m - self.location_m, 1 - self.outlier_share
+        found = densities(error, shapes.noise_m, self.least_m, shapes.detour_m)
+        core = inside * (1 - shapes.tail_share) * found.direct
+        tail = inside * shapes.tail_share * found.reflected
         wide = max(self.outlier_m, 1e-9)
-        wild = self.outlier_share * np.exp(-0.5 * (error / wide) ** 2) / (wide * np.sqrt(2 * np.pi))
+        wild = self.outlier_share * np.exp(-0.5 * (error / wide) ** 2) / (wide * ROOT_2PI)
         total = core + tail + wild
         # Nothing else reaches where all three are zero.
         nothing = total <= 0

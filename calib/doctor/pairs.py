@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from calib.doctor.base import Finding, RecordingView, pair_ids
-from calib.estimation.identifiability import identifiable_directions
+from calib.estimation.identifiability import identifiable_directions, square_of
 from uwblink.recording.summary import failures_by_pair
 from uwblink.twr import delay_weights
 
@@ -24,12 +24,8 @@ def pairs(view: RecordingView) -> Iterator[Finding]:
     if not good.any():
         return
     tags = sorted({*e.initiator[good].tolist(), *e.target[good].tolist()})
-    place = np.array(tags)
-    matrix = np.zeros((np.count_nonzero(good), len(tags)))
-    rows = np.arange(len(matrix))
-    matrix[rows, np.searchsorted(place, e.initiator[good])] += first[good]
-    matrix[rows, np.searchsorted(place, e.target[good])] += second[good]
-    _, free = identifiable_directions(matrix, tags, e.initiator[good], e.target[good])
+    square, ends = square_of(tags, e.initiator[good], e.target[good], first[good], second[good])
+    _, free = identifiable_directions(square, tags, ends)
     if free:
         groups = "; ".join(", ".join(map(str, group)) for group in free)
         yield Finding(

@@ -8,7 +8,6 @@ leaves out pinned delays, takes the splines' averages off and shares curves betw
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
@@ -18,6 +17,9 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 
+Order = NDArray[np.signedinteger[Any]]
+"""Numbers of rows, in as few bytes as they take."""
+
 ROWS_AT_ONCE: Final = 8192
 """Rows worked on together, so that what leads to sums stays in the cache; no block has more."""
 
@@ -25,6 +27,22 @@ MANY: Final = 64
 """Rows a block from which blocks are worth a product of matrices each."""
 
 DIGIT: Final = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Stretches of kept rows within blocks of a design: `starts` (runs + 1,) bound them, `block` (runs,) is theirs."""
+
+    starts: Ints
+    block: Ints
+
+    def sums(self, *stacked: Floats) -> Floats:
+        """Return sums of columns (k, n) over the rows of each run (runs, k)."""
+        return np.vstack([np.add.reduceat(some, self.starts[:-1], axis=-1) for some in stacked]).T
+
+    def rows(self, values: Ints) -> Ints:
+        """Return what rows (n,) have, of what runs have (runs,)."""
+        return np.repeat(values, np.diff(self.starts))
 
 
 @dataclass(frozen=True)
@@ -36,7 +54,7 @@ class Design:
     """
 
     values: Floats
-    order: Ints | None
+    order: Order | None
     starts: Ints
     columns: Ints
     turn: Floats
@@ -111,7 +129,7 @@ class Design:
         return found
 
     def _few_blocks(self, blocks: slice, rows: slice) -> bool:
-        return rows.stop - rows.start >= MANY * (blocks.stop - blocks.start)
+        return bool(rows.stop - rows.start >= MANY * (blocks.stop - blocks.start))
 
     def pull(self, kept: Floats) -> Floats:
         """Return the sum over kept rows (n,) of values times rows of the matrix (m,)."""
@@ -147,12 +165,23 @@ class Design:
         raw = np.bincount(place.ravel(), squares.ravel(), size * size).reshape(size, size)
         return np.asarray(self.turn.T @ raw @ self.turn)
 
-    def grouped(self, sums: Floats, group: Ints, count: int) -> Floats:
-        """Return sums by block of kept entries (blocks, k) as those by group of blocks and parameter (count, m)."""
+    def grouped(self, sums: Floats, group: Ints, count: int, block: Ints | None = None) -> Floats:
+        """Return sums by block of kept entries (blocks, k) as those by group of blocks and parameter (count, m).
+
+        `block` is whose sums they are, where not those of all blocks in turn.
+        """
         size = len(self.turn)
-        place = group[:, None] * size + self.columns
+        place = group[:, None] * size + (self.columns if block is None else self.columns[block])
         raw = np.bincount(place.ravel(), sums.ravel(), count * size).reshape(count, size)
         return np.asarray(raw @ self.turn)
+
+    def runs(self, kept: Ints | None = None) -> Runs:
+        """Return the blocks as runs, cut where a number of kept rows (n,) changes."""
+        if kept is None:
+            return Runs(self.starts, np.arange(len(self.counts)))
+        steps = np.flatnonzero(kept[1:] != kept[:-1]) + 1
+        starts = np.union1d(self.starts, steps)
+        return Runs(starts, np.searchsorted(self.starts, starts[:-1], side="right") - 1)
 
     def by_group(self, kept: Floats, group: Ints, count: int) -> Floats:
         """Return kept values (n,) times rows of the matrix, summed by group of kept rows (n,): (count, m)."""
@@ -254,9 +283,3 @@ def stable_order(key: Ints) -> Ints:
         order = order[np.argsort((high[order] % DIGIT).astype(np.uint16), kind="stable")]
         high = high // DIGIT
     return order
-
-
-def rows_by_block(starts: Ints) -> Iterator[slice]:
-    """Yield the rows of each block."""
-    for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
-        yield slice(begin, end)

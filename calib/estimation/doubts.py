@@ -9,7 +9,17 @@ import numpy as np
 
 from calib.calibration.power_curves import DEGREE, Curve, basis
 from calib.estimation.intervals import blocks_of
-from calib.estimation.misfit import CLEARLY, MATTERS, SMALLEST_M, SMALLEST_NS, Finding, examine, families, told
+from calib.estimation.misfit import (
+    CLEARLY,
+    MATTERS,
+    SMALLEST_M,
+    SMALLEST_NS,
+    Finding,
+    everywhere,
+    examine,
+    families,
+    told,
+)
 from calib.estimation.persistence import FEWEST_STRETCHES
 from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
@@ -53,6 +63,7 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
     tested, kept = families(problem, louder, seconds), found.scores.design.kept
     judged = examine(
         found.scores,
+        found.by_block,
         found.inverse,
         found.delays,
         kept(blocks),
@@ -146,7 +157,7 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
     if problem.design.shape[1] != found.scores.design.shape[1] or not np.ptp(problem.ranges.truth_m) > 0:
         return []
     far = found.scores.design.kept(problem.ranges.truth_m - np.median(problem.ranges.truth_m))
-    link = found.scores.with_groups(far, np.zeros(len(far), dtype=np.int64), 1)[0]
+    link = found.scores.linked(far, *everywhere(found.scores))[0]
     taken = link @ found.inverse
     known = float(found.scores.known() @ far**2 - taken @ link) / found.lasting.factor
     slope = 1 / np.sqrt(SCALE**-2 + max(known, 0.0))

@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.densities import densities
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
@@ -25,7 +26,6 @@ SHORTEST_TAIL: Final = 2.0
 
 ITERATIONS: Final = 400
 SETTLED: Final = 1e-4
-LOG_ROOT_2PI: Final = 0.5 * np.log(2 * np.pi)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,25 +59,13 @@ class Responsibilities:
 
 
 def e_step(error_m: Floats, sigma_m: Floats, mixture: ErrorMixture, outlier_density: float) -> Responsibilities:
-    """Return the expectation step at errors measured from the core's centre.
-
-    The noise in an error with an exponential detour is normal, cut off above the error: with
-    u = e/sigma - sigma/tau its mean is sigma^2/tau - sigma phi(u)/Phi(u).
-    """
-    from scipy.special import log_ndtr
-
-    tau = mixture.tail_mean_m
-    z, ratio = error_m / sigma_m, sigma_m / tau
-    u = z - ratio
-    below = log_ndtr(u)
-    hazard = np.exp(np.minimum(-0.5 * u**2 - LOG_ROOT_2PI - below, 700))
-    clean = 1 - mixture.tail_share - mixture.outlier_share
-    core = clean * np.exp(-0.5 * z**2 - LOG_ROOT_2PI) / sigma_m
-    tail = mixture.tail_share * np.exp(np.minimum(0.5 * ratio**2 - error_m / tau + below, 700)) / tau
+    """Return the expectation step at errors measured from the core's centre."""
+    found = densities(error_m, sigma_m, 0.0, mixture.tail_mean_m)
+    core = (1 - mixture.tail_share - mixture.outlier_share) * found.direct
+    tail = mixture.tail_share * found.reflected
     outlier = np.full_like(core, mixture.outlier_share * outlier_density)
-    total = core + tail + outlier
-    noise = sigma_m * (ratio - hazard)
-    spread = sigma_m**2 * np.maximum(1 - u * hazard - hazard**2, 0)
+    total, noise = core + tail + outlier, found.noise_m()
+    spread = sigma_m**2 * found.noise_var()
     return Responsibilities(core / total, tail / total, outlier / total, noise, noise**2 + spread, total)
 
 

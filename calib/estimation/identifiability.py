@@ -16,6 +16,21 @@ Clock ratios differ from 1 by parts per million, which lifts a free direction to
 """
 
 
+def square_of(tags: list[int], initiator: Ints, target: Ints, first: Floats, second: Floats) -> tuple[Floats, Ints]:
+    """Return the square (tags, tags) of the derivatives of ranges (n,) by the delays of tags, and their pairs (k, 2).
+
+    `first` and `second` are the weights of the delays of initiator and target.
+    """
+    count, (one, two) = len(tags), (np.searchsorted(tags, ids) for ids in (initiator, target))
+
+    def summed(row: Ints, column: Ints, weight: Floats) -> Floats:
+        return np.asarray(np.bincount(row * count + column, weight, count * count), np.float64).reshape(count, count)
+
+    across = summed(one, two, first * second)
+    pairs = np.array(tags)[np.argwhere(across + across.T)]
+    return summed(one, one, first**2) + summed(two, two, second**2) + across + across.T, pairs
+
+
 def identifiable_directions(square: Floats, tags: list[int], pairs: Ints) -> tuple[Floats, list[list[int]]]:
     """Return the directions that ranges determine, (tags, rank), and the tags left free.
 

@@ -20,11 +20,13 @@ CURVE_SERIES: Final = 5
 class Intervals:
     """Covariance (m, m) of the parameters of the design, and what persistence of errors it reckons with.
 
-    1.96 of its standard errors make 95 % intervals: what a small sample takes is in it already.
+    1.96 of its standard errors make 95 % intervals: what a small sample takes is in it already. `by_block` (blocks, D)
+    are the slopes summed over short blocks of time, from which all that follows.
     """
 
     covariance: Floats
     lasting: Persistence
+    by_block: Floats
 
 
 def intervals(
@@ -38,7 +40,8 @@ def intervals(
     """
     columns = scores.design.shape[1]
     reach = inverse[:columns]
-    pulls = scores.by_block(scores.design.kept(blocks), int(blocks[-1]) + 1) @ reach.T
+    by_block = scores.by_block(scores.design.kept(blocks), int(blocks[-1]) + 1)
+    pulls = by_block @ reach.T
     # What all delays share is the curve's constant: it would hide how long errors of single delays last.
     apart = delays - delays.mean(axis=0) if len(delays) > 1 else delays
     lasting = persistence(pulls @ apart.T, seconds, max(len(delays) - 1, 1))
@@ -51,7 +54,8 @@ def intervals(
     used = float(scores.size - np.sum(inverse * prior))
     fresh = len(blocks) / max(len(blocks) - used, 0.2 * len(blocks))
     covariance = fresh * (pulls.T @ pulls) * width[:, None] * width + reach @ prior @ reach.T
-    return Intervals(covariance=np.asarray(covariance), lasting=lasting if rank else factors[-1])
+    lasting = lasting if rank else factors[-1]
+    return Intervals(covariance=np.asarray(covariance), lasting=lasting, by_block=by_block)
 
 
 def blocks_of(time_ns: Ints) -> tuple[Ints, float]:

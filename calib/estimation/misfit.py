@@ -14,10 +14,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.pairs import places_of
+from calib.estimation.design import Runs
 from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.problem import Problem
-from calib.estimation.scores import Places, Scores
+from calib.estimation.scores import Scores
 from uwblink.arrays import Floats, Ints
 
 ERROR_RATE: Final = 0.005
@@ -56,18 +56,17 @@ REACHED: Final = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """Alternatives of one kind: offsets times `weight` (n,), by `place` (n,); `names` (k,) say whose they are.
+    """Alternatives of one kind: offsets times `weight` (n,), or 1; `names` (k,) say whose they are.
 
-    `second` is the other end's place, where each range belongs to both of its tags; in a `signed` family the offset is
-    taken the other way there.
+    Whose a range is goes by its run: each of `ends` has a place among the names of every run (runs,), and a sign. A
+    range belongs to both of its tags; in a family of differences the offset is taken the other way at one.
     """
 
     kind: str
     names: list[str]
-    weight: Floats
-    place: Places
-    second: Places | None = None
-    signed: bool = False
+    weight: Floats | float
+    runs: Runs
+    ends: tuple[tuple[Ints, float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,32 +117,35 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
     """
     kept, bins = problem.design.kept, problem.bins
     tags, truth_m = problem.ranges.tags(), problem.ranges.truth_m
-    # All alternatives are there at once: half the memory.
-    first, second = (
-        kept(place.astype(np.int32)) for place in places_of(tags, problem.ranges.initiator, problem.ranges.target)
-    )
-    names, ones = [f"tag {tag}" for tag in tags], np.ones(len(first))
+    runs = problem.design.runs()
+    pair = problem.design.first_of(kept(problem.pairs.number))
+    low, high = np.searchsorted(tags, problem.pairs.ends[pair]).T
+    both = (low, 1.0), (high, 1.0)
+    names = [f"tag {tag}" for tag in tags]
     named = [f"pair {low}-{high}" for low, high in problem.pairs.ends.tolist()]
-    yield Family(kind="pair", names=named, weight=ones, place=kept(problem.pairs.number))
+    yield Family(kind="pair", names=named, weight=1.0, runs=runs, ends=((pair, 1.0),))
     count = segments(seconds)
-    when = kept((np.arange(len(first)) * count // len(first)).astype(np.int32))
+    when = kept(np.arange(len(truth_m)) * count // len(truth_m))
+    spans = problem.design.runs(when)
+    own = when[spans.starts[:-1]]
     yield Family(
         kind="time",
         names=[name for name in names for _ in range(count)],
-        weight=ones,
-        place=first * count + when,
-        second=second * count + when,
+        weight=1.0,
+        runs=spans,
+        ends=tuple((place[spans.block] * count + own, 1.0) for place in (low, high)),
     )
     rank = np.linspace(-1, 1, len(bins.count))[kept(bins.number)]
     if problem.unknowns.curve:
-        yield Family(kind="power", names=names, weight=rank, place=first, second=second)
+        yield Family(kind="power", names=names, weight=rank, runs=runs, ends=both)
     size = float(np.sqrt(np.mean(louder_m**2)))
     if size > 0:
-        yield Family(kind="decibels", names=names, weight=kept(louder_m) / size, place=first, second=second)
-    yield Family(kind="skew", names=names, weight=ones, place=first, second=second, signed=True)
+        yield Family(kind="decibels", names=names, weight=kept(louder_m) / size, runs=runs, ends=both)
+    forth = np.where(kept(problem.ranges.initiator < problem.ranges.target), 1.0, -1.0)
+    yield Family(kind="skew", names=names, weight=forth, runs=runs, ends=((low, 1.0), (high, -1.0)))
     far = kept(truth_m - np.median(truth_m)) / max(float(np.ptp(truth_m)), 1e-9)
     if np.ptp(truth_m) > 0:
-        yield Family(kind="scale", names=["all tags"], weight=far, place=np.zeros(len(far), dtype=np.int32))
+        yield Family(kind="scale", names=["all tags"], weight=far, runs=runs, ends=((np.zeros_like(low), 1.0),))
 
 
 def segments(seconds: float) -> int:
@@ -153,6 +155,7 @@ def segments(seconds: float) -> int:
 
 def examine(
     scores: Scores,
+    own: Floats,
     inverse: Floats,
     delays: Floats,
     blocks: Ints,
@@ -163,15 +166,13 @@ def examine(
 ) -> Judgement:
     """Hold a fit against alternatives.
 
-    `inverse` (D, D) is that of information and penalty, `delays` (tags, m) turns the parameters of the design into
-    delays in ns, `blocks` (n,) number short blocks of time; rows are in the order in which the design keeps them. `shape_m` (n,) is by how much ranges would be off, were the
-    shape that the fit takes for the tail of reflections another one.
+    `own` (blocks, D) are the slopes by the fitted parameters summed over short blocks of time, which `blocks` (n,)
+    number; `inverse` (D, D) is that of information and penalty, `delays` (tags, m) turns the parameters of the design
+    into delays in ns. `shape_m` (n,) is by how much ranges would be off, were the shape that the fit takes for the tail
+    of reflections another one. Rows are in the order in which the design keeps them.
     """
-    count = int(blocks.max()) + 1
-    own = scores.by_block(blocks, count)
     found, several, results = [], sum(len(family.names) for family in tested), {}
-    nowhere = np.zeros(len(shape_m), dtype=np.int64)
-    effect = -delays @ (scores.with_groups(shape_m, nowhere, 1) @ inverse)[0, : delays.shape[1]]
+    effect = -delays @ (scores.linked(shape_m, *everywhere(scores)) @ inverse)[0, : delays.shape[1]]
     widening = np.outer(effect, effect)
     for family in tested:
         result = _test(family, scores, own, inverse, delays, blocks, seconds)
@@ -181,6 +182,12 @@ def examine(
         found += list(_findings(family, result, several))
     found += list(_of_gain(found, tested, results))
     return Judgement(findings=sorted(found, key=lambda finding: -abs(finding.deviation)), widening_ns2=widening)
+
+
+def everywhere(scores: Scores) -> tuple[Runs, list[tuple[Ints, float]], int]:
+    """Return runs, ends and count of one group that all ranges belong to."""
+    runs = scores.design.runs()
+    return runs, [(np.zeros_like(runs.block), 1.0)], 1
 
 
 def _of_gain(found: list[Finding], tested: list[Family], results: dict[str, Tested]) -> Iterator[Finding]:
@@ -207,19 +214,16 @@ def _test(
     family: Family, scores: Scores, own: Floats, inverse: Floats, delays: Floats, blocks: Ints, seconds: float
 ) -> Tested:
     """Return a family's efficient slopes; `own` (blocks, D) are those by the fitted parameters."""
-    size, count = len(family.names), len(own)
-    link, plain = np.zeros((size, scores.size)), np.zeros((count, size))
-    square = np.zeros((size, size))
-    ends = [(family.place, 1.0)]
-    if family.second is not None:
-        ends.append((family.second, -1.0 if family.signed else 1.0))
-    slope, weighed = scores.score * family.weight, scores.known() * family.weight**2
-    for place, sign in ends:
-        link += sign * scores.with_groups(family.weight, place, size)
-        plain += sign * np.bincount(blocks * size + place, slope, minlength=count * size).reshape(count, size)
-        for other, its in ends:
-            both = np.bincount(place * size + other, weighed, minlength=size * size).reshape(size, size)
+    size, count, runs = len(family.names), len(own), family.runs
+    plain, square = np.zeros((count, size)), np.zeros((size, size))
+    slope, known = scores.score * family.weight, runs.sums((scores.known() * family.weight**2)[None])[:, 0]
+    for place, sign in family.ends:
+        where = blocks * size + runs.rows(place)
+        plain += sign * np.bincount(where, slope, minlength=count * size).reshape(count, size)
+        for other, its in family.ends:
+            both = np.bincount(place * size + other, known, minlength=size * size).reshape(size, size)
             square += sign * its * both
+    link = scores.linked(family.weight, runs, family.ends, size)
     taken = link @ inverse
     efficient = plain - own @ taken.T
     information = square - taken @ link.T

@@ -19,7 +19,7 @@ from calib.calibration.power_curves import (
     populated,
 )
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.design import Design, stable_order
+from calib.estimation.design import Design, Order, stable_order
 from calib.estimation.identifiability import identifiable_directions, require_determined
 from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.unknowns import Unknowns
@@ -321,7 +321,7 @@ def _first_splines(lifted: Floats, knots: Floats) -> Ints:
     return np.asarray(np.clip(found, DEGREE, len(knots) - DEGREE - 2) - DEGREE)
 
 
-def _weights(ranges: Ranges, rows: Ints, unknowns: Unknowns) -> Floats:
+def _weights(ranges: Ranges, rows: Order, unknowns: Unknowns) -> Floats:
     """Return the derivatives of ranges by the delays of their lower and their higher tag in ns, or by a constant."""
     metres = SPEED_OF_LIGHT * 1e-9
     if unknowns.of_pairs:

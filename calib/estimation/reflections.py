@@ -7,16 +7,11 @@ beside the core, as a single wall makes it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
+from calib.densities import densities
 from uwblink.arrays import Floats
-
-ROOT_2: Final = float(np.sqrt(2))
-ROOT_2PI: Final = float(np.sqrt(2 * np.pi))
-FARTHEST: Final = 30.0
-"""Sigmas beyond which the noise in a detour no longer depends on the error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,26 +45,15 @@ class Expected:
 
 
 def expected(error_m: Floats, shape: Shape) -> Expected:
-    """Return the expectation step.
-
-    The noise in an error with an exponential detour is normal, cut off above: with v = (e - least)/sigma and
-    u = v - sigma/mean its mean is sigma (sigma/mean - phi(u)/Phi(u)). The tail's density is
-    exp(-v^2/2) erfcx(-u/sqrt 2) / (2 mean), which neither overflows nor cancels for u < 5.
-    """
-    from scipy.special import erfcx
-
-    sigma = shape.sigma_m
-    z, v, ratio = error_m / sigma, (error_m - shape.least_m) / sigma, sigma / shape.mean_m
-    u = v - ratio
-    scaled = erfcx(np.minimum(u, FARTHEST) / -ROOT_2)
-    hazard = (2 / ROOT_2PI) / scaled
+    """Return the expectation step."""
+    found = densities(error_m, shape.sigma_m, shape.least_m, shape.mean_m)
     inside = 1 - shape.outlier_share
-    core = np.exp(-0.5 * z * z) * (inside * (1 - shape.tail_share)) / (sigma * ROOT_2PI)
-    near = 0.5 * np.exp(-0.5 * v * v) * scaled
-    tail = np.where(u < 5, near, np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)))
-    tail *= inside * shape.tail_share / shape.mean_m
+    tail = inside * shape.tail_share
+    core = (inside - tail) * found.direct
+    tail = tail * found.reflected
     total = core + tail + shape.outlier_share * shape.outlier_density
     core /= total
     tail /= total
-    spread = np.maximum(1 - u * hazard - hazard * hazard, 0.0)
-    return Expected(core=core, tail=tail, noise_m=sigma * (ratio - hazard), noise_var=spread, log_density=np.log(total))
+    return Expected(
+        core=core, tail=tail, noise_m=found.noise_m(), noise_var=found.noise_var(), log_density=np.log(total)
+    )

@@ -82,10 +82,12 @@ def robust_fit(
         # longer changes, and the last one serves on.
         if (near or steps >= SETTLING) and moved < NEWTON_M and (curvature is None or moved > CHORD_M):
             curvature = _descending(design.normal(slope) + ridge)
-        step = None if curvature is None else np.linalg.solve(curvature, downhill)
-        change = None if step is None else design.times(step)
-        if step is None or change is None or np.max(np.abs(change)) > NEWTON_M:
-            step = np.linalg.lstsq(design.normal(weight) + ridge, downhill, rcond=1e-13)[0]
+        step, change = x, np.array([np.inf])
+        if curvature is not None:
+            step = np.asarray(np.linalg.solve(curvature, downhill))
+            change = design.times(step)
+        if np.max(np.abs(change)) > NEWTON_M:
+            step = _solved(design.normal(weight) + ridge, downhill)
             change, curvature = design.times(step), None
         x, residual = np.asarray(x + step), residual + change
         # What no range determines may go where rounding takes it.
@@ -94,6 +96,11 @@ def robust_fit(
         if scale is None and steps <= SETTLING:
             width = scale_of(residual)
     return Solution(x, design.given(residual), width, steps, moved <= STILL_M)
+
+
+def _solved(square: Floats, pull: Floats) -> Floats:
+    """Return the shortest solution, where some direction may be left open."""
+    return np.asarray(np.linalg.lstsq(square, pull, rcond=1e-13)[0], np.float64)
 
 
 def _descending(curvature: Floats) -> Floats | None:
@@ -116,7 +123,7 @@ def _absolute_start(design: Design, error: Floats, ridge: Floats) -> Floats:
     x = np.zeros(design.shape[1])
     for _ in range(5):
         downhill = -design.pull(weight * residual) - ridge @ x
-        x = x + np.linalg.lstsq(design.normal(weight) + ridge, downhill, rcond=1e-13)[0]
+        x = x + _solved(design.normal(weight) + ridge, downhill)
         residual = error + design.times(x)
         size = np.abs(residual)
         weight = 1 / np.maximum(size, 0.1 * np.median(size) + 1e-9)

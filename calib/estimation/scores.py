@@ -8,18 +8,15 @@ follows from the range's place. No matrix of ranges by parameters is ever built:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.estimation.design import Design
+from calib.estimation.design import Design, Runs
 from uwblink.arrays import Floats, Ints
-
-Places = NDArray[np.signedinteger[Any]]
-"""Numbers of places, in as few bytes as they take."""
 
 _NOTHING: Final = np.zeros((0, 0))
 
@@ -88,29 +85,37 @@ class Scores:
         """Return slopes summed within blocks of time (blocks, parameters), of which `blocks` (n,) are the numbers."""
         found = np.empty((count, self.size))
         found[:, : self.design.shape[1]] = self.design.by_group(self.score, blocks, count)
-        for sums, where in zip(self._in_groups(None, blocks, count), self.slices(), strict=True):
+        every = np.repeat(np.arange(len(self.design.counts)), self.design.counts)
+        for sums, where in zip(self._of_sorts(self.slopes, blocks, every, count), self.slices(), strict=True):
             found[:, where] = sums
         return found
 
-    def with_groups(self, weight: Floats, group: Places, count: int) -> Floats:
+    def linked(self, weight: Floats | float, runs: Runs, ends: Sequence[tuple[Ints, float]], count: int) -> Floats:
         """Return what links offsets to the parameters (count, parameters).
 
-        An offset in metres that a group of ranges has, times a range's `weight` (n,); `group` (n,) says which group.
+        An offset in metres that a group of runs has, times a range's `weight` (n,); each of `ends` says which group of
+        `count` a run belongs to (runs,), and with which sign.
         """
-        own = self.design.by_group(self.known() * weight, group, count)
-        return np.hstack([own, *self._in_groups(self.score * weight, group, count)])
+        known, slope = self.known() * weight, self.score * weight
+        sums = np.empty((len(runs.block), self.design.values.shape[0] + len(self.slopes)))
+        for k, column in enumerate([*self.design.values, *self.slopes]):
+            by = known if k < len(self.design.values) else slope
+            sums[:, k] = np.add.reduceat(column * by, runs.starts[:-1])
+        own = self.design.values.shape[0]
+        found = np.zeros((count, self.size))
+        for group, sign in ends:
+            found[:, : self.design.shape[1]] += sign * self.design.grouped(sums[:, :own], group, count, runs.block)
+            parts = self._of_sorts([sums[:, own + k] for k in range(len(self.slopes))], group, runs.block, count)
+            for part, where in zip(parts, self.slices(), strict=True):
+                found[:, where] += sign * part
+        return found
 
-    def _in_groups(self, weight: Floats | None, group: Places, count: int) -> list[Floats]:
-        """Return sums of slopes (n,), times a weight, by group and by the parameters of each sort (count, own)."""
+    def _of_sorts(self, sums: Sequence[Floats], group: Ints, block: Ints, count: int) -> list[Floats]:
+        """Return sums of slopes over runs of blocks (runs,) by group and by each sort's parameters (count, own)."""
         if not self.sorts:
             return []
-        both = group * self.places
-        if self.place is not None:
-            both += np.repeat(self.place, self.design.counts)
-        tables = [
-            np.asarray(np.bincount(both, slope if weight is None else slope * weight, count * self.places), float)
-            for slope in self.slopes
-        ]
+        both = group * self.places + (0 if self.place is None else self.place[block])
+        tables = [np.asarray(np.bincount(both, some, count * self.places), float) for some in sums]
         by_place = [table.reshape(count, self.places).T for table in tables]
         return [_whose(sort, by_place[sort.slope]).T for sort in self.sorts]
 

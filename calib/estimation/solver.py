@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from calib.estimation.design import Design
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
 from calib.estimation.losses import LOSSES, MIXTURE
-from calib.estimation.design import Design
 from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
 from calib.estimation.persistence import Persistence, lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
@@ -40,7 +40,8 @@ class Solved:
     """Parameters (m,) and their covariance (m, m), stated by the gauge, and how it ended.
 
     `residuals` (n,) are fitted less true ranges, `scale` is that of the loss, in metres. `scores` are the slopes at the
-    optimum by what determined the delays, with the `inverse` (D, D) of information and penalty; `delays` (tags, k)
+    optimum by what determined the delays, `by_block` (blocks, D) their sums over short blocks of time, with the
+    `inverse` (D, D) of information and penalty; `delays` (tags, k)
     turns the parameters behind them into stated delays. `lasting` is how long errors last, `mixture` what they are made
     of, where that was fitted. It is `astray` where it took all ranges of some pair for outliers, as far from a robust
     loss may not end: a likelihood climbs, and where few powers or distances leave the design nearly open it can climb
@@ -54,6 +55,7 @@ class Solved:
     steps: int
     success: bool
     scores: Scores
+    by_block: Floats
     inverse: Floats
     delays: Floats
     lasting: Persistence
@@ -113,6 +115,7 @@ def solve(
         steps=steps,
         success=success,
         scores=scores,
+        by_block=known.by_block,
         inverse=inverse,
         delays=delays,
         lasting=known.lasting,
@@ -208,6 +211,7 @@ def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None, ref
         steps=alone.steps + first.steps + curves.steps,
         success=alone.success and curves.success,
         scores=scores,
+        by_block=known.by_block,
         inverse=inverse,
         delays=problem.directions,
         lasting=known.lasting,

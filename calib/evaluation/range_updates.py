@@ -8,16 +8,11 @@ follow exactly (Gaussian noise and state, moments of the posterior).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
+from calib.densities import ROOT_2PI, densities
 from uwblink.arrays import Bools, Floats
-
-ROOT_2: Final = float(np.sqrt(2))
-ROOT_2PI: Final = float(np.sqrt(2 * np.pi))
-FARTHEST: Final = 30.0
-"""Sigmas beyond which the noise in a detour no longer depends on the innovation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,27 +58,18 @@ def gated(innovation_m: Floats, variance_m2: Floats, gate: float) -> Heard:
 def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> Heard:
     """Weigh noise, reflection and outlier by how likely each made an innovation of such noise.
 
-    The noise in a reflected range is normal, cut off above (docs/theory.md): with u = (e - a)/s - s/m its mean is
-    s (s/m - phi(u)/Phi(u)). An outlier says nothing.
+    The noise in a reflected range is normal, cut off above (`calib.densities`, docs/theory.md). An outlier says
+    nothing.
     """
-    from scipy.special import erfcx
-
-    s = np.sqrt(variance_m2)
-    z, away, ratio = innovation_m / s, (innovation_m - errors.least_m) / s, s / errors.detour_m
-    u = away - ratio
-    scaled = erfcx(np.minimum(u, FARTHEST) / -ROOT_2)
-    hazard = (2 / ROOT_2PI) / scaled
+    found = densities(innovation_m, np.sqrt(variance_m2), errors.least_m, errors.detour_m)
     inside = 1 - errors.outlier
-    core = np.exp(-0.5 * z * z) * (inside * (1 - errors.share)) / (s * ROOT_2PI)
-    near = 0.5 * np.exp(-0.5 * away * away) * scaled
-    tail = np.where(u < 5, near, np.exp(np.minimum(ratio * (0.5 * ratio - away), 50.0)))
-    tail = tail * (inside * errors.share / errors.detour_m)
-    wide = np.hypot(errors.outlier_m, s)
+    core = found.direct * (inside * (1 - errors.share))
+    tail = found.reflected * (inside * errors.share)
+    wide = np.hypot(errors.outlier_m, found.sigma_m)
     wild = errors.outlier * np.exp(-0.5 * (innovation_m / wide) ** 2) / (wide * ROOT_2PI) + 1e-300
     total = core + tail + wild
     core, tail, wild = core / total, tail / total, wild / total
-    of_tail = s * (ratio - hazard)
-    spread = variance_m2 * np.maximum(1 - u * hazard - hazard**2, 0.0)
+    of_tail, spread = found.noise_m(), variance_m2 * found.noise_var()
     mean = core * innovation_m + tail * of_tail
     square = core * innovation_m**2 + tail * (of_tail**2 + spread) + wild * variance_m2
     return Heard(
@@ -91,5 +77,5 @@ def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> H
         variance_m2=np.maximum(square - mean**2, 0.0),
         believed=wild < 0.5,
         log_density=np.log(total),
-        nis=z * z,
+        nis=innovation_m**2 / variance_m2,
     )

@@ -4,9 +4,23 @@ import numpy as np
 import pytest
 
 from calib.errors import UnanswerableError
-from calib.estimation.identifiability import identifiable_directions, require_determined
-from calib.estimation.robust import design
-from tests.calib.synthetic import ranges
+from calib.estimation.identifiability import identifiable_directions, require_determined, square_of
+from tests.calib.synthetic import design, ranges
+from uwblink.ticks import SPEED_OF_LIGHT
+
+
+def directions_of(r):
+    square, pairs = square_of(r.tags(), r.initiator, r.target, r.weight_initiator, r.weight_target)
+    return identifiable_directions(square, r.tags(), pairs)
+
+
+def test_the_square_is_that_of_the_matrix_written_out():
+    r = ranges(600)
+    matrix = design(r, r.tags()) / (SPEED_OF_LIGHT * 1e-9)
+    square, pairs = square_of(r.tags(), r.initiator, r.target, r.weight_initiator, r.weight_target)
+    np.testing.assert_allclose(square, matrix.T @ matrix, rtol=1e-12)
+    there = set(zip(r.initiator.tolist(), r.target.tolist(), strict=True))
+    assert {(a, b) for a, b in pairs.tolist()} == there | {(b, a) for a, b in there}
 
 
 @pytest.mark.parametrize("pairs", [[(1, 2)], [(1, 2), (1, 3), (1, 7)], [(1, 3), (1, 7), (2, 3), (2, 7)]])
@@ -14,7 +28,7 @@ def test_bipartite_pairs_do_not_determine_delays(pairs):
     r = ranges(600)
     keep = np.array([(i, j) in pairs for i, j in zip(r.initiator, r.target, strict=True)])
     r = r[keep]
-    directions, free = identifiable_directions(design(r, r.tags()), r.tags(), r.initiator, r.target)
+    directions, free = directions_of(r)
     assert free == [r.tags()]
     assert directions.shape == (len(r.tags()), len(r.tags()) - 1)
     with pytest.raises(UnanswerableError, match=r"tags 1, (2|3)"):
@@ -24,7 +38,7 @@ def test_bipartite_pairs_do_not_determine_delays(pairs):
 def test_three_tags_that_all_range_are_determined():
     r = ranges(600)
     r = r[np.isin(r.initiator, [1, 2, 3]) & np.isin(r.target, [1, 2, 3])]
-    directions, free = identifiable_directions(design(r, r.tags()), r.tags(), r.initiator, r.target)
+    directions, free = directions_of(r)
     assert free == []
     require_determined(free)
     np.testing.assert_array_equal(directions, np.eye(3))
@@ -34,4 +48,4 @@ def test_groups_that_shift_together_are_told_apart():
     r = ranges(600)
     keep = np.array([(i, j) in [(1, 2), (3, 7)] for i, j in zip(r.initiator, r.target, strict=True)])
     r = r[keep]
-    assert identifiable_directions(design(r, r.tags()), r.tags(), r.initiator, r.target)[1] == [[1, 2], [3, 7]]
+    assert directions_of(r)[1] == [[1, 2], [3, 7]]

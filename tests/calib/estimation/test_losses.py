@@ -12,9 +12,9 @@ import calib
 from calib.errors import BadInputError
 from calib.estimation.fitting import fit
 from calib.estimation.losses import LOSSES, register_loss
-from calib.estimation.robust import design, robust_fit
+from calib.estimation.robust import robust_fit
 from calib.samples import sample_flight
-from tests.calib.synthetic import DELAYS_NS, ranges
+from tests.calib.synthetic import DELAYS_NS, design, ranges
 from uwblink.recording.file import Recording
 
 

@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import exponnorm
 
-from calib.estimation.pair_mixture import Errors, Layout, _scores, fit_pair_mixture
+from calib.estimation.design import Design
+from calib.estimation.pair_mixture import Errors, Layout, _sums, fit_pair_mixture
 from calib.estimation.reflections import Shape, expected
 from calib.estimation.scores import Scores, Sort, inverse_of
 
 
 def errors(n=600, pairs=3, seed=4):
     rng = np.random.default_rng(seed)
-    return Errors(
-        error=rng.normal(0, 0.08, n) + (rng.random(n) < 0.2) * rng.exponential(0.3, n),
-        design=rng.normal(size=(n, 2)),
-        place=rng.integers(0, 8 * pairs, n),
-        pairs=pairs,
-        density=0.2,
-    )
+    error = rng.normal(0, 0.08, n) + (rng.random(n) < 0.2) * rng.exponential(0.3, n)
+    return Errors.of(error, rng.normal(size=(n, 2)), rng.integers(0, 8 * pairs, n), pairs)
 
 
 def test_slopes_are_those_of_the_likelihood():
@@ -28,13 +24,13 @@ def test_slopes_are_those_of_the_likelihood():
     theta = rng.normal(0, 0.1, layout.slices()["pair_mean"].stop)
     for name, start in (("mean", np.log(0.3)), ("least", np.log(0.05)), ("outliers", -4), ("cell_noise", -2.4)):
         theta[layout.slices()[name]] += start
-    scores, _ = _scores(some, layout, theta)
+    sums, _ = _sums(some, layout, theta, squares=False)
     step, found = 1e-6, []
     for k in range(len(theta)):
         moved = np.eye(len(theta))[k] * step
-        change = _scores(some, layout, theta + moved)[1] - _scores(some, layout, theta - moved)[1]
-        found.append(change.sum() / (2 * step))
-    np.testing.assert_allclose(scores.gradient(), found, rtol=1e-5, atol=1e-4)
+        up, down = (_sums(some, layout, at, squares=False)[1] for at in (theta + moved, theta - moved))
+        found.append((up - down) / (2 * step))
+    np.testing.assert_allclose(sums.gradient(), found, rtol=1e-5, atol=1e-4)
 
 
 def test_the_density_is_that_of_scipy():
@@ -57,11 +53,13 @@ def test_the_density_is_that_of_scipy():
 def scores():
     rng = np.random.default_rng(2)
     n = 500
+    place = rng.integers(0, 8, n)
+    design = Design.whole(rng.normal(size=(n, 3))).blocked(place)
     return Scores(
-        design=rng.normal(size=(n, 3)),
+        design=design,
         score=rng.normal(size=n),
         slopes=tuple(rng.normal(size=(3, n))),
-        place=rng.integers(0, 8, n),
+        place=design.first_of(design.kept(place)),
         places=8,
         sorts=(
             Sort(slope=0),
@@ -72,51 +70,46 @@ def scores():
     )
 
 
+def rows_of(scores):
+    """The design in the order of its kept rows."""
+    return scores.design.written_out()[scores.design.order]
+
+
 def written_out(scores):
     """The matrix that `Scores` never builds."""
-    columns = [scores.design * scores.score[:, None]]
+    columns = [rows_of(scores) * scores.score[:, None]]
+    place = np.repeat(scores.place, scores.design.counts)
     for sort in scores.sorts:
         whose = np.zeros(8, dtype=int) if sort.whose is None else sort.whose
-        columns.append(np.eye(sort.count)[whose[scores.place]] * scores.slopes[sort.slope][:, None])
+        columns.append(np.eye(sort.count)[whose[place]] * scores.slopes[sort.slope][:, None])
     return np.hstack(columns)
 
 
 def test_sums_are_those_of_the_matrix_written_out(scores):
     matrix = written_out(scores)
     np.testing.assert_allclose(scores.gradient(), matrix.sum(axis=0), atol=1e-9)
-    blocks = np.arange(500) // 30
+    blocks = np.random.default_rng(9).integers(0, 17, 500)
     expected_sums = np.array([matrix[blocks == b].sum(axis=0) for b in range(17)])
     np.testing.assert_allclose(scores.by_block(blocks, 17), expected_sums, atol=1e-9)
-    square = matrix.T @ matrix
-    np.testing.assert_allclose(scores.information(), square, atol=1e-9)
-    parts = [
-        replace(
-            scores,
-            design=scores.design[rows],
-            score=scores.score[rows],
-            place=scores.place[rows],
-            slopes=tuple(slope[rows] for slope in scores.slopes),
-        )
-        for rows in (slice(0, 300), slice(300, None))
-    ]
-    both = parts[0].sums() + parts[1].sums()
-    np.testing.assert_allclose(both.information(), square, atol=1e-9)
-    np.testing.assert_allclose(both.gradient(), matrix.sum(axis=0), atol=1e-9)
+    np.testing.assert_allclose(scores.information(), matrix.T @ matrix, atol=1e-9)
 
 
 def test_a_curvature_of_its_own_is_that_of_the_design(scores):
     curvature = np.random.default_rng(7).uniform(0.5, 1, 500)
-    square = (scores.design * curvature[:, None]).T @ scores.design
+    square = (rows_of(scores) * curvature[:, None]).T @ rows_of(scores)
     plain = replace(scores, curvature=curvature)
     np.testing.assert_allclose(plain.information()[:3, :3], square, atol=1e-9)
+    np.testing.assert_allclose(replace(plain, sorts=(), slopes=()).information(), square, atol=1e-9)
 
 
 def test_offsets_of_groups_are_linked_as_columns_would_be(scores):
     rng = np.random.default_rng(3)
-    weight, place = rng.normal(size=500), rng.integers(0, 5, 500)
-    offsets = np.eye(5)[place] * weight[:, None]
-    link = scores.with_groups(weight, place, 5)
-    np.testing.assert_allclose(link[:, :3], (offsets * scores.score[:, None] ** 2).T @ scores.design, atol=1e-9)
+    weight, stretch = rng.normal(size=500), np.arange(500) // 90
+    runs = scores.design.runs(stretch)
+    ends = [(rng.integers(0, 5, len(runs.block)), sign) for sign in (1.0, -1.0)]
+    offsets = sum(sign * np.eye(5)[runs.rows(place)] for place, sign in ends) * weight[:, None]
+    link = scores.linked(weight, runs, ends, 5)
+    np.testing.assert_allclose(link[:, :3], (offsets * scores.score[:, None] ** 2).T @ rows_of(scores), atol=1e-9)
     rest = (offsets * scores.score[:, None]).T @ written_out(scores)[:, 3:]
     np.testing.assert_allclose(link[:, 3:], rest, atol=1e-9)
 
@@ -143,7 +136,8 @@ def test_eliminating_places_first_gives_the_same_inverse():
 def test_where_reflections_last_pairs_are_drawn_together():
     rng = np.random.default_rng(8)
     some = errors(n=3000, pairs=6)
-    reflected = rng.random(3000) < np.linspace(0.05, 0.5, 6)[some.place // 8]
+    pair = np.repeat(some.place // 8, some.design.counts)
+    reflected = rng.random(3000) < np.linspace(0.05, 0.5, 6)[pair]
     some = replace(some, error=rng.normal(0, 0.05, 3000) + reflected * rng.exponential(0.4, 3000))
     nothing = np.zeros(2), np.eye(2)
     spread = [np.std(fit_pair_mixture(some, *nothing, lasting).of("pair_share")) for lasting in (1.0, 30.0)]

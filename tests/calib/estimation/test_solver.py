@@ -13,11 +13,11 @@ from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.fitting import fit
 from calib.estimation.problem import build_problem
-from calib.estimation.robust import design, quadratic_model, robust_fit
+from calib.estimation.robust import quadratic_model, robust_fit
 from calib.estimation.smoothing import reml_penalty
 from calib.estimation.solver import solve
 from calib.ranges import without_static
-from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
+from tests.calib.synthetic import DELAYS_NS, bias_m, design, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 METRES_A_NS = SPEED_OF_LIGHT * 1e-9
@@ -32,7 +32,7 @@ def problem_of(r, groups=None, minimum_norm=False):
 def test_the_joint_optimum_is_scipys():
     problem = problem_of(ranges(9000))
     found = solve(problem, "cauchy", 0.1 * METRES_A_NS, sequential=False)
-    width = 0.1 * METRES_A_NS
+    width, written = 0.1 * METRES_A_NS, problem.design.written_out()
     residual = problem.error + problem.design @ found.parameters
     # The penalty that the fit chose is recovered from its own optimum: the gradient of the loss is balanced by it.
     near = quadratic_model(problem.design, residual, "cauchy", width)
@@ -41,16 +41,16 @@ def test_the_joint_optimum_is_scipys():
     root = np.hstack([np.zeros((len(root), problem.rank)), root])
 
     def cost(x):
-        u = (problem.error + problem.design @ x) / width
+        u = (problem.error + written @ x) / width
         # Half of scipy's sum of squares is the loss: sign(u) sqrt(log(1 + u^2)) squared is Cauchy's.
         return np.concatenate([np.sign(u) * np.sqrt(np.log1p(u**2)) * width, root @ x])
 
     def slope(x):
-        u = (problem.error + problem.design @ x) / width
+        u = (problem.error + written @ x) / width
         size = np.sqrt(np.log1p(u**2))
         with np.errstate(invalid="ignore", divide="ignore"):
             factor = np.where(np.abs(u) < 1e-6, 1.0, np.abs(u) / ((1 + u**2) * size))
-        return np.vstack([factor[:, None] * problem.design, root])
+        return np.vstack([factor[:, None] * written, root])
 
     joint = robust_fit(problem.design, problem.error, "cauchy", width, ridge, found.parameters, near=True)
     x = joint.parameters + 0.003
