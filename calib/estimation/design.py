@@ -95,7 +95,7 @@ class Design:
         """Return values of rows (n,) in the order in which rows are kept."""
         return given if self.order is None else given[self.order]
 
-    def given(self, kept: Floats) -> Floats:
+    def given(self, kept: NDArray[Any]) -> NDArray[Any]:
         """Return values of kept rows (n,) in the order in which rows were given."""
         if self.order is None:
             return kept
@@ -192,6 +192,12 @@ class Design:
             for column, value in zip(self.columns[blocks].T, self.values[:, rows], strict=True):
                 raw += np.bincount(own + np.repeat(column, counts), weight * value, count * size)
         return np.asarray(raw.reshape(count, size) @ self.turn)
+
+    def like(self, matrix: Floats) -> Design:
+        """Return another matrix (n, k), of which all entries count, with the same order of rows and the same blocks."""
+        columns = np.tile(np.arange(matrix.shape[1]), (len(self.counts), 1))
+        values = np.ascontiguousarray(self.kept(matrix).T)
+        return Design(values, self.order, self.starts, columns, np.eye(matrix.shape[1]))
 
     def part(self, parameters: slice) -> Design:
         """Return some columns of the matrix, without the entries that stand in none of them."""

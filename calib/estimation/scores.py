@@ -60,6 +60,11 @@ class Scores:
         ends = np.cumsum([self.design.shape[1], *(sort.count for sort in self.sorts)]).tolist()
         return [slice(a, b) for a, b in pairwise(ends)]
 
+    def places_given(self) -> Ints:
+        """Return the place of each range (n,), in the order of given rows."""
+        place = np.zeros(len(self.design.counts), dtype=np.int64) if self.place is None else self.place
+        return self.design.given(np.repeat(place, self.design.counts))
+
     def known(self) -> Floats:
         """Return what each range knows of its residual (n,), in 1/m^2."""
         return self.score * self.score if self.curvature is None else self.curvature

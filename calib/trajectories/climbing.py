@@ -60,7 +60,7 @@ class Climbed:
 def climb(scene: Scene, problem: Problem, state: State, done: Callable[[float], None]) -> Climbed:
     """Return the likeliest unknowns, beginning with a robust loss and a state that has its standing bodies in place."""
     columns = columns_of(scene, problem.design.shape[1])
-    rows = range_rows(scene, columns, problem.error + problem.ranges.truth_m, problem.design)
+    rows = range_rows(scene, columns, problem.error + problem.ranges.truth_m, problem.design.written_out())
     search = _Search(scene, problem, columns, rows, done)
     search.begin(state)
     search.go(Cauchy(FIRST_SCALE_M), 1 / (2 * FIRST_SCALE_M**2))
@@ -147,7 +147,7 @@ class _Search:
     def expected(self, mixture: PairMixture) -> Floats:
         """Return what ranges are expected to say (n,): squared scores, averaged over a pair's ranges at a power."""
         slope, _ = loss_of(mixture).slopes(self.residual())
-        place = np.asarray(mixture.scores.place)
+        place = mixture.scores.places_given()
         count = np.bincount(place)
         mean = np.bincount(place, slope**2) / np.maximum(count, 1)
         # A place with few ranges has the average of all.

@@ -71,7 +71,8 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
     design = (border - local @ whole.reach) @ taken
     held = (climbed.known.border - climbed.known.local @ whole.reach) @ taken
     slope, _ = loss_of(climbed.mixture).slopes(climbed.rows.residuals(climbed.state))
-    scores = replace(climbed.mixture.scores, design=design, score=-slope)
+    known = climbed.mixture.scores
+    scores = replace(known, design=known.design.like(design), score=known.design.kept(-slope))
     precision = climbed.mixture.precision.copy()
     precision[:columns, :columns] = climbed.ridge[:columns, :columns] + held.T @ held
     pairs = len(problem.pairs.ends)
@@ -79,10 +80,10 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
     stated = stating(problem, reference)
     delays = problem.directions @ stated[: problem.rank]
     blocks, seconds = blocks_of(problem.ranges.time_ns)
-    known = intervals(scores, inverse, precision, delays, problem.rank, blocks=blocks, seconds=seconds)
+    of_blocks = intervals(scores, inverse, precision, delays, problem.rank, blocks=blocks, seconds=seconds)
     found = climbed.state.border[:columns]
     shares = [_of_curve(climbed.ridge[:columns, :columns], curve) for _, curve in problem.curves()]
-    covariance = known.covariance / (1 - climbed.used) + unsure(inverse[:columns, :columns], found, shares)
+    covariance = of_blocks.covariance / (1 - climbed.used) + unsure(inverse[:columns, :columns], found, shares)
     solved = Solved(
         parameters=stated @ found,
         covariance=stated @ covariance @ stated.T,
@@ -91,9 +92,10 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
         steps=climbed.steps,
         success=climbed.settled,
         scores=scores,
+        by_block=of_blocks.by_block,
         inverse=inverse,
         delays=delays,
-        lasting=known.lasting,
+        lasting=of_blocks.lasting,
         mixture=climbed.mixture,
     )
     rank = problem.rank

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from calib.estimation.pair_mixture import CELLS, Errors, PairMixture, fit_pair_mixture
-from calib.estimation.problem import Problem
+from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
+from calib.estimation.problem import CELLS, Problem
 from calib.estimation.reflections import Shape
 from calib.trajectories.range_losses import Reflecting
 from uwblink.arrays import Floats
@@ -17,22 +18,14 @@ OUTLIERS_OVER_M: Final = 10.0
 
 def mixture_of(problem: Problem, error_m: Floats, start: Floats, ridge: Floats) -> PairMixture:
     """Fit what errors (n,) of ranges against given distances are made of, with delays and curve from `start` (m,)."""
-    bins, pairs = problem.bins, problem.pairs
-    errors = Errors(
-        error=error_m,
-        design=problem.design,
-        place=pairs.number * CELLS + bins.number * CELLS // len(bins.count),
-        pairs=len(pairs.ends),
-        density=1 / OUTLIERS_OVER_M,
-    )
-    return fit_pair_mixture(errors, start, ridge)
+    pairs = problem.pairs
+    errors = Errors.of(error_m, problem.design, pairs.number * CELLS + problem.cell, len(pairs.ends))
+    return fit_pair_mixture(replace(errors, density=1 / OUTLIERS_OVER_M), start, ridge)
 
 
 def loss_of(mixture: PairMixture) -> Reflecting:
     """Return the mixture as a loss of residuals, with everything but the residuals as it was found."""
-    place = mixture.scores.place
-    if place is None:
-        raise ValueError("a mixture without places")
+    place = mixture.scores.places_given()
     sigma = np.exp(mixture.of("pair_noise")[:, None] + mixture.of("cell_noise")).ravel()
     share = 1 / (1 + np.exp(-mixture.of("pair_share")[:, None] - mixture.of("cell_share"))).ravel()
     return Reflecting(
