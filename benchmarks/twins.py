@@ -17,7 +17,7 @@ import uwbsim
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import load
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.radio import TwoStateMultipath
+from uwbsim.scenario.multipath import TwoStateMultipath
 from uwbsim.twins.fitting import Twin
 from uwbsim.world.reflected_states import share_and_life
 

@@ -6,7 +6,21 @@ import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+
+class FileKey(NamedTuple):
+    """A key of a file, for readers and for the reference: dotted below tables, in capitals where people choose it."""
+
+    name: str
+    kind: str
+    default: str
+    meaning: str
+
+
+def heads(keys: Iterable[FileKey]) -> tuple[str, ...]:
+    """Return the keys and tables of the first level, each once, in order."""
+    return tuple(dict.fromkeys(key.name.split(".")[0] for key in keys))
 
 from uwblink.text_files import read_text
 

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from uwbsim.scenario.model import FixedReply, Mocap, Ranging, Tag
+from uwbsim.scenario.model import Mocap
 from uwbsim.scenario.radio import Radio
+from uwbsim.scenario.ranging import FixedReply, Ranging
+from uwbsim.scenario.tags import Tag
 
 PACKAGE = Path(__file__).parents[2] / "uwbsim"
 ROOMS = ("world", "simulation")

@@ -25,10 +25,22 @@ from typing import Any, Final, Literal
 from uwblink.errors import PlanError
 from uwblink.recording.schema import Tag
 from uwblink.recording.tags import is_board_id, read_tags
-from uwblink.toml import TomlReader, is_number
+from uwblink.toml import FileKey, TomlReader, heads, is_number
 
 PROTOCOLS: Final = ("ds", "ss")
-KEYS: Final = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "tags")
+FILE_KEYS: Final = (
+    FileKey("pairs", '"all" or [[initiator, target], ...]', '"all"', "Who ranges with whom, in turns."),
+    FileKey("rate_hz", "number, Hz, above 0", "as fast as the boards answer", "Exchanges a second in total."),
+    FileKey("protocol", '"ds" or "ss"', '"ds"', "Double-sided or single-sided ranging."),
+    FileKey("target_reports", "true or false", "false", "Whether the target reports each exchange, too."),
+    FileKey(
+        "get_cir", "true or false", "false", "Whether the initiator prints its channel impulse response; this is slow."
+    ),
+    FileKey("tags[].id", "whole number, 0 to 254", "needed", "A board whose place on a body is known."),
+    FileKey("tags[].body", "text", "needed", "The body that carries it, as motion capture calls it."),
+    FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Where its antenna sits in the body's frame."),
+)
+KEYS: Final = tuple(name.removesuffix("[]") for name in heads(FILE_KEYS))
 
 
 @dataclass(frozen=True, slots=True)

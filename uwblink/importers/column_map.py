@@ -42,7 +42,7 @@ from typing import Any, Final
 from uwblink.errors import ImportTableError
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import TICKS_PER_SECOND
-from uwblink.toml import TomlReader, is_number
+from uwblink.toml import FileKey, TomlReader, heads, is_number
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
@@ -68,10 +68,74 @@ TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 ISO: Final = "iso"
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
 DELIMITERS: Final = (",", ";", "\t", "|", " ")
-KEYS: Final = (
-    "layout", "bits", "counter", "protocol", "delimiter", "decimal", "within_s",
-    "columns", "units", "constants", "ids", "antenna_delays", "each", "topics",
-)  # fmt: skip
+FILE_KEYS: Final = (
+    FileKey(
+        "layout",
+        '"exchanges", "messages", "stamps", "parts" or "ranges"',
+        "by the columns that there are; parts must be said",
+        "What a row is: an exchange; a message; a stamp with `message`, as devices log their own; one part of an "
+        "exchange, as where both devices report; a range without stamps.",
+    ),
+    FileKey("bits", "32 or 40", "32 where the stamps fit, else 40", "Width of the counter that the stamps come from."),
+    FileKey(
+        "counter",
+        '"wrapped", "signed" or "unwrapped"',
+        "by the numbers",
+        "Whether it goes from 0 to 2^bits, is negative in its upper half, or counts on.",
+    ),
+    FileKey(
+        "protocol",
+        '"ss", "ss-cfo", "ds", "ds-alt", "ds-sym" or a registered one',
+        "ds where there are six stamps, or ds-alt where only that makes ranges; else ss",
+        "The protocol of the exchanges.",
+    ),
+    FileKey("delimiter", "one of , ; tab | and blank", "by the first lines", "What stands between cells."),
+    FileKey("decimal", '"." or ","', "by the first lines", "What stands in numbers."),
+    FileKey("within_s", "number, s", "1", "Rows of one exchange lie no further apart."),
+    FileKey("columns.NAME", "text", "our name", "What the table calls the column NAME of ours."),
+    FileKey(
+        "units.stamps",
+        '"ticks", "ps", "ns", "us", "s", or the length of a unit in seconds',
+        "ticks",
+        "Unit of stamps; a tick is 15.65 ps, as the DW1000 counts.",
+    ),
+    FileKey(
+        "units.time",
+        '"s", "ms", "us", "ns" or "iso"',
+        "s, or iso where the column holds no number",
+        "Unit of `time_s`; iso is as 2024-05-06T07:08:09.5+02:00, UTC where no zone is named.",
+    ),
+    FileKey("units.distance", '"m", "cm", "mm", "ft" or "in"', "m", "Unit of ranges, true distances and positions."),
+    FileKey(
+        "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that is not there."
+    ),
+    FileKey(
+        'ids."WORD"', "whole number", "free ones, in the order of the words", "The number of an id that is a word."
+    ),
+    FileKey("antenna_delays.unit", '"ticks" or "ns"', "ticks", "Unit of the antenna delays below."),
+    FileKey(
+        "antenna_delays.tx",
+        "number",
+        "not known; 16436 is assumed",
+        "What was programmed into all devices for sending.",
+    ),
+    FileKey(
+        "antenna_delays.rx",
+        "number",
+        "not known; 16436 is assumed",
+        "What was programmed into all devices for receiving; 0 where nothing was.",
+    ),
+    FileKey("antenna_delays.tags.ID.tx", "number", "as all", "What was programmed into one device for sending."),
+    FileKey("antenna_delays.tags.ID.rx", "number", "as all", "What was programmed into one device for receiving."),
+    FileKey("each", "text", "a message is a row", "Of bags: the list in a message whose elements are the rows."),
+    FileKey(
+        'topics."TOPIC"',
+        "table of constants",
+        "the only topic of the bag",
+        "Of bags: a topic to read, and what its messages do not say.",
+    ),
+)
+KEYS: Final = heads(FILE_KEYS)
 REGISTER_MAX: Final = 65_535
 
 

@@ -13,18 +13,18 @@ from uwbsim.scenario.base import NotNegative, Positive, Section
 class Constant(Section):
     """The same all the time; a number alone means this."""
 
-    model: Literal["constant"] = "constant"
-    value: float
+    model: Literal["constant"] = Field("constant", description="The same all the time.")
+    value: float = Field(description="Its value.")
 
 
 class Ramp(Section):
     """From one value to another, evenly, over `duration_s` from `begin_s` on; constant before and after."""
 
-    model: Literal["ramp"]
-    start: float
-    end: float
-    duration_s: Positive
-    begin_s: float = 0.0
+    model: Literal["ramp"] = Field(description="From one value to another, evenly.")
+    start: float = Field(description="The value before.")
+    end: float = Field(description="The value after.")
+    duration_s: Positive = Field(description="How long it takes.")
+    begin_s: float = Field(0.0, description="When it begins.")
 
 
 class WarmUp(Section):
@@ -33,11 +33,11 @@ class WarmUp(Section):
     Constant before `begin_s`; a negative one means that part of it is over when the run begins.
     """
 
-    model: Literal["warm-up"]
-    start: float
-    end: float
-    time_constant_s: Positive
-    begin_s: float = 0.0
+    model: Literal["warm-up"] = Field(description="From one value to another, ever more slowly.")
+    start: float = Field(description="The value before.")
+    end: float = Field(description="The value that it comes close to.")
+    time_constant_s: Positive = Field(description="In which time the distance shrinks by e.")
+    begin_s: float = Field(0.0, description="When it begins; negative: part of it is over when the run begins.")
 
 
 class Table(Section):
@@ -46,10 +46,14 @@ class Table(Section):
     The file has the columns time_s and the key that it stands at, temperature_c or supply_v.
     """
 
-    model: Literal["table"]
-    file: str | None = None
-    times_s: tuple[float, ...]
-    values: tuple[float, ...]
+    model: Literal["table"] = Field(description="Values at times.")
+    file: str | None = Field(
+        None,
+        description="CSV file with the columns time_s and the key that it stands at; times_s and values are then read "
+        "from it.",
+    )
+    times_s: tuple[float, ...] = Field(description="When; increasing.")
+    values: tuple[float, ...] = Field(description="The value at each of these times.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -73,21 +77,30 @@ Profile = Annotated[
 class Devices(Section):
     """What temperature and supply voltage do to boards, and what boards tell of them.
 
-    `range_mm_per_k` and `range_cm_per_v` are by how much each of the two tags of a range lengthens it, a kelvin above
-    `reference_c` and a volt above `reference_v`: its antenna delay grows by twice that way, 0.44 of it before
-    transmissions and 0.56 in receptions. The DW1000's manual (8.3.1) calls 2.15 mm and 5.35 cm typical, without a sign.
-    `skew_ppm_per_k` is what a kelvin adds to the rate of clocks. Tags may have their own. Where tags have a temperature
-    or a voltage, the recording has their readings `readings_hz` times a second, with noise.
+    A tag's antenna delay grows by twice what each end of a range lengthens it, 0.44 of it before transmissions and 0.56
+    in receptions. Typical values are from the DW1000's manual (8.3.1), which gives no sign. Tags may have their own.
+    Where tags have a temperature or a voltage, the recording has their readings.
     """
 
-    range_mm_per_k: float = 0.0
-    range_cm_per_v: float = 0.0
-    skew_ppm_per_k: float = 0.0
-    reference_c: float = 23.0
-    reference_v: float = 3.3
-    readings_hz: Positive = 1.0
-    reading_noise_k: NotNegative = 0.0
-    reading_noise_v: NotNegative = 0.0
+    range_mm_per_k: float = Field(
+        0.0,
+        description="By how much each of the two tags of a range lengthens it, a kelvin above reference_c (typically "
+        "2.15 by the DW1000's manual).",
+    )
+    range_cm_per_v: float = Field(
+        0.0,
+        description="By how much each of the two tags of a range lengthens it, a volt above reference_v (typically "
+        "5.35 by the DW1000's manual).",
+    )
+    skew_ppm_per_k: float = Field(0.0, description="What a kelvin above reference_c adds to the rate of clocks.")
+    reference_c: float = Field(23.0, description="The temperature at which delays and skews are as the tags say.")
+    reference_v: float = Field(3.3, description="The supply voltage at which delays are as the tags say.")
+    readings_hz: Positive = Field(
+        1.0,
+        description="How often a tag that has a temperature or a voltage reads it, a second.",
+    )
+    reading_noise_k: NotNegative = Field(0.0, description="Standard deviation of temperatures read.")
+    reading_noise_v: NotNegative = Field(0.0, description="Standard deviation of voltages read.")
 
 
 class GroupDelayHarmonics(Section):
@@ -97,12 +110,12 @@ class GroupDelayHarmonics(Section):
     elevation e in the frame of the body; `turned_deg` is how far the board is turned about the body's z axis.
     """
 
-    model: Literal["harmonics"]
-    mean_cm: float = 0.0
-    cosine_cm: tuple[float, ...] = ()
-    sine_cm: tuple[float, ...] = ()
-    elevation_cm: float = 0.0
-    turned_deg: float = 0.0
+    model: Literal["harmonics"] = Field(description="As low-order harmonics of azimuth.")
+    mean_cm: float = Field(0.0, description="Mean over all directions.")
+    cosine_cm: tuple[float, ...] = Field((), description="Factors of cos(k azimuth) cos(elevation), from k = 1 on.")
+    sine_cm: tuple[float, ...] = Field((), description="Factors of sin(k azimuth) cos(elevation), from k = 1 on.")
+    elevation_cm: float = Field(0.0, description="Factor of sin(elevation).")
+    turned_deg: float = Field(0.0, description="How far the board is turned about the body's z axis.")
 
 
 class GroupDelayTable(Section):
@@ -111,12 +124,18 @@ class GroupDelayTable(Section):
     `file` is a CSV table with the columns azimuth_deg, elevation_deg, delay_cm.
     """
 
-    model: Literal["table"]
-    file: str | None = None
-    azimuth_deg: tuple[float, ...]
-    elevation_deg: tuple[float, ...]
-    delay_cm: tuple[tuple[float, ...], ...]
-    turned_deg: float = 0.0
+    model: Literal["table"] = Field(description="As a table over directions.")
+    file: str | None = Field(
+        None,
+        description="CSV file with the columns azimuth_deg, elevation_deg, delay_cm; the other keys are then read from "
+        "it.",
+    )
+    azimuth_deg: tuple[float, ...] = Field(description="Azimuths in the body's frame, from -180 to 180, increasing.")
+    elevation_deg: tuple[float, ...] = Field(description="Elevations in the body's frame, from -90 to 90, increasing.")
+    delay_cm: tuple[tuple[float, ...], ...] = Field(
+        description="A row for each azimuth, a delay in it for each elevation.",
+    )
+    turned_deg: float = Field(0.0, description="How far the board is turned about the body's z axis.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

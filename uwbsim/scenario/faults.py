@@ -17,51 +17,51 @@ from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
 class Bytes(Section):
     """Each byte to the host is dropped, or replaced by a random one, with a probability."""
 
-    kind: Literal["drop-bytes", "garble-bytes"]
-    share: Share
-    tag: TagId | None = None
+    kind: Literal["drop-bytes", "garble-bytes"] = Field(description="What happens to bytes.")
+    share: Share = Field(description="Probability for each byte.")
+    tag: TagId | None = Field(None, description="Which board; all where it is left out.")
 
 
 class SplitWrites(Section):
     """Messages come in two pieces with a gap between, with a probability."""
 
-    kind: Literal["split-writes"]
-    share: Share
-    gap_ms: NotNegative = 2.0
-    tag: TagId | None = None
+    kind: Literal["split-writes"] = Field(description="Messages come in two pieces.")
+    share: Share = Field(description="Probability for each message.")
+    gap_ms: NotNegative = Field(2.0, description="Between the pieces.")
+    tag: TagId | None = Field(None, description="Which board; all where it is left out.")
 
 
 class LateReplies(Section):
     """Messages come late, with a probability."""
 
-    kind: Literal["late-replies"]
-    share: Share
-    delay_ms: Positive = 200.0
-    tag: TagId | None = None
+    kind: Literal["late-replies"] = Field(description="Messages come late.")
+    share: Share = Field(description="Probability for each message.")
+    delay_ms: Positive = Field(200.0, description="How late.")
+    tag: TagId | None = Field(None, description="Which board; all where it is left out.")
 
 
 class LoseFrames(Section):
     """Frames on the air are lost with a probability."""
 
-    kind: Literal["lose-frames"]
-    share: Share
+    kind: Literal["lose-frames"] = Field(description="Frames on the air are lost.")
+    share: Share = Field(description="Probability for each frame.")
 
 
 class Hang(Section):
     """A board goes into its hard-fault loop until it is unplugged."""
 
-    kind: Literal["hang"]
-    tag: TagId
-    at_s: NotNegative
+    kind: Literal["hang"] = Field(description="A board hangs until it is unplugged.")
+    tag: TagId = Field(description="Which board.")
+    at_s: NotNegative = Field(description="When, after the start.")
 
 
 class Unplug(Section):
     """A board is unplugged, and plugged in again after a while."""
 
-    kind: Literal["unplug"]
-    tag: TagId
-    at_s: NotNegative
-    for_s: Positive = 1.0
+    kind: Literal["unplug"] = Field(description="A board is unplugged for a while.")
+    tag: TagId = Field(description="Which board.")
+    at_s: NotNegative = Field(description="When, after the start.")
+    for_s: Positive = Field(1.0, description="For how long.")
 
 
 Fault = Annotated[Bytes | SplitWrites | LateReplies | LoseFrames | Hang | Unplug, Field(discriminator="kind")]
@@ -70,7 +70,7 @@ Fault = Annotated[Bytes | SplitWrites | LateReplies | LoseFrames | Hang | Unplug
 class Faults(Section):
     """A file of faults."""
 
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[Fault, ...] = Field((), description="What goes wrong, in any order.")
 
     def lost_share(self) -> float:
         """Return the share of frames that are lost on the air."""

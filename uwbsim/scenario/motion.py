@@ -12,10 +12,13 @@ from uwbsim.scenario.base import Positive, Section, Vector
 class RandomFlight(Section):
     """Smooth flight through random points of a box."""
 
-    model: Literal["random-flight"]
-    box_min_m: Vector
-    box_max_m: Vector
-    speed_mps: Positive = 1.0
+    model: Literal["random-flight"] = Field(description="Smoothly through random points of a box.")
+    box_min_m: Vector = Field(description="Lowest corner of the box.")
+    box_max_m: Vector = Field(description="Highest corner of the box.")
+    speed_mps: Positive = Field(
+        1.0,
+        description="Speed, roughly: that at which it would go straight from each point to the next.",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -27,11 +30,17 @@ class RandomFlight(Section):
 class Waypoints(Section):
     """Through points: at times, on a smooth spline; or straight, with limits of speed and acceleration."""
 
-    model: Literal["waypoints"]
-    points_m: tuple[Vector, ...]
-    times_s: tuple[float, ...] | None = None
-    speed_mps: Positive | None = None
-    acceleration_mps2: Positive = 2.0
+    model: Literal["waypoints"] = Field(description="Through given points.")
+    points_m: tuple[Vector, ...] = Field(description="The points, two or more.")
+    times_s: tuple[float, ...] | None = Field(
+        None,
+        description="When it is at each of them, on a smooth spline; or give speed_mps.",
+    )
+    speed_mps: Positive | None = Field(
+        None,
+        description="Highest speed on straight ways between the points; or give times_s.",
+    )
+    acceleration_mps2: Positive = Field(2.0, description="Highest acceleration on straight ways.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -54,33 +63,36 @@ class Waypoints(Section):
 class Figure(Section):
     """A structured training figure around a centre, turning all the way: every direction and distance comes up."""
 
-    model: Literal["figure"]
-    shape: Literal["circle", "eight", "helix"]
-    centre_m: Vector
-    radius_m: Positive
-    period_s: Positive = 12.0
-    climb_m: float = 0.0
-    phase_deg: float = 0.0
-    turns_per_period: float = 1.0
+    model: Literal["figure"] = Field(description="A training figure, turning all the way.")
+    shape: Literal["circle", "eight", "helix"] = Field(description="Which figure.")
+    centre_m: Vector = Field(description="Its centre.")
+    radius_m: Positive = Field(description="Its radius.")
+    period_s: Positive = Field(12.0, description="How long one round takes.")
+    climb_m: float = Field(0.0, description="How far its lowest point is below its highest.")
+    phase_deg: float = Field(0.0, description="Where on it the body begins.")
+    turns_per_period: float = Field(1.0, description="How often the body turns about its z axis in a round.")
 
 
 class Static(Section):
     """A body that does not move, such as an anchor."""
 
-    model: Literal["static"]
-    position_m: Vector
-    yaw_deg: float = 0.0
+    model: Literal["static"] = Field(description="Does not move, such as an anchor.")
+    position_m: Vector = Field(description="Where it stands.")
+    yaw_deg: float = Field(0.0, description="How far it is turned about the z axis.")
 
 
 class Recorded(Section):
     """A trajectory from a file: TUM, CSV, or the poses of a recording, of `body` there; filled in on reading."""
 
-    model: Literal["recorded"]
-    file: str
-    body: str | None = None
-    times_s: tuple[float, ...] = ()
-    positions_m: tuple[Vector, ...] = ()
-    quaternions: tuple[tuple[float, float, float, float], ...] = ()
+    model: Literal["recorded"] = Field(description="As a file says.")
+    file: str = Field(description="TUM, CSV, or a recording (.uwb); from the folder of the scenario.")
+    body: str | None = Field(None, description="Which body of the file; needed where it has several.")
+    times_s: tuple[float, ...] = Field((), description="Filled in on reading.")
+    positions_m: tuple[Vector, ...] = Field((), description="Filled in on reading.")
+    quaternions: tuple[tuple[float, float, float, float], ...] = Field(
+        (),
+        description="Filled in on reading: x y z w, body to world.",
+    )
 
 
 Motion = Annotated[RandomFlight | Waypoints | Figure | Static | Recorded, Field(discriminator="model")]

@@ -1,36 +1,26 @@
-"""The radios of a scenario: power, noise, bias, and what is between them."""
+"""The radios of a scenario: power, noise and bias."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId, Vector
+from uwbsim.scenario.base import NotNegative, Positive, Section
 from uwbsim.scenario.devices import GroupDelay, check_grid
+from uwbsim.scenario.multipath import Fading, IndependentMultipath, Multipath, Outages
 from uwbsim.scenario.published_curves import BIAS, SIGMA
-from uwbsim.units import MM, MS, NS, PS
-
-MATERIALS: Final = {
-    "air": (0.0, 1.0),
-    "drywall": (15.0, 1.6),
-    "wood": (25.0, 1.5),
-    "glass": (40.0, 2.5),
-    "brick": (45.0, 2.0),
-    "concrete": (80.0, 2.4),
-    "person": (60.0, 6.0),
-    "metal": (2000.0, 1.0),
-}
-"""Loss in dB a metre and refractive index near 4 GHz: round values from ITU-R P.2040-3 (building materials; person as
-wet tissue). Excess delay is (index - 1) times the thickness."""
+from uwbsim.units import PS
 
 
 class Spline(Section):
     """A B-spline over lifted first-path power 10^((fpp_dbm + 82)/10), held constant beyond its ends."""
 
-    knots: tuple[float, ...]
-    coefficients: tuple[float, ...]
-    degree: Annotated[int, Field(ge=0, le=5)] = 3
+    knots: tuple[float, ...] = Field(description="Knots over lifted power, not decreasing.")
+    coefficients: tuple[float, ...] = Field(
+        description="Coefficients in metres, as many as knots less degree less one.",
+    )
+    degree: Annotated[int, Field(ge=0, le=5)] = Field(3, description="Degree of the pieces.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -47,14 +37,17 @@ class Spline(Section):
 class SigmaSpline(Spline):
     """Standard deviation of the range in metres, where dt32/dt53 is `reply_ratio`."""
 
-    reply_ratio: NotNegative = 0.0
+    reply_ratio: NotNegative = Field(
+        0.0,
+        description="At which dt32/dt53 the curve was measured: the noise of a double-sided range depends on it.",
+    )
 
 
 class BiasTable(Section):
     """Bias in metres at received powers in dBm, linear between them and constant beyond."""
 
-    power_dbm: tuple[float, ...]
-    bias_m: tuple[float, ...]
+    power_dbm: tuple[float, ...] = Field(description="Received powers, all rising or all falling.")
+    bias_m: tuple[float, ...] = Field(description="Bias at each of them.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -79,159 +72,14 @@ def _named(known: dict[str, dict[str, Any] | None]) -> Any:
     return BeforeValidator(look_up)
 
 
-class IndependentMultipath(Section):
-    """The positive tail, drawn for each exchange alone: with `probability` it travels an exponential excess distance.
-
-    All pairs are alike, nothing lasts, and neither power nor impulse response tells such an exchange from others.
-    """
-
-    model: Literal["independent"] = "independent"
-    probability: Share
-    mean_excess_m: Positive
-
-
-class PairMultipath(Section):
-    """What a pair of tags has of reflections where it is known; the rest is drawn."""
-
-    tags: tuple[TagId, TagId]
-    share: Share | None = None
-    life_s: Positive | None = None
-    mean_excess_m: Positive | None = None
-
-
-class TwoStateMultipath(Section):
-    """Reflections that last: at any time a pair's first path is the direct one or a reflection.
-
-    At random instants, on average a pair's life apart, a pair's path is drawn anew: with its share a reflection, whose
-    excess length has a gamma distribution of mean `mean_excess_m` and shape `excess_shape` (1 is exponential). So both
-    the state and the excess have the autocorrelation exp(-dt/life). Pairs' shares have the mean `share` and the
-    standard deviation `share_std` (a beta distribution), their lives the median `life_s` and `life_spread` as the
-    standard deviation of the logarithm; `pairs` has those that are known. A reflection leaves its trace: its first path
-    is weaker than the direct one by `first_path_loss_db` on average (`loss_std_db` about it) and all paths together by
-    `total_loss_db`, with most of the power in a path that comes `rise_ns` later on average.
-    A direct path seems longer or shorter by `direct_std_m`, as long as it lasts.
-    """
-
-    model: Literal["two-state"]
-    share: Share = 0.1
-    share_std: NotNegative = 0.0
-    life_s: Annotated[float, Field(ge=0.01)] = 0.5
-    life_spread: Annotated[float, Field(ge=0, le=2)] = 0.0
-    mean_excess_m: Positive = 0.4
-    excess_shape: Positive = 1.0
-    first_path_loss_db: NotNegative = 8.0
-    loss_std_db: NotNegative = 2.0
-    total_loss_db: NotNegative = 2.0
-    rise_ns: Positive = 6.0
-    direct_std_m: NotNegative = 0.0
-    pairs: tuple[PairMultipath, ...] = ()
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.share_std and self.share_std**2 >= self.share * (1 - self.share):
-            most = (self.share * (1 - self.share)) ** 0.5
-            raise ValueError(
-                f"share_std: found {self.share_std:g}, with a mean of {self.share:g} it is below {most:.3g}"
-            )
-        if self.total_loss_db > self.first_path_loss_db:
-            raise ValueError(
-                f"total_loss_db: found {self.total_loss_db:g}, at most first_path_loss_db ({self.first_path_loss_db:g})"
-            )
-        known = [frozenset(pair.tags) for pair in self.pairs]
-        for k, pair in enumerate(known):
-            if len(pair) < 2 or pair in known[:k]:
-                raise ValueError(
-                    f"pairs[{k}].tags: found {list(self.pairs[k].tags)}, give two tags, and each pair once"
-                )
-        return self
-
-    @property
-    def rise_s(self) -> float:
-        """Return in seconds how much later the strongest path comes on average."""
-        return self.rise_ns * NS
-
-
-class Fading(Section):
-    """Power that comes and goes with the place, alike in both directions of a pair of tags.
-
-    At random instants, `life_s` apart on average, it is drawn anew, with the standard deviation `std_db`; so its
-    autocorrelation is exp(-dt/life). With `levels_db` it has these quantiles instead, from 0 to 1 in equal steps.
-    """
-
-    std_db: NotNegative = 0.0
-    levels_db: tuple[float, ...] = ()
-    life_s: Annotated[float, Field(ge=0.01)] = 0.5
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if len(self.levels_db) == 1 or list(self.levels_db) != sorted(self.levels_db):
-            raise ValueError("levels_db: give two or more, which do not decrease")
-        if self.levels_db and self.std_db:
-            raise ValueError("levels_db: give either levels_db or std_db")
-        return self
-
-
-class Outages(Section):
-    """Whiles in which two tags do not hear each other, for no reason that the scenario has: `share` of the time.
-
-    At random instants, `life_s` apart on average, it is drawn anew whether a pair is out.
-    """
-
-    share: Share
-    life_s: Annotated[float, Field(ge=0.01)] = 0.5
-
-
-class GeometricMultipath(Section):
-    """One impulse response from geometry: direct path, reflections off room and obstacles, and things in the room.
-
-    The room's surfaces and the obstacles' faces reflect as their materials do (Fresnel), less what their roughness
-    scatters; obstacles and bodies throw shadows with soft edges. `scatterers` are things at places of their own in the
-    room, drawn from the seed: each gives back what a mirror there would, less `scatter_loss_db` on average (with a
-    Rayleigh distribution of its field), later by what waves bounce around it, whose power dies out over `decay_ns`.
-    All paths add up with their phases. The response is computed for each pair every `step_ms`; of it follow first path,
-    powers, excess range, impulse response, and with `stamp_noise` what noise does to the leading edge: noise is
-    `threshold_to_noise` times below the first path's threshold, which is `radio.dynamic_range_db` below the strongest
-    tap, or at `radio.sensitivity_dbm`.
-
-    `scatter_loss_db` and `decay_ns` were chosen so that rooms have the total less first-path powers of MILUV's recorded
-    responses (median 7.5 dB); these also say 18 dB for `radio.dynamic_range_db`, and 12 for `threshold_to_noise`.
-    """
-
-    model: Literal["geometric"]
-    scatterers: Annotated[int, Field(ge=0, le=500)] = 32
-    scatter_loss_db: float = 1.0
-    decay_ns: Positive = 12.0
-    step_ms: Annotated[float, Field(ge=0.1, le=100)] = 5.0
-    stamp_noise: bool = True
-    threshold_to_noise: Positive = 12.0
-
-    @property
-    def decay_s(self) -> float:
-        """Return over which time the power of what bounces around falls to a share of 1/e."""
-        return self.decay_ns * NS
-
-    @property
-    def step_s(self) -> float:
-        """Return in seconds how often responses are computed."""
-        return self.step_ms * MS
-
-
-def _independent_unless_named(value: Any) -> Any:
-    return {"model": "independent"} | value if isinstance(value, dict) else value
-
-
-Multipath = Annotated[
-    Annotated[IndependentMultipath | TwoStateMultipath | GeometricMultipath, Field(discriminator="model")],
-    BeforeValidator(_independent_unless_named),
-]
-
-
 class AntennaTable(Section):
     """Gain in dB over azimuth and elevation in the body's frame: a full grid, interpolated linearly."""
 
-    azimuth_deg: tuple[float, ...]
-    elevation_deg: tuple[float, ...]
-    gain_db: tuple[tuple[float, ...], ...]
+    azimuth_deg: tuple[float, ...] = Field(description="Azimuths in the body's frame, from -180 to 180, increasing.")
+    elevation_deg: tuple[float, ...] = Field(description="Elevations in the body's frame, from -90 to 90, increasing.")
+    gain_db: tuple[tuple[float, ...], ...] = Field(
+        description="A row for each azimuth, a gain in it for each elevation.",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -245,39 +93,80 @@ class Radio(Section):
     Sources (firmware wire format, section 5): `rx_noise_ps` and `skew_noise_ppm`, `skew_bias_ppm` from 1833 exchanges
     of MILUV; `sensitivity_dbm` a little below the weakest first path seen there (-104.2 dBm); frame settings those of
     the firmware. `capture_db` and `dynamic_range_db` are typical of the chip's correlator, and not measured here.
-
-    First-path powers that boards read, and what goes by them, saturate at `saturation_dbm`: the chip's readings fall
-    behind above -85 dBm (DW1000 User Manual, 4.7.2), and those of the ICRA 2023 flights end at -80.
-
-    A board reads `carrier_sign` times the rate of its clock less that of the sender's, plus `skew_bias_ppm`, which
-    grows by `skew_bias_ppm_per_db` above -90 dBm of first-path power: 1 is the boards' convention, -1 that of firmwares
-    which print by how much the sender is ahead. `group_delay` is that of the antennas of all tags that have none of
-    their own.
     """
 
-    first_path_at_1m_dbm: float = -80.0
-    path_loss_exponent: NotNegative = 2.0
-    antenna: Literal["isotropic", "dipole"] | AntennaTable = "isotropic"
-    shadowing_db: NotNegative = 0.0
-    power_noise_db: NotNegative = 0.0
-    saturation_dbm: float | None = None
-    sensitivity_dbm: float = -105.0
-    tx_noise_ps: NotNegative = 0.0
-    rx_noise_ps: NotNegative = 116.0
-    skew_noise_ppm: NotNegative = 0.20
-    skew_bias_ppm: float = -0.13
-    skew_bias_ppm_per_db: float = 0.0
-    carrier_sign: Literal[-1, 1] = 1
-    group_delay: GroupDelay | None = None
-    quantize: bool = True
-    preamble_symbols: Literal[64, 128, 256, 512, 1024, 1536, 2048, 4096] = 128
-    capture_db: NotNegative = 6.0
-    dynamic_range_db: Positive = 15.0
-    bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = None
-    sigma: Annotated[SigmaSpline | None, _named(SIGMA)] = None
-    multipath: Multipath | None = None
-    fading: Fading | None = None
-    outages: Outages | None = None
+    first_path_at_1m_dbm: float = Field(-80.0, description="First-path power at a metre.")
+    path_loss_exponent: NotNegative = Field(
+        2.0,
+        description="By which power of the distance the received power falls; 2 in free space.",
+    )
+    antenna: Literal["isotropic", "dipole"] | AntennaTable = Field(
+        "isotropic",
+        description="Gain of all antennas over direction in the frame of the body.",
+    )
+    shadowing_db: NotNegative = Field(
+        0.0,
+        description="Standard deviation of what the surroundings of a tag add to its gain over azimuth, smoothly, "
+        "drawn for each.",
+    )
+    power_noise_db: NotNegative = Field(0.0, description="Standard deviation of what is drawn for each reception.")
+    saturation_dbm: float | None = Field(
+        None,
+        description="Where readings of first-path power end; the chip's fall behind above -85, and those of the ICRA "
+        "2023 flights end at -80. Nowhere where it is left out.",
+    )
+    sensitivity_dbm: float = Field(-105.0, description="First-path power below which a frame is not received.")
+    tx_noise_ps: NotNegative = Field(0.0, description="Standard deviation of transmissions about their stamps.")
+    rx_noise_ps: NotNegative = Field(
+        116.0,
+        description="Standard deviation of receive stamps that does not depend on power.",
+    )
+    skew_noise_ppm: NotNegative = Field(0.20, description="Standard deviation of the carrier integrator's reading.")
+    skew_bias_ppm: float = Field(-0.13, description="Bias of the carrier integrator's reading at -90 dBm and below.")
+    skew_bias_ppm_per_db: float = Field(
+        0.0,
+        description="By how much that bias grows above -90 dBm of first-path power.",
+    )
+    carrier_sign: Literal[-1, 1] = Field(
+        1,
+        description="1 where boards print by how much their clock is ahead of the sender's; -1 where by how much the "
+        "sender is.",
+    )
+    group_delay: GroupDelay | None = Field(
+        None,
+        description="Group delay of the antennas of all tags that have none of their own.",
+    )
+    quantize: bool = Field(True, description="Whether stamps are whole ticks, as on boards.")
+    preamble_symbols: Literal[64, 128, 256, 512, 1024, 1536, 2048, 4096] = Field(
+        128,
+        description="Length of the preamble, which is most of the time a frame takes.",
+    )
+    capture_db: NotNegative = Field(
+        6.0,
+        description="How much stronger a frame must be than another on the air to be received all the same.",
+    )
+    dynamic_range_db: Positive = Field(
+        15.0,
+        description="How far below the strongest path the first one may be and still be found.",
+    )
+    bias: Annotated[Spline | BiasTable | None, _named(BIAS)] = Field(
+        None,
+        description="Bias of ranges over power: a spline over lifted power, a table over dBm, or the name of a "
+        "published curve.",
+    )
+    sigma: Annotated[SigmaSpline | None, _named(SIGMA)] = Field(
+        None,
+        description="Standard deviation of ranges over lifted power: a spline, or the name of a published curve.",
+    )
+    multipath: Multipath | None = Field(None, description="Reflections; none where it is left out.")
+    fading: Fading | None = Field(
+        None,
+        description="Power that comes and goes with the place; none where it is left out.",
+    )
+    outages: Outages | None = Field(
+        None,
+        description="Whiles in which pairs do not hear each other; none where it is left out.",
+    )
 
     @property
     def independent_multipath(self) -> tuple[float, float]:
@@ -295,93 +184,3 @@ class Radio(Section):
     def rx_noise_s(self) -> float:
         """Return the standard deviation of receive stamps that does not depend on power, in seconds."""
         return self.rx_noise_ps * PS
-
-
-class Material(Section):
-    """What an obstacle is made of: loss in dB a metre, and refractive index."""
-
-    loss_db_per_m: NotNegative
-    index: Annotated[float, Field(ge=1)] = 1.0
-
-
-def _known(material: Any) -> Any:
-    if isinstance(material, str) and material not in MATERIALS:
-        raise ValueError(f"found {material!r}, known are {', '.join(MATERIALS)}")
-    return material
-
-
-KnownMaterial = Annotated[str | Material, AfterValidator(_known)]
-
-
-class Obstacle(Section):
-    """A box that waves go through, at a loss and late. `material` is a name or a table of its own.
-
-    In the geometric model its faces reflect; `roughness_mm` is the standard deviation of their heights.
-    """
-
-    name: str = "obstacle"
-    min_m: Vector
-    max_m: Vector
-    material: KnownMaterial
-    roughness_mm: NotNegative = 3.0
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
-            raise ValueError("min_m: must be below max_m in every direction")
-        return self
-
-    def properties(self) -> tuple[float, float]:
-        """Return loss in dB a metre, and refractive index."""
-        return properties(self.material)
-
-    @property
-    def roughness_m(self) -> float:
-        """Return the standard deviation of its surface's heights in metres."""
-        return self.roughness_mm * MM
-
-
-def properties(material: str | Material) -> tuple[float, float]:
-    """Return loss in dB a metre and refractive index of a material, by its name or as given."""
-    if isinstance(material, str):
-        return MATERIALS[material]
-    return material.loss_db_per_m, material.index
-
-
-class Room(Section):
-    """The room: a box, whose six surfaces reflect with `reflection_loss_db` where it is given.
-
-    In the geometric model they reflect as their `material` does, or `floor` and `ceiling` where these are given;
-    `roughness_mm` is the standard deviation of their heights.
-    """
-
-    min_m: Vector
-    max_m: Vector
-    reflection_loss_db: NotNegative | None = None
-    material: KnownMaterial = "concrete"
-    floor: KnownMaterial | None = None
-    ceiling: KnownMaterial | None = None
-    roughness_mm: NotNegative = 3.0
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
-            raise ValueError("min_m: must be below max_m in every direction")
-        return self
-
-    @property
-    def roughness_m(self) -> float:
-        """Return the standard deviation of its surfaces' heights in metres."""
-        return self.roughness_mm * MM
-
-    def materials(self) -> tuple[str | Material, ...]:
-        """Return those of the six surfaces: two walls across x, two across y, floor and ceiling."""
-        return (*[self.material] * 4, self.floor or self.material, self.ceiling or self.material)
-
-
-class Shadow(Section):
-    """The part of a body that waves do not pass unharmed: an ellipsoid in the body's frame."""
-
-    semi_axes_m: tuple[Positive, Positive, Positive]
-    centre_m: Vector = (0.0, 0.0, 0.0)
-    loss_db_per_m: NotNegative = 40.0

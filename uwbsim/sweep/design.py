@@ -15,6 +15,7 @@ import numpy as np
 
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.text_files import read_text
+from uwblink.toml import FileKey
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import load
@@ -22,8 +23,38 @@ from uwbsim.scenario.shipped import SUFFIX, shipped_scenarios
 
 KINDS: Final = ("compare", "calibrate")
 DESIGNS: Final = ("grid", "latin-hypercube", "list")
-KEYS: Final = ("name", "scenario", "kind", "protocols", "ranges", "seeds", "design", "samples")
 MOST_RUNS: Final = 10_000_000
+FILE_KEYS: Final = (
+    FileKey("sweep.name", "text", "the name of the file", "What the sweep is called."),
+    FileKey("sweep.scenario", "text", "needed", "The scenario that varies, from the folder of this file."),
+    FileKey(
+        "sweep.kind",
+        '"compare" or "calibrate"',
+        '"compare"',
+        "What a run does: compare protocols, or simulate a flight, calibrate and judge.",
+    ),
+    FileKey("sweep.protocols", "list of protocols", 'all, or ["ds"] to calibrate', "The protocols of each run."),
+    FileKey("sweep.ranges", "whole number, 1 to 10,000,000", "100000", "Ranges with each protocol in a run."),
+    FileKey("sweep.seeds", "whole number, or list of them", "1", "How many seeds each point gets, or which."),
+    FileKey(
+        "sweep.design",
+        '"grid", "latin-hypercube" or "list"',
+        '"grid"',
+        "Every combination of values; points spread over spans; or points one by one.",
+    ),
+    FileKey("sweep.samples", "whole number, 1 to 10,000,000", "16", "Points of a Latin hypercube."),
+    FileKey(
+        'vary."KEY"', "list of values", "none", "Of a grid: values of a key of the scenario, such as radio.tx_noise_ps."
+    ),
+    FileKey('vary."KEY".low', "number", "needed", "Of a Latin hypercube: the lower end of the span."),
+    FileKey('vary."KEY".high', "number", "needed", "Of a Latin hypercube: the upper end of the span."),
+    FileKey('vary."KEY".scale', '"linear" or "log"', '"linear"', "How points are spread over the span."),
+    FileKey(
+        'vary."KEY".whole', "true or false", "true where low and high are whole", "Whether values are whole numbers."
+    ),
+    FileKey('list[]."KEY"', "a value", "that of the scenario", "Of a list: the value of a key at one point."),
+)
+KEYS: Final = tuple(key.name.removeprefix("sweep.") for key in FILE_KEYS if key.name.startswith("sweep."))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,8 @@ from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import Poses
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.linked_files import MOST_POSES
-from uwbsim.scenario.radio import Radio, TwoStateMultipath
+from uwbsim.scenario.multipath import TwoStateMultipath
+from uwbsim.scenario.radio import Radio
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.twins.clocks import ClockFit
 from uwbsim.twins.flight import Flight, attitude

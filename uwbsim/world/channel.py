@@ -16,7 +16,8 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.radio import Shadow, TwoStateMultipath
+from uwbsim.scenario.multipath import TwoStateMultipath
+from uwbsim.scenario.surroundings import Shadow
 from uwbsim.world.geometric_responses import GeometricResponses
 from uwbsim.world.group_delay import group_delay_m, has_group_delays
 from uwbsim.world.pair_levels import PairLevels

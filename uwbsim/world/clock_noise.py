@@ -22,7 +22,7 @@ from scipy.special import ndtri
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.random_streams import stream
-from uwbsim.scenario.model import Tag
+from uwbsim.scenario.tags import Tag
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 SHORTEST: Final = 30

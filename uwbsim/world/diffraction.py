@@ -15,7 +15,7 @@ from scipy.special import fresnel
 
 from uwblink.arrays import Complexes, Floats
 from uwbsim.scenario.model import WAVELENGTH_M
-from uwbsim.scenario.radio import Obstacle, Shadow
+from uwbsim.scenario.surroundings import Obstacle, Shadow
 
 DEEPEST: Final = 12.0
 FADES: Final = 8.0

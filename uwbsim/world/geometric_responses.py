@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.radio import GeometricMultipath
+from uwbsim.scenario.multipath import GeometricMultipath
 from uwbsim.world.geometric_paths import (
     Legs,
     Paths,

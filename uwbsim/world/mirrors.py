@@ -9,7 +9,7 @@ import numpy as np
 
 from uwblink.arrays import Bools, Complexes, Floats, Ints
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.radio import Material, properties
+from uwbsim.scenario.surroundings import Material, properties
 from uwbsim.world.diffraction import covered, fresnel_number
 from uwbsim.world.fresnel_reflection import fresnel, permittivity
 

@@ -13,7 +13,7 @@ import numpy as np
 from uwblink.arrays import Floats, Ints
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.radio import Fading
+from uwbsim.scenario.multipath import Fading
 
 MARGIN_S: Final = 60.0
 """So long after the end of a run links are still asked for at most; later on the last level lasts."""

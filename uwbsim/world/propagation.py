@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
-from uwbsim.scenario.radio import Obstacle, Room, Shadow
+from uwbsim.scenario.surroundings import Obstacle, Room, Shadow
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,8 @@ from uwblink.arrays import Bools, Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import WAVELENGTH_M, Scenario
-from uwbsim.scenario.radio import GeometricMultipath, Shadow
+from uwbsim.scenario.multipath import GeometricMultipath
+from uwbsim.scenario.surroundings import Shadow
 from uwbsim.world.antenna_patterns import Patterns
 from uwbsim.world.diffraction import LIT, body_gain
 from uwbsim.world.mirrors import Mirrors

@@ -13,7 +13,8 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.random_streams import stream
 from uwbsim.scenario.devices import Constant, Devices, Profile, Ramp, Table, WarmUp
-from uwbsim.scenario.model import Scenario, Tag
+from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.tags import Tag
 from uwbsim.units import CM, MM, NS_PER_S, PPM
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 

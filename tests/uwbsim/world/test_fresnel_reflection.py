@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwbsim.scenario.radio import properties
+from uwbsim.scenario.surroundings import properties
 from uwbsim.world.fresnel_reflection import METAL, fresnel, permittivity, roughness_factor
 
 COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 89.0]))

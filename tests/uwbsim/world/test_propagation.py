@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwbsim.scenario.radio import Obstacle, Room, Shadow
+from uwbsim.scenario.surroundings import Obstacle, Room, Shadow
 from uwbsim.world.propagation import (
     Link,
     box_chords_m,

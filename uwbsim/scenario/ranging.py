@@ -1,0 +1,156 @@
+"""Who ranges with whom in a scenario, how, how often, and how soon boards reply."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from uwblink.arrays import Floats
+from uwblink.protocols.table import PROTOCOLS
+from uwbsim.scenario.airtime import TURNAROUND_S, exchange_air_s, exchange_s
+from uwbsim.scenario.base import NotNegative, Positive, Section, TagId
+from uwbsim.units import MS, US
+
+ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
+
+
+MEDIAN_REPLY_S: Final = 305e-6
+
+
+"""Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
+
+
+PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
+
+
+UUS_S: Final = 512 / 499.2e6
+
+
+class BoardReply(Section):
+    """The reply latency measured on boards: two modes near 304 and 306 us, a tail to 386 us."""
+
+    model: Literal["boards"] = Field("boards", description="Replies take as long as was measured on boards.")
+
+
+class FixedReply(Section):
+    """A reply latency that is always the same."""
+
+    model: Literal["fixed"] = Field(description="All replies take equally long.")
+    delay_us: Annotated[float, Field(ge=180, le=6000)] = Field(description="From the reception to the reply.")
+
+    @property
+    def delay_s(self) -> float:
+        """Return the latency in seconds."""
+        return self.delay_us * US
+
+
+class QuantileReply(Section):
+    """Reply latencies by their quantiles, from 0 to 1 in equal steps, with all values in between equally likely."""
+
+    model: Literal["quantiles"] = Field(description="Replies take as long as these quantiles say.")
+    delays_us: Annotated[tuple[Annotated[float, Field(ge=180, le=6000)], ...], Field(min_length=2)] = Field(
+        description="Quantiles from 0 to 1 in equal steps, two or more, not decreasing.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if list(self.delays_us) != sorted(self.delays_us):
+            raise ValueError("delays_us: must not decrease")
+        return self
+
+    def at_s(self, share: Floats) -> Floats:
+        """Return the latencies in seconds that shares (n,) of all replies stay below."""
+        levels = np.linspace(0, 1, len(self.delays_us))
+        return np.asarray(np.interp(share, levels, self.delays_us) * US)
+
+
+class PlanFile(Section):
+    """A plan from a CSV file with the columns time_s, initiator, target; `slots` is filled in on reading.
+
+    Slots after the end of the run are not flown, so that a long plan can be flown for a while.
+    """
+
+    file: str = Field(
+        description="CSV file with the columns time_s, initiator, target; from the folder of the scenario.",
+    )
+    slots: tuple[tuple[float, int, int], ...] = Field(
+        (),
+        description="Its rows (time_s, initiator, target), filled in on reading.",
+    )
+
+
+class Ranging(Section):
+    """Who ranges with whom, how, and how often."""
+
+    protocol: ProtocolName = Field(
+        "ds",
+        description="How the messages of an exchange go, and what is computed of them.",
+    )
+    rate_hz: Positive = Field(description="Exchanges a second, all pairs together.")
+    pairs: Literal["between-bodies"] | tuple[tuple[TagId, TagId], ...] = Field(
+        "between-bodies",
+        description="Who ranges with whom, as [initiator, target]; or every two tags on different bodies.",
+    )
+    plan: PlanName | PlanFile = Field(
+        "round-robin",
+        description="Who comes when: in turns, in slots of synchronized hosts (tdma), at random (aloha), each robot by "
+        "a common list (common-list), or a file.",
+    )
+    sync_error_ms: NotNegative = Field(0.1, description="Standard deviation of the hosts' clocks, with plan tdma.")
+    list_timeout_ms: NotNegative = Field(
+        10.0,
+        description="How long a robot waits for an exchange that it cannot hear, with plan common-list.",
+    )
+    response_delay_uus: Annotated[int, Field(ge=280, le=6500)] = Field(
+        1500,
+        description="Delay of the scheduled message in UWB microseconds (1.0256 us): the boards' setting C08.",
+    )
+    reply: Annotated[BoardReply | FixedReply | QuantileReply, Field(discriminator="model")] = Field(
+        BoardReply(),
+        description="How long a reply at once takes.",
+    )
+    get_cir: bool = Field(False, description="Whether initiators print their channel impulse responses.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.protocol not in PROTOCOLS:
+            raise ValueError(f"protocol: found {self.protocol!r}, allowed: {', '.join(PROTOCOLS)}")
+        if self.pairs == ():
+            raise ValueError("pairs: found none, give at least one [initiator, target]")
+        for pair in self.pairs if self.pairs != "between-bodies" else ():
+            if pair[0] == pair[1]:
+                raise ValueError(f"pairs: tag {pair[0]} cannot range with itself")
+        return self
+
+    @property
+    def sync_error_s(self) -> float:
+        """Return the standard deviation of hosts' clocks in seconds."""
+        return self.sync_error_ms * MS
+
+    @property
+    def list_timeout_s(self) -> float:
+        """Return in seconds how long a robot waits for an exchange that it cannot hear."""
+        return self.list_timeout_ms * MS
+
+    @property
+    def scheduled_s(self) -> float:
+        """Return the delay of the scheduled message in seconds."""
+        return self.response_delay_uus * UUS_S
+
+    @property
+    def at_once_s(self) -> float:
+        """Return the median latency of a reply at once, in seconds."""
+        if self.reply.model == "fixed":
+            return self.reply.delay_s
+        return float(self.reply.at_s(np.array(0.5))) if self.reply.model == "quantiles" else MEDIAN_REPLY_S
+
+    def fastest_hz(self, preamble_symbols: int) -> float:
+        """Return how many exchanges a second one after the other allow."""
+        row = PROTOCOLS[self.protocol]
+        return 1 / (exchange_s(row, preamble_symbols, self.scheduled_s, self.at_once_s) + TURNAROUND_S)
+
+    def air_share(self, preamble_symbols: int) -> float:
+        """Return the share of time for which the plan keeps the air busy."""
+        return self.rate_hz * exchange_air_s(PROTOCOLS[self.protocol], preamble_symbols)

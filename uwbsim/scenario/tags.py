@@ -1,0 +1,159 @@
+"""The tags of a scenario, and the bodies that carry them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Self
+
+from pydantic import Field, model_validator
+
+from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
+from uwbsim.scenario.devices import GroupDelay, Profile
+from uwbsim.scenario.motion import Motion
+from uwbsim.scenario.surroundings import Shadow
+from uwbsim.units import NS, PPM
+
+PATTERN_SIZES: Final = (0, 1, 4, 9, 16, 25)
+
+
+"""How many spherical harmonics there are up to a degree."""
+
+
+class Body(Section):
+    """Something that carries tags, and may stand in the way of waves."""
+
+    name: Annotated[str, Field(min_length=1)] = Field(description="What the body is called; no two have the same name.")
+    motion: Motion = Field(description="How it moves.")
+    shadow: Shadow | None = Field(
+        None,
+        description="The part of it that waves do not pass unharmed; none where it is left out.",
+    )
+    temperature_c: Profile | None = Field(
+        None,
+        description="Temperature of those of its tags that have none of their own, over time.",
+    )
+    supply_v: Profile | None = Field(
+        None,
+        description="Supply voltage of those of its tags that have none of their own, over time.",
+    )
+
+
+class Tag(Section):
+    """A board: where it sits, its antenna delay and its clock.
+
+    Give the aggregate `delay_ns` = transmit - receive, split 0.44 / 0.56, or both parts. What temperature and voltage
+    do to a tag is in `Devices`.
+    """
+
+    id: TagId = Field(description="Number of the board; no two have the same.")
+    body: str = Field(description="Name of the body that carries it.")
+    lever_arm_m: Vector = Field((0.0, 0.0, 0.0), description="Where its antenna sits in the frame of the body.")
+    delay_ns: float | None = Field(
+        None,
+        description="Aggregate antenna delay, transmit less receive, split 0.44 / 0.56; 0 where no delay is given.",
+    )
+    tx_delay_ns: float | None = Field(
+        None,
+        description="What the antenna adds to transmit stamps; give rx_delay_ns, too, and not delay_ns.",
+    )
+    rx_delay_ns: float | None = Field(
+        None,
+        description="What the antenna adds to receive stamps; give tx_delay_ns, too, and not delay_ns.",
+    )
+    skew_ppm: Annotated[float, Field(ge=-100, le=100)] = Field(
+        0.0,
+        description="How much faster than true time the clock runs at first.",
+    )
+    drift_ppm_per_sqrt_s: NotNegative = Field(
+        0.0,
+        description="Random walk of the clock's rate (Allan deviation q sqrt(tau/3)).",
+    )
+    white_ppm_sqrt_s: NotNegative = Field(
+        0.0,
+        description="White noise of the clock's rate (Allan deviation h/sqrt(tau)).",
+    )
+    flicker_ppm: NotNegative = Field(
+        0.0,
+        description="Flicker noise of the clock's rate (the same Allan deviation at every tau).",
+    )
+    ramp_ppm_per_s: float = Field(0.0, description="Steady change of the clock's rate.")
+    warm_up_ppm: float = Field(
+        0.0,
+        description="How much faster the clock runs at first, by a transient that dies out.",
+    )
+    warm_up_s: Positive = Field(60.0, description="Over which time that transient decays by e.")
+    temperature_c: Profile | None = Field(
+        None,
+        description="Its temperature over time; that of its body where it is left out.",
+    )
+    supply_v: Profile | None = Field(
+        None,
+        description="Its supply voltage over time; that of its body where it is left out.",
+    )
+    range_mm_per_k: float | None = Field(None, description="In the place of devices.range_mm_per_k, for this tag.")
+    range_cm_per_v: float | None = Field(None, description="In the place of devices.range_cm_per_v, for this tag.")
+    skew_ppm_per_k: float | None = Field(None, description="In the place of devices.skew_ppm_per_k, for this tag.")
+    group_delay: GroupDelay | None = Field(
+        None,
+        description="Group delay of its antenna over direction; that of radio.group_delay where it is left out.",
+    )
+    passive: bool = Field(False, description="Whether it records the exchanges that it overhears.")
+    tx_power_db: float = Field(0.0, description="How much stronger than others it sends.")
+    power_offset_db: float = Field(0.0, description="How much too high it reads powers.")
+    pattern_db: tuple[float, ...] = Field(
+        (),
+        description="What its own antenna adds to radio.antenna by direction in its body's frame: 1, 4, 9, 16 or 25 "
+        "coefficients of real spherical harmonics of degree 0, 1 and so on (m from -l to l), whose root "
+        "mean square over all directions is one.",
+    )
+    clock_offset_s: NotNegative | None = Field(
+        None,
+        description="What its clock shows when the run begins; drawn from the seed where it is left out.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        parts = (self.tx_delay_ns is not None, self.rx_delay_ns is not None)
+        if parts[0] != parts[1] or (parts[0] and self.delay_ns is not None):
+            raise ValueError("delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
+        if len(self.pattern_db) not in PATTERN_SIZES:
+            allowed = ", ".join(map(str, PATTERN_SIZES[1:]))
+            raise ValueError(f"pattern_db: found {len(self.pattern_db)} coefficients, expected {allowed} or none")
+        return self
+
+    @property
+    def antenna_delays_s(self) -> tuple[float, float]:
+        """Return what the antenna adds to a transmit and to a receive stamp, in seconds."""
+        transmit, receive = self.delays_ns()
+        return transmit * NS, receive * NS
+
+    @property
+    def skew(self) -> float:
+        """Return how much faster than true time the clock runs at first, as a fraction."""
+        return self.skew_ppm * PPM
+
+    @property
+    def drift_per_sqrt_s(self) -> float:
+        """Return the random walk of the clock's rate, as a fraction per root of a second."""
+        return self.drift_ppm_per_sqrt_s * PPM
+
+    @property
+    def white_sqrt_s(self) -> float:
+        """Return the white noise of the clock's rate, as a fraction times the root of a second."""
+        return self.white_ppm_sqrt_s * PPM
+
+    @property
+    def flicker(self) -> float:
+        """Return the Allan deviation of flicker noise of the clock's rate, as a fraction."""
+        return self.flicker_ppm * PPM
+
+    @property
+    def ramp_per_s(self) -> float:
+        """Return what a change of temperature adds to the clock's rate, as a fraction per second."""
+        return self.ramp_ppm_per_s * PPM
+
+    def delays_ns(self) -> tuple[float, float]:
+        """Return what the antenna adds to a transmit and to a receive stamp, in nanoseconds."""
+        if self.tx_delay_ns is not None and self.rx_delay_ns is not None:
+            return self.tx_delay_ns, self.rx_delay_ns
+        aggregate = self.delay_ns or 0.0
+        return 0.44 * aggregate, -0.56 * aggregate
