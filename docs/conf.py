@@ -14,11 +14,14 @@ release = __version__
 version = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design"]
-exclude_patterns = ["_build", "site", "examples", "maps", "figures"]
+exclude_patterns = ["_build", "generated", "site", "examples", "maps", "figures"]
 myst_enable_extensions = ["deflist", "colon_fence"]
 myst_heading_anchors = 3
 # Code fences of the pages say after the language how the tests run them; MyST takes the first word alone.
-suppress_warnings = ["mystnb.unknown_mime_type"]
+suppress_warnings = [
+    "mystnb.unknown_mime_type",
+    "ref.python",  # several rooms have a class of one name: annotations find theirs by its module
+]
 
 # Single backticks in docstrings are code, as everywhere else in the project.
 default_role = "code"
@@ -27,7 +30,32 @@ autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 88
+autodoc_type_aliases = {
+    name: name
+    for name in (
+        "ArrayLike",
+        "Bools",
+        "Floats",
+        "Ints",
+        "NDArray",
+        "Axes",
+        "Figure",
+        "Data",
+        "Source",
+        "Settings",
+        "Using",
+    )
+}
 nitpicky = True
+# Names of Python, of NumPy and of matplotlib, whose documentation is elsewhere, and aliases of types of arrays.
+nitpick_ignore_regex = [
+    (
+        "py:class",
+        r"(annotated_types|duckdb|np|collections|contextlib|datetime|numpy|os|pathlib|pydantic|matplotlib|typing)\..*",
+    ),
+    ("py:class", r"uwbsim\.scenario\..*"),  # models of files, which have pages of their own
+    ("py:class", r"(Mapping|tuple)\[.*|Path|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using"),
+]
 
 nb_execution_mode = "force"
 nb_execution_timeout = 120

@@ -41,6 +41,7 @@ UNITS: Final = {
 }
 BRANCHES: Final = ("anyOf", "oneOf")
 LONGEST_DEFAULT: Final = 60
+RAISED: Final = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +103,7 @@ def _refs(value: dict[str, Any], *, listed: bool = False) -> Iterator[tuple[str,
 
 def _section(schema: dict[str, Any], place: Place, root: str) -> str:
     table = schema if place.model == root else schema["$defs"][place.model]
-    lines = [f"### {_title(table, place)}", "", table.get("description", ""), ""]
+    lines = [f"## {_title(table, place)}", "", table.get("description", ""), ""]
     also = [path for path in dict.fromkeys(place.also) if path != place.path]
     if also:
         lines += ["Also at " + ", ".join(f"`{path}`" for path in also) + ".", ""]
@@ -136,13 +137,21 @@ def _shown(default: Any) -> str:
     return f"`{text}`" if len(text) <= LONGEST_DEFAULT else "as the table below has them"
 
 
+def _number(value: float) -> str:
+    """Return a limit: powers of ten as such."""
+    size = abs(value)
+    if size < 1e5 or not math.log10(size).is_integer():
+        return f"{value:g}"
+    return ("-" if value < 0 else "") + "10" + str(round(math.log10(size))).translate(RAISED)
+
+
 def _kind(value: dict[str, Any]) -> str:
     if "const" in value:
-        return f"always `{json.dumps(value['const'])}`"
+        return f"`{json.dumps(value['const'])}`"
     if "enum" in value:
         return "one of " + ", ".join(f"`{json.dumps(choice)}`" for choice in value["enum"])
     if "$ref" in value:
-        return "a table"
+        return "table"
     for branch in BRANCHES:
         if branch in value:
             kinds = [_kind(choice) for choice in value[branch] if choice.get("type") != "null"]
@@ -154,11 +163,13 @@ def _list_kind(value: dict[str, Any]) -> str:
     items = value.get("prefixItems")
     if items:
         return f"{len(items)} × {' or '.join(dict.fromkeys(_kind(item) for item in items))}"
-    return f"list of {_kind(value.get('items', {}))}"
+    return f"list of {_kind(value.get('items', {}))}s".replace("`s", "`")
 
 
 def _range(value: dict[str, Any]) -> str:
     """Return the range of a number, of itself or of the number among its choices or items."""
+    if "enum" in value or "const" in value:
+        return ""
     for branch in BRANCHES:
         for choice in value.get(branch, ()):
             if choice.get("type") in ("number", "integer", "array"):
@@ -170,5 +181,5 @@ def _range(value: dict[str, Any]) -> str:
     if low is None and high is None:
         return ""
     lowest = "above" if "exclusiveMinimum" in value else "from"
-    ends = [f"{lowest} {low:g}" if low is not None else "", f"to {high:g}" if high not in (None, math.inf) else ""]
+    ends = [f"{lowest} {_number(low)}" if low is not None else "", f"to {_number(high)}" if high is not None else ""]
     return " ".join(filter(None, ends))

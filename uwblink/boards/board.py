@@ -83,7 +83,7 @@ class Board:
 
     @classmethod
     def open(cls, port: str) -> Self:
-        """Open a serial port or pyserial URL; raises one of the `PortError`s. Nothing is written to it."""
+        """Open a serial port or pyserial URL; raises a `PortError`. Nothing is written to it."""
         return cls(SerialPort(port))
 
     def __enter__(self) -> Self:

@@ -1,0 +1,92 @@
+"""The generated reference: every key that a reader of files knows, every command and option, every offered name."""
+
+import dataclasses
+import json
+
+import pytest
+import typer
+
+import calib
+import uwblink
+import uwbsim
+from calib.calibration.file_keys import FILE_KEYS as CALIBRATION
+from docs.site import commands, doors, file_keys
+from uwblink.boards import ranging_plan
+from uwblink.importers import column_map
+from uwbsim.sweep import design
+
+APPS = commands.leaves
+
+
+@pytest.mark.parametrize("module", [column_map, ranging_plan, design], ids=["map", "plan", "sweep"])
+def test_the_reference_of_a_file_has_every_key_that_its_reader_knows(module):
+    page = file_keys.reference(module.FILE_KEYS)
+    for key in module.KEYS:
+        assert any(key in line for line in page.splitlines() if line.startswith("`")), key
+    assert all(key.kind and key.default and len(key.meaning) > 10 for key in module.FILE_KEYS)
+
+
+def test_a_map_knows_the_tables_that_its_reference_has():
+    assert set(column_map.KEYS) == {
+        *("layout", "bits", "counter", "protocol", "delimiter", "decimal", "within_s", "each", "topics"),
+        *("columns", "units", "constants", "ids", "antenna_delays"),
+    }
+
+
+def flat(table, above=""):
+    """Every key of a JSON document, dotted; names that people or data choose in capitals."""
+    for key, value in table.items():
+        free = {"delays_ns": "TAG", "delays_std_ns": "TAG", "groups": "NAME", "provenance": "KEY"}
+        name = free.get(above, key)
+        name = "PAIR" if above in ("errors.pairs", "pair_offsets") else name
+        dotted = f"{above}.{name}".strip(".")
+        if isinstance(value, dict) and dotted not in ("provenance.KEY",) and value:
+            yield from flat(value, dotted)
+        elif value != {}:
+            yield dotted
+
+
+def test_the_reference_of_calibrations_has_every_key_of_files_and_no_other():
+    flight = calib.sample_flight()
+    groups = {"front": [1, 2], "back": [3]}
+    found = set()
+    for settings in ({}, {"groups": groups}, {"constants": "pair"}):
+        calibration = calib.fit(flight, **settings).calibration
+        received = dataclasses.replace(calibration, power_at="reception")
+        for one in (calibration, received):
+            found |= set(flat(json.loads(one.to_json())))
+    assert found == {key.name for key in CALIBRATION}
+
+
+@pytest.mark.parametrize("package", [uwblink, uwbsim, calib], ids=lambda p: p.__name__)
+def test_every_offered_name_is_in_the_reference(package):
+    page = doors.reference(package.__name__)
+    assert f".. automodule:: {package.__name__}\n   :members:" in page
+    assert all(
+        (getattr(package, name).__doc__ or "").strip() for name in package.__all__ if callable(getattr(package, name))
+    )
+
+
+def test_what_doors_return_is_in_the_reference():
+    page = doors.reference("calib")
+    for name in ("evaluation.statistics.ErrorStatistics", "calibration.runtime.CorrectedRange", "doctor.base.Finding"):
+        assert f"calib.{name}" in page or name.split(".")[-1] in page
+
+
+@pytest.mark.parametrize("package", [uwblink, uwbsim, calib], ids=lambda p: p.__name__)
+def test_the_pages_of_commands_have_every_option(package):
+    app = __import__(f"{package.__name__}.cli.commands", fromlist=["app"]).app
+    page = commands.reference(app, package.__name__)
+    group = typer.main.get_command(app)
+    every = list(commands.leaves(group, (package.__name__,)))
+    assert len(every) > 8
+    for words, command in every:
+        section = page.split(f"## `{' '.join(words)}`\n")[1].split("\n## ")[0]
+        flags = [flag for p in command.params if p.name != "help" for flag in p.opts if flag.startswith("-")]
+        assert [flag for flag in flags if f"`{flag}`" not in section] == [], words
+        assert "```sh" in section, words
+
+
+def test_aliases_of_types_are_shown_by_their_names():
+    event = ("app", "function", "calib.x", len, None, "(a: TypeAliasForwardRef('Floats') | None = None)", None)
+    assert doors.plain_aliases(*event) == ("(a: Floats | None = None)", None)
