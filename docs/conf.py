@@ -53,8 +53,14 @@ nitpick_ignore_regex = [
         "py:class",
         r"(annotated_types|duckdb|np|collections|contextlib|datetime|numpy|os|pathlib|pydantic|matplotlib|typing)\..*",
     ),
-    ("py:class", r"uwbsim\.scenario\..*"),  # models of files, which have pages of their own
-    ("py:class", r"(Mapping|tuple)\[.*|Path|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using"),
+    (
+        "py:class",
+        r"uwbsim\.scenario\..*|Faults|GeometricMultipath|Shadow|Spline",
+    ),  # models of files, which have pages of their own
+    (
+        "py:class",
+        r"(Mapping|tuple)\[.*|AbstractContextManager|deque|PathLike|Path|ndarray|dtype|float64|complex128|ArrayLike|Bools|Floats|Ints|NDArray|Axes|Figure|Data|Source|Using",
+    ),
 ]
 
 nb_execution_mode = "force"

@@ -15,8 +15,6 @@ from uwblink.boards import ranging_plan
 from uwblink.importers import column_map
 from uwbsim.sweep import design
 
-APPS = commands.leaves
-
 
 @pytest.mark.parametrize("module", [column_map, ranging_plan, design], ids=["map", "plan", "sweep"])
 def test_the_reference_of_a_file_has_every_key_that_its_reader_knows(module):
@@ -90,3 +88,5 @@ def test_the_pages_of_commands_have_every_option(package):
 def test_aliases_of_types_are_shown_by_their_names():
     event = ("app", "function", "calib.x", len, None, "(a: TypeAliasForwardRef('Floats') | None = None)", None)
     assert doors.plain_aliases(*event) == ("(a: Floats | None = None)", None)
+    other = (*event[:5], "(a: ~calib.ranges.Ranges, b: dict = <factory>)", "~calib.Fit")
+    assert doors.plain_aliases(*other) == ("(a: Ranges, b: dict = ...)", "Fit")

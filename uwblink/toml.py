@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from uwblink.text_files import read_text
+
 
 class FileKey(NamedTuple):
     """A key of a file, for readers and for the reference: dotted below tables, in capitals where people choose it."""
@@ -21,8 +23,6 @@ class FileKey(NamedTuple):
 def heads(keys: Iterable[FileKey]) -> tuple[str, ...]:
     """Return the keys and tables of the first level, each once, in order."""
     return tuple(dict.fromkeys(key.name.split(".")[0] for key in keys))
-
-from uwblink.text_files import read_text
 
 
 class TomlReader:

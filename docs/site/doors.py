@@ -14,6 +14,8 @@ from typing import Any, Final
 
 PACKAGES: Final = ("uwblink", "uwbsim", "calib")
 ALIAS: Final = re.compile(r"TypeAliasForwardRef\('(\w+)'\)")
+HOME: Final = re.compile(r"~[\w.]+\.(?=\w)")
+FACTORY: Final = "<factory>"
 
 
 def reference(package: str) -> str:
@@ -35,7 +37,11 @@ def plain_aliases(*event: Any) -> tuple[str | None, str | None]:
     signature, returned = event[-2:]
     if hasattr(event[3], "model_fields"):
         return "", None
-    return tuple(ALIAS.sub(r"\1", text) if text else text for text in (signature, returned))  # type: ignore[return-value]
+    return _by_names(signature), _by_names(returned)
+
+
+def _by_names(text: str | None) -> str | None:
+    return HOME.sub("", ALIAS.sub(r"\1", text)).replace(FACTORY, "...") if text else text
 
 
 def _module(name: str, members: str = "") -> str:
