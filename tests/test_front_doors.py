@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import pkgutil
 import subprocess
 import sys
 
@@ -58,6 +59,20 @@ SHOWN = {(package, name) for package in PACKAGES for name in offered(package) if
 @pytest.mark.parametrize(("package", "name"), sorted(SHOWN))
 def test_everything_but_errors_has_an_example(package, name):
     assert shown(getattr(importlib.import_module(package), name))
+
+
+def rooms_of(package):
+    top = importlib.import_module(package)
+    inner = (m.name for m in pkgutil.walk_packages(top.__path__, f"{package}.") if m.ispkg)
+    return [importlib.import_module(name) for name in (package, *inner)]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_nothing_offered_has_the_name_of_a_module_beside_it(package):
+    """Whoever imports the module would find it in place of what is offered."""
+    for room in rooms_of(package):
+        modules = {module.name for module in pkgutil.iter_modules(room.__path__)}
+        assert modules & set(getattr(room, "__all__", ())) == set(), room.__name__
 
 
 @pytest.mark.parametrize("package", PACKAGES)

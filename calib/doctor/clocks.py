@@ -15,7 +15,7 @@ from calib.single_sided import corrected, left_skew
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.protocols.table import single_sided
-from uwblink.recording.clock_skews import clock_skews
+from uwblink.recording.relative_clocks import clock_skews
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals, without_stamps
 

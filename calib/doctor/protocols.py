@@ -11,7 +11,7 @@ import numpy as np
 from calib.doctor.base import Finding, RecordingView, plausible_share
 from uwblink.arrays import Bools
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.clock_skews import target_faster_ppm
+from uwblink.recording.relative_clocks import target_faster_ppm
 from uwblink.twr import Exchanges, raw_range
 
 WIDTHS: Final = (32, 40)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from uwblink.recording.clock_skews import clock_skews
+    from uwblink.recording.relative_clocks import clock_skews
     from uwblink.recording.summary import Summary, counted
 
 __all__ = [
@@ -16,7 +16,7 @@ __all__ = [
 
 _HOMES: Final = {
     "Summary": "uwblink.recording.summary",
-    "clock_skews": "uwblink.recording.clock_skews",
+    "clock_skews": "uwblink.recording.relative_clocks",
     "counted": "uwblink.recording.summary",
 }
 

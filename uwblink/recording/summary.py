@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwblink.display import as_html, cut, first_few, printable
-from uwblink.recording.clock_skews import ClockSkew, clock_skews, told
+from uwblink.recording.relative_clocks import ClockSkew, clock_skews, told
 from uwblink.recording.schema import TABLES, Fault, Tag
 from uwblink.recording.target_reports import single_reports
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwblink.recording.clock_skews import clock_skews, told
+from uwblink.recording.relative_clocks import clock_skews, told
 from uwblink.twr import Exchanges
 
 TICKS = 128 * 499.2e6
