@@ -176,6 +176,12 @@ class SerialPort:
         return PortLostError(f"{self.name}: the port is gone ({reason}); plug the board in again")
 
 
+def _since_boot_ns() -> int:
+    """Return a clock that nobody sets, and that goes on while the computer is suspended, where the system has one."""
+    boot = getattr(time, "CLOCK_BOOTTIME", None)
+    return time.monotonic_ns() if boot is None else time.clock_gettime_ns(boot)
+
+
 class SerialPorts:
     """The serial ports of this computer."""
 
@@ -184,7 +190,7 @@ class SerialPorts:
         self._selector = selectors.SelectSelector()
         self._pyserial: list[SerialPort] = []
         # No change of the wall clock moves the times of a recording.
-        self._epoch_ns = time.time_ns() - time.monotonic_ns()
+        self._epoch_ns = time.time_ns() - _since_boot_ns()
 
     def open(self, name: str) -> SerialPort:
         """Open a port and watch it; raises one of the `PortError`s."""
@@ -214,7 +220,7 @@ class SerialPorts:
 
     def host_ns(self) -> int:
         """Return host time in nanoseconds since the Unix epoch."""
-        return self._epoch_ns + time.monotonic_ns()
+        return self._epoch_ns + _since_boot_ns()
 
     def moved(self, name: str, number: str | None) -> str | None:
         """Return what a port is called now: the old name, or another of the board with this USB serial number."""

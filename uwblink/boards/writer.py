@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
@@ -26,6 +27,8 @@ from uwblink.wire.messages import Cir, Overheard, RangeReport
 
 FLUSH_S: Final = 0.1
 LONGEST_BACKLOG_S: Final = 20.0
+STOPPED_S: Final = 2.0
+"""A loop that does not ask for so long was stopped with its process (Ctrl-Z, a suspended computer)."""
 
 
 @dataclass(slots=True)
@@ -80,7 +83,9 @@ class RecordingWriter(Listener):
         self._batch = Batch()
         self._lock = threading.Lock()
         self._ended = threading.Event()
-        self._written_s = time.monotonic()
+        self._written_s = self._checked_s = time.monotonic()
+        self._stopped_s = 0.0
+        self._file = _identity(recording.path)
         self._error: RecordingError | None = None
         self._snapshots = SnapshotMaker(recording.path, recording.snapshot)
         self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
@@ -122,13 +127,17 @@ class RecordingWriter(Listener):
 
     @property
     def behind_s(self) -> float:
-        """How long ago the last commit ended, in seconds."""
-        return time.monotonic() - self._written_s
+        """How long ago the last commit ended, in seconds, less what this process was stopped since."""
+        return time.monotonic() - self._written_s - self._stopped_s
 
     def check(self) -> None:
         """Raise `RecordingError` when nothing can be written any more, or the disk cannot keep up."""
         if self._error:
             raise self._error
+        now_s = time.monotonic()
+        if now_s - self._checked_s > STOPPED_S:  # the loop was away as well: no disk is to blame
+            self._stopped_s += now_s - self._checked_s
+        self._checked_s = now_s
         if self.behind_s > LONGEST_BACKLOG_S:
             raise RecordingError(
                 f"{self._recording.path}: the disk is {self.behind_s:.0f} s behind; record to a faster one. "
@@ -150,6 +159,7 @@ class RecordingWriter(Listener):
             try:
                 if batch:
                     batch.write(self._recording)
+                self._check_file()
             except RecordingError as error:
                 self._error = error
             except Exception as error:  # whatever it is: nobody else sees what ends this thread
@@ -157,9 +167,25 @@ class RecordingWriter(Listener):
                     f"{self._recording.path}: cannot be written any more ({type(error).__name__}: {error}). "
                     "What was written before is kept"
                 )
-            self._written_s = time.monotonic()
-            self._snapshots.look()
+            self._written_s, self._stopped_s = time.monotonic(), 0.0
+            if not self._error:
+                self._snapshots.look()
         self._snapshots.close()
+
+    def _check_file(self) -> None:
+        """Raise `RecordingError` where the file has no name any more: what is written to it then is lost."""
+        path = self._recording.path
+        if _identity(path) != self._file:
+            raise RecordingError(f"{path}: was removed or replaced while it was being recorded; what it held is lost")
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from another of the same name, None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 class _Withdrawn(RecordingError):  # noqa: N818 - nothing is wrong

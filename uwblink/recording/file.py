@@ -35,7 +35,7 @@ from uwblink.recording.schema import (
     standard_meta,
 )
 from uwblink.recording.snapshots import open_snapshot
-from uwblink.recording.store import Store
+from uwblink.recording.store import Store, is_locked
 from uwblink.ticks import REPORT_BITS
 from uwblink.twr import BITS, COLUMNS, Exchanges
 
@@ -84,13 +84,19 @@ class Recording:
         """
         final = Path(path)
         check_output(final, force=force)
+        if final.exists() and is_locked(final, update=False):
+            raise RecordingInUseError(f"{final}: another process is writing it; give another name")
         place = final if live else final.with_name(f".{final.name}.{os.getpid()}.partial")
         _remove(place)
-        recording = cls(Store.create(place, final), None if live else place)
-        recording.append_meta(standard_meta() | dict(meta or {}))
-        if live:
-            # So that the tables are in the file itself, and only rows ever in the log beside it.
-            recording._store.execute("CHECKPOINT")
+        try:
+            recording = cls(Store.create(place, final), None if live else place)
+            recording.append_meta(standard_meta() | dict(meta or {}))
+            if live:
+                # So that the tables are in the file itself, and only rows ever in the log beside it.
+                recording._store.finish()
+        except RecordingError:
+            _remove(place)
+            raise
         return recording
 
     @classmethod
@@ -131,13 +137,24 @@ class Recording:
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close; a written file takes its name, or vanishes if the block raised."""
-        self._store.close()
+        """Close; a written file takes its name, or vanishes if the block raised.
+
+        Raises `RecordingError` where the disk does not take all of it.
+        """
         if self._partial is None:
+            self._store.close()
             return
-        if kind is None:
-            self._partial.replace(self.path)
-        _remove(self._partial)
+        try:
+            if kind is None:
+                self._store.finish()
+            self._store.close()
+            if kind is None:
+                self._partial.replace(self.path)
+        except OSError as error:
+            raise RecordingError(f"{self.path}: cannot be written ({error.strerror})") from error
+        finally:
+            self._store.close()
+            _remove(self._partial)
 
     def snapshot(self, place: str | os.PathLike[str]) -> None:
         """Write everything committed so far to a new file, while others go on appending; raises `RecordingError`."""

@@ -42,10 +42,15 @@ _LOCKED: Final = (
 class Store:
     """An open file with the tables of `TABLES`; `path` is what messages call it."""
 
-    def __init__(self, connection: duckdb.DuckDBPyConnection, path: Path, size: int = 0) -> None:
-        """Wrap an open connection to a file of `size` bytes, which bounds how long reading may take."""
+    def __init__(
+        self, connection: duckdb.DuckDBPyConnection, path: Path, size: int = 0, *, hidden: bool = False
+    ) -> None:
+        """Wrap an open connection to a file of `size` bytes, which bounds how long reading may take.
+
+        A `hidden` one has not its name yet, and vanishes where writing fails.
+        """
         self._db, self._second = connection, connection.cursor()
-        self.path = path
+        self.path, self._hidden = path, hidden
         self._longest_read_s = longest_read_s(size)
 
     @classmethod
@@ -54,7 +59,7 @@ class Store:
         import duckdb
 
         try:
-            store = cls(duckdb.connect(str(place)), path)
+            store = cls(duckdb.connect(str(place)), path, hidden=place != path)
             # Snapshots are written beside the recording, and nothing ever elsewhere.
             store.execute("SET allowed_directories = ?", [[str(place.absolute().parent)]])
             for setting in _LOCKED:
@@ -77,7 +82,7 @@ class Store:
         except duckdb.ConnectionException as error:
             raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error
         except duckdb.IOException as error:
-            if _is_locked(path, update=update):
+            if is_locked(path, update=update):
                 use = "has it open" if update else "is writing it"
                 raise RecordingInUseError(f"{path}: another process {use}; wait until that ends") from error
             raise _damaged(path, error) from error
@@ -98,6 +103,13 @@ class Store:
         self._second.close()
         self._db.close()
 
+    def finish(self) -> None:
+        """Put everything into the file itself, none of it left in the log beside it; raises `RecordingError`.
+
+        Closing does so too, and says nothing where it cannot.
+        """
+        self.execute("CHECKPOINT")
+
     def copy_to(self, place: Path) -> None:
         """Write what is committed to a new file, on a connection of its own; raises `RecordingError`."""
         import duckdb
@@ -116,8 +128,24 @@ class Store:
             raise RecordingError(f"{place}: cannot be written ({_first_line(error)})") from error
 
     def execute(self, statement: str, values: list[Any] | None = None) -> None:
-        """Execute a statement of SQL."""
-        self._db.execute(statement, values)
+        """Execute a statement of SQL; raises `RecordingError` where the file cannot be written."""
+        import duckdb
+
+        try:
+            self._db.execute(statement, values)
+        except (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException):
+            raise  # of values, and who inserts them knows of which table
+        except duckdb.Error as error:
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: duckdb.Error) -> RecordingError:
+        import duckdb
+
+        disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
+        reason = f"{_first_line(error)}){'; is the disk full?' if disk else '.'}"
+        if self._hidden:
+            return RecordingError(f"{self.path}: cannot be written ({reason} Nothing was written")
+        return RecordingError(f"{self.path}: cannot be written any more ({reason} What was written before is kept")
 
     def insert(self, table: str, columns: Mapping[str, NDArray[Any]]) -> None:
         """Add rows from columns with the table's names; what is masked in them is missing in the table.
@@ -209,14 +237,11 @@ class Store:
             yield
             self.execute("COMMIT")
         except duckdb.Error as error:
-            with suppress(duckdb.Error):
+            with suppress(RecordingError):
                 self.execute("ROLLBACK")
-            hint = "; is the disk full?" if isinstance(error, duckdb.IOException) else "."
-            raise RecordingError(
-                f"{self.path}: cannot be written any more ({_first_line(error)}){hint} What was written before is kept"
-            ) from error
+            raise self._unwritable(error) from error
         except RecordingError:
-            with suppress(duckdb.Error):
+            with suppress(RecordingError):
                 self.execute("ROLLBACK")
             raise
 
@@ -247,7 +272,7 @@ class Store:
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
 
 
-def _is_locked(path: Path, *, update: bool) -> bool:
+def is_locked(path: Path, *, update: bool) -> bool:
     """Whether another process holds the lock that DuckDB takes on a file it writes, or reads."""
     try:
         import fcntl
