@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, Final, Protocol
 
-from uwbsim.errors import ParameterError
+from uwbsim.errors import ParameterError, UwbsimError
 from uwbsim.sweep.extensions import Extensions
 from uwbsim.sweep.task import Result, Task, run_chunk
 
@@ -19,6 +20,10 @@ Done = tuple[Chunk, list[Result] | None, float]
 
 CONNECT_S: Final = 10
 THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class ClusterLostError(UwbsimError, ConnectionError):
+    """The scheduler of a cluster went away while it worked."""
 
 
 class Workers(Protocol):
@@ -121,7 +126,7 @@ class Cluster:
     def __init__(self, address: str, extensions: Extensions) -> None:
         """Connect; raises `ParameterError` where nobody answers within ten seconds."""
         extensions.check()
-        self._extensions = extensions
+        self._extensions, self._address = extensions, address
         try:
             self._dask: Any = import_module("distributed")
         except ImportError as error:
@@ -143,16 +148,21 @@ class Cluster:
     def finished(self) -> Sequence[Done]:
         """Wait for the first chunk that is done."""
         found: list[Done] = []
-        with self._client.as_current():
-            ready = self._dask.wait(list(self._running), return_when="FIRST_COMPLETED").done
-        for future in ready:
-            chunk = self._running.pop(future)
-            try:
-                rows, seconds = future.result()
-                found.append((chunk, rows, seconds))
-            except self._dask.KilledWorker:
-                found.append((chunk, None, 0.0))
-            future.release()
+        try:
+            with self._client.as_current():
+                ready = self._dask.wait(list(self._running), return_when="FIRST_COMPLETED").done
+            for future in ready:
+                chunk = self._running.pop(future)
+                try:
+                    rows, seconds = future.result()
+                    found.append((chunk, rows, seconds))
+                except self._dask.KilledWorker:
+                    found.append((chunk, None, 0.0))
+                future.release()
+        except (CancelledError, OSError, TimeoutError) as error:
+            raise ClusterLostError(
+                f"{self._address}: the scheduler is gone; results so far are kept, go on with `resume`"
+            ) from error
         return found
 
     def close(self) -> None:

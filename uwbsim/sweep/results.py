@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,38 +20,40 @@ class TableError(UwblinkError, ValueError):
 class Store:
     """Results by number, committed as they come: whoever is killed loses what was not committed, and nothing else."""
 
-    def __init__(self, connection: Any) -> None:
+    def __init__(self, connection: Any, path: Path) -> None:
         """Wrap an open database; use `create` or `open`."""
-        self._db = connection
+        self._db, self._path = connection, path
 
     @classmethod
     def create(cls, path: Path, identity: Mapping[str, Any]) -> Self:
         """Make a new store; `identity` says what its results are of."""
         db = _connect(path)
-        db.execute("BEGIN")
-        db.execute("CREATE TABLE identity (key VARCHAR, value VARCHAR)")
-        db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
-        db.execute("CREATE TABLE results (number BIGINT, part BIGINT, document VARCHAR)")
-        db.execute("COMMIT")
-        return cls(db)
+        with _writing(path):
+            db.execute("BEGIN")
+            db.execute("CREATE TABLE identity (key VARCHAR, value VARCHAR)")
+            db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
+            db.execute("CREATE TABLE results (number BIGINT, part BIGINT, document VARCHAR)")
+            db.execute("COMMIT")
+        return cls(db, path)
 
     @staticmethod
     def begun(path: Path) -> bool:
         """Return whether a file is there and holds anything: a kill at the very start leaves an empty one."""
         if not path.exists():
             return False
-        with _connect(path) as db:
+        with _connect(path) as db, _reading(path):
             return bool(db.execute("SELECT 1 FROM information_schema.tables").fetchall())
 
     @classmethod
     def open(cls, path: Path) -> Self:
         """Open a store; raises `TableError` where the file is none."""
         db = _connect(path)
-        names = {row[0] for row in db.execute("SELECT table_name FROM information_schema.tables").fetchall()}
+        with _reading(path):
+            names = {row[0] for row in db.execute("SELECT table_name FROM information_schema.tables").fetchall()}
         if not {"identity", "results"} <= names:
             db.close()
             raise TableError(f"{path}: not a store of results")
-        return cls(db)
+        return cls(db, path)
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -62,27 +65,32 @@ class Store:
 
     def identity(self) -> dict[str, Any]:
         """Return what the store was made for."""
-        return {key: json.loads(value) for key, value in self._db.execute("SELECT * FROM identity").fetchall()}
+        with _reading(self._path):
+            rows = self._db.execute("SELECT key, value FROM identity").fetchall()
+            return {key: json.loads(value) for key, value in rows}
 
     def done(self) -> set[int]:
         """Return the numbers that have results."""
-        return {int(row[0]) for row in self._db.execute("SELECT DISTINCT number FROM results").fetchall()}
+        with _reading(self._path):
+            return {int(row[0]) for row in self._db.execute("SELECT DISTINCT number FROM results").fetchall()}
 
     def append(self, results: Sequence[tuple[int, Sequence[Mapping[str, Any]]]]) -> None:
-        """Commit results, each a number and its rows, all or none."""
+        """Commit results, each a number and its rows, all or none; raises `TableError`."""
         rows = [[n, k, json.dumps(row)] for n, some in results for k, row in enumerate(some)]
-        self._db.execute("BEGIN")
-        if rows:
-            self._db.executemany("INSERT INTO results VALUES (?, ?, ?)", rows)
-        self._db.execute("COMMIT")
+        with _writing(self._path):
+            self._db.execute("BEGIN")
+            if rows:
+                self._db.executemany("INSERT INTO results VALUES (?, ?, ?)", rows)
+            self._db.execute("COMMIT")
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield all rows in the order of their numbers."""
-        cursor = self._db.cursor()
-        cursor.execute("SELECT document FROM results ORDER BY number, part")
-        while batch := cursor.fetchmany(5000):
-            for (document,) in batch:
-                yield json.loads(document)
+        """Yield all rows in the order of their numbers; raises `TableError` where one is damaged."""
+        with _reading(self._path):
+            cursor = self._db.cursor()
+            cursor.execute("SELECT document FROM results ORDER BY number, part")
+            while batch := cursor.fetchmany(5000):
+                for (document,) in batch:
+                    yield dict(json.loads(document))
 
 
 def export(store: Store, table: Path, parquet: Path) -> None:
@@ -103,4 +111,36 @@ def _connect(path: Path) -> Any:
         return duckdb.connect(str(path))
     except duckdb.Error as error:
         reason = str(error).splitlines()[0]
+        if "lock" in reason:
+            raise TableError(f"{path}: another sweep writes its results there; give another folder") from error
         raise TableError(f"{path}: cannot be opened ({reason[:120]})") from error
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Say of which store results cannot be read."""
+    import duckdb
+
+    try:
+        yield
+    except (duckdb.Error, ValueError, TypeError, KeyError, RecursionError) as error:
+        if isinstance(error, TableError):
+            raise
+        raise TableError(f"{path}: its results are damaged ({_first_line(error)}); begin in another folder") from error
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Say of which store results cannot be written."""
+    import duckdb
+
+    try:
+        yield
+    except duckdb.Error as error:
+        raise TableError(
+            f"{path}: cannot be written ({_first_line(error)}); is the disk full? Results so far are kept"
+        ) from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -1,0 +1,159 @@
+"""Sweeps while their machines misbehave: a damaged store, two sweeps on one folder, a scheduler that goes away."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+
+import duckdb
+import pytest
+
+from tests.in_process import CONTEXT, run
+from tests.uwbsim.sweep.test_sweep import HEAD, plan, rows
+from uwblink.errors import UwblinkError
+from uwbsim.sweep.executors import ClusterLostError
+from uwbsim.sweep.results import Store, TableError
+from uwbsim.sweep.runner import run_sweep
+
+SMALL = HEAD + 'ranges = 100\n[vary]\n"radio.rx_noise_ps" = [0.0, 50.0]\n'
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    p = plan(folder, SMALL)
+    assert run_sweep(p, folder / "out", workers=1).done == 2
+    return p, folder / "out"
+
+
+@pytest.fixture
+def done(finished, tmp_path):
+    p, out = finished
+    shutil.copytree(out, tmp_path / "out")
+    return p, tmp_path / "out"
+
+
+def cut(store):
+    store.write_bytes(store.read_bytes()[:20_000])
+
+
+def garbage(store):
+    data = bytearray(store.read_bytes())
+    data[12_288:] = os.urandom(len(data) - 12_288)
+    store.write_bytes(bytes(data))
+
+
+def with_sql(*statements):
+    def change(store):
+        with duckdb.connect(str(store)) as db:
+            for statement in statements:
+                db.execute(statement)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        cut,
+        garbage,
+        with_sql("UPDATE identity SET value = NULL"),
+        with_sql("UPDATE identity SET value = '{'"),
+        with_sql("ALTER TABLE identity DROP COLUMN value"),
+        with_sql("DROP TABLE results"),
+        with_sql("ALTER TABLE results DROP COLUMN number"),
+        with_sql("UPDATE results SET document = NULL"),
+        with_sql("UPDATE results SET document = '[1]'"),
+        with_sql("UPDATE results SET number = NULL"),
+    ],
+    ids=["cut", "garbage", "no identity", "no json", "column", "table", "number", "null", "list", "no number"],
+)
+def test_a_damaged_store_is_one_line_and_stays_as_it_is(done, damage):
+    p, out = done
+    damage(out / "results.duckdb")
+    before = (out / "results.csv").read_bytes()
+    with pytest.raises(UwblinkError) as caught:  # which is one line and status 2 of the command
+        run_sweep(p, out, workers=1, resume=True)
+    assert "\n" not in str(caught.value)
+    assert str(out) in str(caught.value)
+    assert (out / "results.csv").read_bytes() == before
+
+
+def _hold(path, pipe):
+    with Store.open(path):
+        pipe.send("open")
+        pipe.recv()
+
+
+def test_two_sweeps_cannot_have_one_folder(done):
+    p, out = done
+    ours, theirs = CONTEXT.Pipe()
+    other = CONTEXT.Process(target=_hold, args=(out / "results.duckdb", theirs))
+    other.start()
+    assert ours.recv() == "open"
+    with pytest.raises(TableError) as caught:
+        run_sweep(p, out, workers=1, resume=True)
+    ours.send("close")
+    other.join()
+    assert str(caught.value) == f"{out}/results.duckdb: another sweep writes its results there; give another folder"
+    assert len(rows(out)) == 4
+
+
+def test_a_full_disk_ends_a_sweep_with_one_line_and_keeps_what_was_done(tmp_path):
+    plan(tmp_path, SMALL)
+    ended = run("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1", most_bytes=8000)
+    assert ended.status == 2, ended
+    assert ended.err.count("\n") == 1
+    assert not (tmp_path / "out" / "results.csv").exists()
+    # Once there is room again, the same command does it.
+    (tmp_path / "out" / "results.duckdb").unlink(missing_ok=True)
+    assert run("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1").status == 0
+
+
+SCHEDULER = """
+import sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    quiet = {"dashboard_address": None, "silence_logs": 50}
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", **quiet) as c:
+        print(c.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_a_scheduler_that_goes_away_is_named_and_what_was_done_is_kept(tmp_path):
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    import dask
+
+    p = plan(tmp_path, HEAD + "ranges = 60_000\nseeds = 24\n")
+    words = [sys.executable, "-c", SCHEDULER]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as cluster:
+        address = cluster.stdout.readline().strip()
+        begun = threading.Event()
+
+        def kill():
+            begun.wait(60)
+            cluster.send_signal(signal.SIGKILL)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        gone = pytest.raises(ClusterLostError, match=rf"^{address}: the scheduler is gone; results so far are kept")
+        # The client tries to come back for so long, half a minute otherwise.
+        with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), gone:
+            run_sweep(p, tmp_path / "out", scheduler=address, progress=lambda _: begun.set())
+        begun.set()
+        killer.join()
+    with Store.open(tmp_path / "out" / "results.duckdb") as store:
+        before = store.done()
+    assert 0 < len(before) < p.total
+
+
+def test_results_that_are_none_are_no_rows(tmp_path):
+    with Store.create(tmp_path / "r.duckdb", {"name": "x"}) as store:
+        store.append([(1, [{"a": 1}]), (2, [])])
+        assert list(store.rows()) == [{"a": 1}]
+        with pytest.raises(TableError, match="damaged"):
+            store._db.execute("UPDATE results SET document = 'x'")
+            list(store.rows())
