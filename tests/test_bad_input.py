@@ -1,5 +1,6 @@
 """Every mistake a user can make at the three commands: one line, the right status, nothing written."""
 
+import gzip
 import subprocess
 import sys
 from pathlib import Path
@@ -94,6 +95,17 @@ def test_tables_that_cannot_be(tmp_path, content, fragments):
     table.write_text(content)
     refused(run("uwblink", "import", "csv", table, "-o", tmp_path / "o.uwb"), 2, "t.csv", *fragments)
     assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
+
+
+def test_a_broken_gzip_is_refused_and_not_read_for_ever(tmp_path):
+    whole = gzip.compress((HEADER + "\n" + (GOOD + "\n") * 5000).encode(), mtime=0)
+    (tmp_path / "t.csv.gz").write_bytes(whole[:40] + whole[60:80] * 100 + whole[40:])
+    refused(run("uwblink", "import", "csv", tmp_path / "t.csv.gz", "-o", tmp_path / "o.uwb"), 2, "t.csv.gz", "gzip")
+
+
+def test_names_too_long_for_the_system_are_one_line(tmp_path, flight):
+    for words in (("uwblink", "show", "a" * 5000), ("calib", "fit", flight / "f.uwb", "-o", "a" * 5000)):
+        refused(run(*words), 2, "File name too long")
 
 
 def test_recordings_that_are_not(tmp_path, flight):
@@ -257,6 +269,9 @@ def test_calibrations_of_other_tags_and_versions(tmp_path, flight):
         "schema version 7",
         "reads 1, 2, 3 and 4",
     )
+    huge = document | {"delays_ns": document["delays_ns"] | {"3": 10**400}}
+    (tmp_path / "c.json").write_text(json.dumps(huge))
+    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "delays_ns: 3", "a finite number")
     document["uncertainty"]["bias_m2"] = [[1.0]]
     (tmp_path / "c.json").write_text(json.dumps(document))
     refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "uncertainty", "bias_m2", "rows")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from typing import Any
 
 from calib.calibration.power_curves import Curve
@@ -39,7 +39,7 @@ class Reader:
     def number(self, key: str) -> float:
         """Return a finite number."""
         value = self._value(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
             raise self.wrong(key, "a finite number")
         return float(value)
 

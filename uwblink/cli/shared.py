@@ -104,6 +104,9 @@ def _said(error: BaseException, mistakes: tuple[type[Exception], ...]) -> str | 
         return str(error)
     if isinstance(error, RuntimeWarning):
         return f"numbers beyond what can be computed with ({error}); nothing was written"
+    if isinstance(error, OSError):
+        # Of the machine, wherever it met it: a name too long, a folder gone, a disk full.
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
     if isinstance(error, MemoryError):
         return "not enough memory for that; nothing was written"
     return None

@@ -5,6 +5,7 @@ Where one is not, nothing is returned, and whoever reads row by row says which c
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Final
 
@@ -46,11 +47,13 @@ def poses_of_lines(path: Path, body: str, *, euroc: bool) -> Poses | None:
     """Return the poses of a TUM or a EuRoC file, in order of time; None where a cell cannot be read so."""
     kind = np.dtype([("time", np.int64 if euroc else np.float64), ("values", np.float64, 7)])
     try:
-        rows = np.loadtxt(
-            path, dtype=kind, comments="#", delimiter="," if euroc else None, usecols=range(8) if euroc else None,
-            encoding="utf-8", ndmin=1,
-        )  # fmt: skip
-    except (ValueError, OSError, IndexError):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)  # of a file without any data
+            rows = np.loadtxt(
+                path, dtype=kind, comments="#", delimiter="," if euroc else None, usecols=range(8) if euroc else None,
+                encoding="utf-8", ndmin=1,
+            )  # fmt: skip
+    except (ValueError, OSError, IndexError, UserWarning):
         return None
     if not len(rows):
         return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
@@ -281,6 +282,20 @@ def _check(path: Path) -> None:
         raise ImportTableError(f"{path}: is a directory, expected a table (.csv, .csv.gz, .parquet or .jsonl)")
     if not path.exists():
         raise ImportTableError(f"{path}: no such table")
+    if path.suffix == ".gz":
+        _check_gzip(path)
+
+
+def _check_gzip(path: Path) -> None:
+    """Read a compressed file through: DuckDB reads a broken one for ever."""
+    try:
+        with gzip.open(path, "rb") as file:
+            while file.read(1 << 20):
+                pass
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise ImportTableError(f"{path}: broken or truncated gzip ({error})") from error
+    except OSError as error:
+        raise ImportTableError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def first_line(error: Exception) -> str:

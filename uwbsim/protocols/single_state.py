@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
@@ -56,7 +55,7 @@ def _check(q: State) -> None:
         value = getattr(q, field.name)
         if field.name in ("protocol", "whole_ticks"):
             continue
-        if not isinstance(value, int | float) or not (math.isfinite(value) and abs(value) < LARGEST):
+        if not isinstance(value, int | float) or not abs(value) < LARGEST:
             raise ParameterError(f"found {value}, expected a number below {LARGEST:g}", parameter=field.name)
         if field.name in NOT_NEGATIVE and value < 0:
             raise ParameterError(f"found {value:g}, expected 0 or more", parameter=field.name)

@@ -6,8 +6,8 @@ Nothing here is shared with what fits calibrations: a twin that carries their re
 from __future__ import annotations
 
 import json
-import math
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -136,7 +136,7 @@ def _value(table: Mapping[str, Any], key: str, where: str) -> Any:
 
 def _number(table: Mapping[str, Any], key: str, where: str) -> float:
     value = _value(table, key, where)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise ScenarioError(f"{where}: {key}: found {value!r:.60}, expected a finite number")
     return float(value)
 

@@ -33,6 +33,7 @@ class WorseError(MineError):
         (MineError("mine"), 2, "error: mine\n"),
         (WorseError("worse"), 1, "error: worse\n"),
         (MineError("a\nb\x1b[31m \ud800"), 2, "error: a\\nb\\x1b[31m \\ud800\n"),
+        (OSError(36, "File name too long", "aaa"), 2, "error: aaa: File name too long\n"),
         (MemoryError(), 2, "error: not enough memory for that; nothing was written\n"),
     ],
 )
