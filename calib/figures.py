@@ -1,4 +1,4 @@
-"""The figures of a calibration, drawn into axes: histogram of errors, curves over power, delays.
+"""The figures of a calibration, drawn into axes: errors and their distribution, curves over power, delays.
 
 Each takes matplotlib axes, or makes new ones where there are none, and returns them.
 """
@@ -6,105 +6,184 @@ Each takes matplotlib axes, or makes new ones where there are none, and returns 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, Literal
 
 import numpy as np
 from matplotlib.axes import Axes as Axes
 from matplotlib.figure import Figure
 
 from calib.calibration.model import Calibration, CorrectedRanges
+from calib.error_mixture import fit_error_mixture
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
 from calib.ranges import Ranges
-from calib.spread import robust_spread
 from uwblink.arrays import Floats
+from uwblink.pages.colours import BLUE, GREEN, INK, MAROON, MUTED, PALE, VERMILION
+from uwblink.pages.figures import label, legend, mark, sheet
 from uwblink.ticks import SPEED_OF_LIGHT
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart.
-COLOURS: Final = {"raw": "#D55E00", "delays": "#E69F00", "full": "#0072B2", "planted": "#009E73"}
+COLOURS: Final = {"raw": VERMILION, "delays": MAROON, "full": BLUE, "planted": GREEN}
+DASHES: Final = {"raw": (0, (1.5, 1.2)), "delays": (0, (5, 1.5)), "full": "-"}
 LABELS: Final = {"raw": "raw", "delays": "delays corrected", "full": "fully corrected"}
-HISTOGRAM_CM: Final = (-40.0, 80.0)
 BINS: Final = 20
-WIDE: Final = (8.0, 3.6)
-LOW: Final = (8.0, 3.4)
+BINS_OF_PAIR: Final = 6
+FEWEST_IN_BIN: Final = 60
+"""Errors of which a core can be told from a tail; below, their median stands for both."""
+
+HISTOGRAM_BINS: Final = 40
+WIDE: Final = (7.16, 3.2)
 TWO_SIDED_95: Final = 1.959963984540054
+STRAY: Final = 12.0
+"""Values further from the median than so many median deviations do not decide how far an axis runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Binned:
+    """Errors by lifted power: median power, centre, and standard deviation in each bin, metres.
+
+    Of the errors' core, noise without reflections, or of all of them where the curve was fitted to those.
+    """
+
+    lifted: Floats
+    centre_m: Floats
+    std_m: Floats
+    median_m: Floats
 
 
 def histogram(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None) -> Axes:
     """Range errors in the three stages, in cm; the outermost bins hold everything beyond them."""
     axes = axes or new_axes()
-    edges = np.arange(HISTOGRAM_CM[0], HISTOGRAM_CM[1] + 1, 4.0)
-    for stage, field in CORRECTION_STAGES.items():
-        error = 100 * (getattr(applied, field) - ranges.truth_m)
-        inside = np.clip(error, edges[0] + 0.1, edges[-1] - 0.1)
-        axes.hist(inside, edges.tolist(), histtype="step", lw=1.8, color=COLOURS[stage], label=LABELS[stage])
-    ticks = np.arange(HISTOGRAM_CM[0], HISTOGRAM_CM[1] + 1, 20)
-    names = [f"{t:.0f}" for t in ticks]
-    names[0], names[-1] = f"≤ {names[0]}", f"≥ {names[-1]}"
-    axes.set_xticks(ticks, names)
-    label(axes, "range error (cm)", "exchanges")
-    axes.legend(frameon=False)
-    return axes
+    errors = _errors_cm(ranges, applied)
+    low, high = _reach(errors)
+    edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
+    for stage, error in errors.items():
+        inside = np.clip(error, low, np.nextafter(high, low))
+        share = np.histogram(inside, edges)[0] * (100 / len(error))
+        mark(axes.stairs(share, edges, lw=1.3, color=COLOURS[stage], ls=DASHES[stage], label=LABELS[stage]), stage)
+    _outermost(axes, low, high)
+    label(axes, "range error (cm)", "ranges (%)")
+    return _explained(axes)
+
+
+def cumulative(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None) -> Axes:
+    """Share of ranges whose error is smaller than so much, in the three stages."""
+    axes = axes or new_axes()
+    errors = {stage: np.sort(np.abs(error)) for stage, error in _errors_cm(ranges, applied).items()}
+    shares = np.concatenate([np.linspace(0, 0.98, 150), np.linspace(0.981, 1, 20)])
+    for stage, error in errors.items():
+        (line,) = axes.plot(
+            np.quantile(error, shares), 100 * shares, color=COLOURS[stage], ls=DASHES[stage], label=LABELS[stage]
+        )
+        mark(line, LABELS[stage])
+    for share in (50, 95):
+        axes.axhline(share, color=PALE, lw=0.6, zorder=0)
+    full, raw = (float(np.quantile(errors[stage], 0.99)) for stage in ("full", "raw"))
+    axes.set_xlim(0, max(full, min(raw, 4 * full), 1e-9))
+    axes.set_ylim(0, 100)
+    axes.set_yticks([0, 25, 50, 75, 95])
+    label(axes, "size of the range error (cm)", "ranges with less (%)")
+    return _explained(axes)
+
+
+def binned(lifted: Floats, error_m: Floats, loss: str, bins: int) -> Binned:
+    """Return what errors (n,) come to by lifted power (n,), as a fit with this loss sees them.
+
+    The curve of a robust fit follows the errors' core: reflections only lengthen, so medians and means lie above it.
+    Least squares follow the mean.
+    """
+    groups = np.array_split(np.argsort(lifted), max(1, min(bins, len(lifted) // FEWEST_IN_BIN)))
+    found = np.array([_centre(error_m[rows], loss) for rows in groups])
+    median = [float(np.median(error_m[rows])) for rows in groups]
+    return Binned(np.array([np.median(lifted[rows]) for rows in groups]), found[:, 0], found[:, 1], np.array(median))
+
+
+def _centre(error_m: Floats, loss: str) -> tuple[float, float]:
+    if loss == "l2":
+        return float(np.mean(error_m)), float(np.std(error_m))
+    if len(error_m) < FEWEST_IN_BIN or float(np.ptp(error_m)) < 1e-9:
+        return float(np.median(error_m)), float(np.std(error_m))
+    core = fit_error_mixture(error_m, np.zeros(len(error_m), dtype=np.int64), 1)
+    return core.location_m, float(core.sigma_m[0])
 
 
 def bias_over_power(
     ranges: Ranges, applied: CorrectedRanges, calibration: Calibration, axes: Axes | None = None
 ) -> Axes:
-    """Median error after delay correction over lifted power: every pair, all, fitted, planted."""
-    error = 100 * (applied.delay_corrected_m - ranges.truth_m)
-    axes = _over_power(axes or new_axes(), ranges, applied, error, np.median)
+    """Centre of the delay-corrected errors' core over lifted power: every pair, all, fitted, planted; and medians."""
+    axes = axes or new_axes()
+    error = applied.delay_corrected_m - ranges.truth_m
+    everything = _over_power(axes, ranges, applied.lifted, error, calibration.loss, "centre_m")
+    if calibration.loss != "l2":
+        axes.plot(
+            everything.lifted, 100 * everything.median_m, "_", color=MUTED, ms=6, label="medians, reflections included"
+        )
+    _curve(axes, calibration, "bias")
     grid = np.linspace(*calibration.bias_curve.range, 300)
-    _band(axes, grid, 100 * calibration.bias_curve(grid), calibration.band(grid, "bias"))
-    axes.plot(grid, 100 * calibration.bias_curve(grid), color=COLOURS["full"], lw=2.2, label="fitted")
     planted = planted_curve(ranges, "bias_curve", grid)
     if planted is not None:
         beside = beside_planted(ranges, applied, calibration)
         shift = beside.shift_ns * 1e-9 * SPEED_OF_LIGHT if beside else 0.0
-        axes.plot(grid, 100 * (planted + shift), "--", color=COLOURS["planted"], lw=2.2, label="planted")
-    label(axes, "lifted first-path power", "bias (cm)")
-    axes.legend(frameon=False)
-    return axes
+        axes.plot(grid, 100 * (planted + shift), ls=DASHES["delays"], color=GREEN, label="planted, same gauge")
+    _power_axes(axes, calibration, "bias (cm)")
+    return _explained(axes)
 
 
 def sigma_over_power(
     ranges: Ranges, applied: CorrectedRanges, calibration: Calibration, axes: Axes | None = None
 ) -> Axes:
-    """Robust standard deviation of calibrated errors over lifted power, likewise."""
-    error = 100 * (applied.corrected_m - ranges.truth_m)
-    axes = _over_power(axes or new_axes(), ranges, applied, error, robust_spread)
+    """Standard deviation of the calibrated errors' core over lifted power, likewise."""
+    axes = axes or new_axes()
+    _over_power(axes, ranges, applied.lifted, applied.corrected_m - ranges.truth_m, calibration.loss, "std_m")
+    _curve(axes, calibration, "sigma")
     grid = np.linspace(*calibration.sigma_curve.range, 300)
-    _band(axes, grid, 100 * calibration.sigma_curve(grid), calibration.band(grid, "sigma"))
-    axes.plot(grid, 100 * calibration.sigma_curve(grid), color=COLOURS["full"], lw=2.2, label="fitted")
     planted = planted_curve(ranges, "sigma_curve", grid)
     if planted is not None:
-        axes.plot(grid, 100 * planted, "--", color=COLOURS["planted"], lw=2.2, label="planted")
+        axes.plot(grid, 100 * planted, ls=DASHES["delays"], color=GREEN, label="planted")
     axes.set_ylim(bottom=0)
-    label(axes, "lifted first-path power", "standard deviation (cm)")
-    axes.legend(frameon=False)
-    return axes
+    _power_axes(axes, calibration, "standard deviation (cm)")
+    return _explained(axes)
 
 
-def _over_power(axes: Axes, ranges: Ranges, applied: CorrectedRanges, values: Floats, summary: Any) -> Axes:
-    for rows in pair_rows(ranges).values():
-        axes.plot(*_binned(applied.lifted[rows], values[rows], summary), color="0.75", lw=0.9)
-    axes.plot([], [], color="0.75", lw=0.9, label="each pair")
-    everything = _binned(applied.lifted, values, summary)
-    axes.plot(*everything, "o", color="0.2", ms=4, label="all pairs")
-    return axes
+def _over_power(axes: Axes, ranges: Ranges, lifted: Floats, error_m: Floats, loss: str, what: str) -> Binned:
+    shown = []
+    for name, rows in pair_rows(ranges).items():
+        own = binned(lifted[rows], error_m[rows], loss, BINS_OF_PAIR)
+        shown.append(100 * getattr(own, what))
+        (line,) = axes.plot(own.lifted, shown[-1], color=PALE, lw=0.8, label="" if len(shown) > 1 else "each pair")
+        mark(line, f"pair {name}")
+    everything = binned(lifted, error_m, loss, BINS)
+    name = "mean of all pairs" if loss == "l2" else "core of all pairs"
+    axes.plot(everything.lifted, 100 * getattr(everything, what), "o", color=INK, ms=3, label=name, zorder=4)
+    keep_strays_out(axes, np.concatenate([*shown, 100 * getattr(everything, what)]))
+    return everything
 
 
-def _band(axes: Axes, grid: Floats, middle: Floats, std_m: Floats | None) -> None:
+def _curve(axes: Axes, calibration: Calibration, which: Literal["bias", "sigma"]) -> None:
+    curve = calibration.bias_curve if which == "bias" else calibration.sigma_curve
+    grid = np.linspace(*curve.range, 300)
+    middle, std_m = 100 * curve(grid), calibration.band(grid, which)
     if std_m is not None:
-        axes.fill_between(
-            grid, middle - 196 * std_m, middle + 196 * std_m, color=COLOURS["full"], alpha=0.25, lw=0, label="95 % band"
-        )
+        half = 100 * TWO_SIDED_95 * std_m
+        axes.fill_between(grid, middle - half, middle + half, color=BLUE, alpha=0.3, lw=0, label="95 % band")
+    axes.plot(grid, middle, color=BLUE, lw=1.6, label="fitted", zorder=3)
 
 
-def _binned(x: Floats, y: Floats, summary: Any) -> tuple[Floats, Floats]:
-    groups = np.array_split(np.argsort(x), max(1, min(BINS, len(x) // 20)))
-    return (
-        np.array([np.median(x[rows]) for rows in groups]),
-        np.array([summary(y[rows]) for rows in groups]),
-    )
+def _power_axes(axes: Axes, calibration: Calibration, y: str) -> None:
+    """Name the axes, and put first-path powers in dBm above: the same axis in the radio's unit."""
+    alpha = calibration.alpha_dbm
+    label(axes, f"lifted power ψ = 10^((p − α) / 10 dB), α = {alpha:g} dBm".replace("-", "−"), y)
+    low, high = axes.get_xlim()
+    top = axes.secondary_xaxis("top")
+    kept: list[float] = []
+    # A label takes 0.4 inch.
+    apart = (high - low) * 0.4 / max(1.0, axes.figure.get_figure(root=True).get_figwidth() - 0.6)
+    for power in np.arange(np.floor(alpha + 40), alpha - 40, -1.0):
+        place = 10 ** ((power - alpha) / 10)
+        if max(low, 1e-4) <= place <= high and (not kept or abs(kept[-1] - place) > apart):
+            kept.append(float(place))
+    top.set_xticks(kept, [f"{10 * np.log10(place) + alpha:.0f}".replace("-", "−") for place in kept])
+    top.set_xlabel("first-path power p (dBm)")
+    top.spines["top"].set_color(MUTED)
 
 
 def delays(
@@ -113,22 +192,98 @@ def delays(
     shift_ns: float = 0.0,
     axes: Axes | None = None,
 ) -> Axes:
-    """Delays in ns with 95 % intervals; planted ones, if known, beside them, moved by the common shift."""
+    """Delays in ns with 95 % intervals; planted ones, if known, beside them, moved by the common shift.
+
+    What lies far from all the others is at the edge, with its value.
+    """
     axes = axes or new_axes()
     tags = sorted(calibration.delays_ns)
-    place = np.arange(len(tags))
+    place = np.arange(len(tags), dtype=np.float64)
     values = np.array([calibration.delays_ns[tag] for tag in tags])
     std = np.array([calibration.delays_std_ns.get(tag, np.nan) for tag in tags])
     bars = np.where(np.isfinite(std), TWO_SIDED_95 * std, 0.0)
-    axes.errorbar(place, values, bars, fmt="o", ms=5, capsize=4, color=COLOURS["full"], label="fitted, 95 % interval")
+    inside = within_fence(values)
+    beside = 0.12 if planted_ns else 0.0
+    axes.errorbar(
+        (place - beside)[inside],
+        values[inside],
+        bars[inside],
+        fmt="o",
+        ms=3.5,
+        capsize=2.5,
+        color=BLUE,
+        label="fitted, 95 % interval",
+    )
+    low, high = float(values[inside].min()), float(values[inside].max())
     if planted_ns:
-        known = [planted_ns.get(tag, np.nan) + shift_ns for tag in tags]
-        axes.plot(place, known, "x", ms=8, mew=2, color=COLOURS["planted"], label="planted, moved by the common shift")
-    axes.axhline(0, color="0.7", lw=0.8, zorder=0)
-    axes.set_xticks(place, [str(tag) for tag in tags])
-    axes.margins(x=0.08)
+        known = np.array([planted_ns.get(tag, np.nan) + shift_ns for tag in tags])
+        axes.plot(place + beside, known, "x", ms=5, mew=1.4, color=GREEN, label="planted, same gauge")
+        near = known[inside & np.isfinite(known)]
+        low, high = min([low, *near]), max([high, *near])
+    bar = min(float(bars[inside].max()), 4 * float(np.median(bars[inside])))
+    margin = 0.08 * (high - low) + bar + 1e-6
+    axes.set_ylim(low - margin, high + 2.2 * margin if not inside.all() else high + margin)
+    for k in np.flatnonzero(~inside):
+        axes.annotate(
+            f"{values[k]:+.1f} ns",
+            (place[k], 0.97),
+            xycoords=("data", "axes fraction"),
+            ha="center",
+            va="top",
+            color=BLUE,
+        )
+    axes.axhline(0, color=PALE, lw=0.7, zorder=0)
+    every = max(1, len(tags) // 24 + 1)
+    axes.set_xticks(place[::every], [str(tag) for tag in tags[::every]])
+    axes.margins(x=0.06)
     label(axes, "tag", "antenna delay (ns)")
-    axes.legend(frameon=False)
+    return _explained(axes)
+
+
+def within_fence(values: Floats) -> Any:
+    """Return which values (n,) may decide how far an axis runs: all but those far from the others."""
+    away = np.abs(values - np.median(values))
+    usual = float(np.median(away))
+    return away <= (STRAY * usual if usual > 0 else np.inf)
+
+
+def keep_strays_out(axes: Axes, values: Floats) -> None:
+    """Let the vertical axis run over values (n,) but strays."""
+    inside = values[within_fence(values)]
+    low, high = float(inside.min()), float(inside.max())
+    margin = 0.12 * (high - low) + 1e-9
+    axes.set_ylim(low - margin, high + margin)
+
+
+def _errors_cm(ranges: Ranges, applied: CorrectedRanges) -> dict[str, Floats]:
+    return {stage: 100 * (getattr(applied, name) - ranges.truth_m) for stage, name in CORRECTION_STAGES.items()}
+
+
+def _reach(errors: Mapping[str, Floats]) -> tuple[float, float]:
+    """Return from where to where a histogram runs: over 98 % of the corrected, and the raw where they are near."""
+    low, high = np.quantile(errors["full"], (0.01, 0.99))
+    raw = np.quantile(errors["raw"], (0.02, 0.98))
+    if raw[1] - raw[0] + abs(float(np.mean(raw)) - float(low + high) / 2) < 5 * (high - low):
+        low, high = min(low, raw[0]), max(high, raw[1])
+    margin = 0.05 * float(high - low) + 0.1
+    return float(low) - margin, float(high) + margin
+
+
+def _outermost(axes: Axes, low: float, high: float) -> None:
+    """Say at its ends that the axis holds everything beyond."""
+    inner = [t for t in axes.get_xticks() if low + 0.12 * (high - low) < t < high - 0.12 * (high - low)]
+    names = [f"≤ {low:.0f}", *(f"{t:.0f}" for t in inner), f"≥ {high:.0f}"]
+    axes.set_xticks([low, *inner, high], [name.replace("-", "−") for name in names])
+    axes.set_xlim(low, high)
+
+
+def _explained(axes: Axes) -> Axes:
+    """Explain the lines: above the axes where they have a figure of their own, else inside."""
+    figure = axes.figure
+    if isinstance(figure, Figure) and len(figure.axes) == 1 and figure.get_layout_engine() is not None:
+        legend(figure, axes)
+    else:
+        axes.legend(frameon=False)
     return axes
 
 
@@ -139,16 +294,8 @@ def new_axes() -> Axes:
     return pyplot.subplots(figsize=WIDE, layout="constrained")[1]
 
 
-def alone(draw: Callable[[Axes], Axes], size: tuple[float, float] = WIDE) -> Figure:
-    """Return a figure of its own, for a page, with what is drawn into its axes."""
-    figure = Figure(figsize=size, layout="constrained")
-    draw(figure.subplots())
+def alone(draw: Callable[[Axes], Axes], width_in: float) -> Figure:
+    """Return a figure of its own, of a width in inches, with what is drawn into its axes."""
+    figure, (axes,) = sheet(width_in, height_in=3.1)
+    draw(axes)
     return figure
-
-
-def label(axes: Axes, x: str, y: str) -> None:
-    """Name the axes, and take away what carries nothing."""
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)

@@ -16,9 +16,10 @@ CONFINED = {
     "serial": lambda path: path == "uwblink/boards/ports.py",
     "simpy": lambda path: path.startswith("uwbsim/"),
     "matplotlib": lambda path: (
-        "figures" in Path(path).name or path in {f"calib/report/{name}.py" for name in ("blocks", "html", "pdf")}
+        "figures" in Path(path).name or path in {f"calib/report/{name}.py" for name in ("blocks", "pdf")}
     ),
     "fpdf": lambda path: path == "calib/report/pdf.py",
+    "pypdf": lambda path: path == "calib/report/pdf.py",
     "typer": lambda path: "/cli/" in path,
     "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
@@ -34,7 +35,7 @@ CONFINED = {
 FLOORS = {
     "uwblink": (
         ("arrays", "display", "errors", "lazy", "text_files"),
-        ("columns", "output", "plugins", "ticks", "toml"),
+        ("columns", "output", "pages", "plugins", "ticks", "toml"),
         ("protocols",),
         ("twr",),
         ("wire",),
@@ -54,7 +55,7 @@ FLOORS = {
     ),
     "calib": (
         ("densities", "errors", "samples", "single_sided", "spread"),
-        ("information", "ranges"),
+        ("error_mixture", "information", "ranges"),
         ("calibration", "sources"),
         ("evaluation",),
         ("figures",),

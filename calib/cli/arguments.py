@@ -12,6 +12,9 @@ from uwblink.cli.guide import choice, tags_of
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings with true distances (.uwb).")]
 CalibrationFile = Annotated[Path, typer.Option("-c", "--calibration", help="Calibration (.json).")]
 NewCalibration = Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")]
+Figures = Annotated[
+    Path | None, typer.Option(help="Folder for the figures as PDF and SVG, at a column's and a page's width.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print all figures as JSON, in SI units and ns.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
 WEIGHTS: Final = "How errors count"

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from calib import Calibration
     from calib.evaluation import Evaluation
 
-from calib.cli.arguments import CalibrationFile, Force, Recordings
+from calib.cli.arguments import CalibrationFile, Figures, Force, Recordings
 from uwblink.cli.guide import add, choice
 from uwblink.cli.waiting import waiting
 
@@ -42,7 +42,10 @@ def add_to(app: typer.Typer) -> None:
 def evaluate(
     recordings: Recordings,
     calibration: CalibrationFile,
-    report: Annotated[Path | None, typer.Option(help="Report of the evaluation to write, one page (.html).")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Report of the evaluation to write, one page (.html) or pages (.pdf).")
+    ] = None,
+    figures: Figures = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print all figures as JSON, in metres and ns, instead of a table.")
     ] = False,
@@ -52,16 +55,20 @@ def evaluate(
     import calib
     from calib.sources import load_each
 
-    if report:
-        from uwblink.output import check_output
+    if report or figures:
+        from calib.report import check_places
 
-        check_output(report, force=force)
+        check_places(report, None, figures, force=force)
     known = calib.load_calibration(calibration)
     with waiting("evaluating"):
         parts = load_each(recordings, need_power=known.needs_power)
         evaluation = calib.evaluate(parts, known)
-        if report:
-            calib.write_report(report, parts, known, force=force)
+        if report or figures:
+            from calib.cli.reporting import command_line
+            from calib.report import origin_of
+
+            origin = origin_of([*recordings, calibration], command_line())
+            calib.write_report(report, parts, known, figures=figures, evaluation=evaluation, origin=origin, force=force)
     tell_seen(evaluation)
     if as_json:
         typer.echo(json.dumps(evaluation.to_dict(), indent=1))
@@ -71,8 +78,8 @@ def evaluate(
     from calib.cli.table import WIDE, print_table
 
     print_table(evaluation, Console(width=None if sys.stdout.isatty() else WIDE))
-    if report:
-        typer.echo(f"report: {report}")
+    for path in filter(None, (report, figures)):
+        typer.echo(f"report: {path}")
 
 
 def tell_seen(evaluation: Evaluation) -> None:
@@ -107,6 +114,7 @@ def localize(
     tum: Annotated[
         Path | None, typer.Option(help="Folder for the estimated trajectories, one file a body and filter (.tum).")
     ] = None,
+    figures: Figures = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
     force: Force = False,
 ) -> None:
@@ -114,15 +122,21 @@ def localize(
     import calib
     from calib.evaluation import Settings, localization_json, localization_text, summarize, write_tum
 
+    if figures:
+        from calib.report import check_places, write_track_figures
+
+        check_places(None, None, figures, force=force)
     known = calib.load_calibration(calibration)
     if model != "poses":
-        _onboard(recordings, known, model, tum, as_json=as_json, force=force)
+        _onboard(recordings, known, model, tum, figures, as_json=as_json, force=force)
         return
     settings = Settings(velocity_std_mps=process_noise, seeds=seeds)
     with waiting("localizing"):
         found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
     if tum:
         write_tum(found, tum, force=force)
+    if figures:
+        write_track_figures(found, figures, force=force)
     if as_json:
         typer.echo(json.dumps(localization_json(found), indent=1))
         return
@@ -130,7 +144,14 @@ def localize(
 
 
 def _onboard(
-    recordings: list[Path], known: Calibration, model: str, tum: Path | None, *, as_json: bool, force: bool
+    recordings: list[Path],
+    known: Calibration,
+    model: str,
+    tum: Path | None,
+    figures: Path | None,
+    *,
+    as_json: bool,
+    force: bool,
 ) -> None:
     """Localize by what is on board, and print it."""
     from calib.evaluation import OnboardSettings, localize_onboard, onboard_json, onboard_text, write_onboard_tum
@@ -140,6 +161,10 @@ def _onboard(
         found = [one for path in recordings for one in localize_onboard(path, known, settings)]
     if tum:
         write_onboard_tum(found, tum, force=force)
+    if figures:
+        from calib.report import write_onboard_figures
+
+        write_onboard_figures(found, figures, force=force)
     typer.echo(json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings))
 
 
@@ -184,12 +209,21 @@ def doctor(
 def compare(
     first: Annotated[Path, typer.Argument(help="Calibration to compare with (.json).")],
     second: Annotated[Path, typer.Argument(help="Calibration whose differences are told (.json).")],
+    figures: Figures = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    force: Force = False,
 ) -> None:
     """Say whether two calibrations' delays differ by more than their standard errors explain (differences in ns)."""
     import calib
 
-    found = calib.compare(calib.load_calibration(first), calib.load_calibration(second))
+    if figures:
+        from calib.report import check_places, write_comparison_figures
+
+        check_places(None, None, figures, force=force)
+    known = [calib.load_calibration(path) for path in (first, second)]
+    found = calib.compare(*known)
+    if figures:
+        write_comparison_figures(found, known, [first.stem, second.stem], figures, force=force)
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from calib.cli.arguments import (
     Constants,
     DelaysFrom,
     DelaysOnly,
+    Figures,
     Fix,
     Force,
     GroupFile,
@@ -32,6 +34,11 @@ from calib.cli.flags import with_flags
 from uwblink.cli.guide import add
 
 MANY: Final = "--tests"
+
+
+def command_line() -> str:
+    """Return how the command was called, for the report to say."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def add_to(app: typer.Typer) -> None:
@@ -61,13 +68,13 @@ def spread(arguments: Sequence[str]) -> list[str]:
 
 def report(
     recordings: Recordings,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Report to write (.html).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Report to write, one page (.html) or pages (.pdf).")],
     tests: Annotated[
         list[Path] | None,
         typer.Option(help="Recordings to judge the calibration by, which the fit does not see (.uwb)."),
     ] = None,
     pdf: Annotated[Path | None, typer.Option(help="The same report to write as PDF.")] = None,
-    figures: Annotated[Path | None, typer.Option(help="Folder for the figures as PDF and SVG, at paper size.")] = None,
+    figures: Figures = None,
     loss: Loss = None,
     scale: Scale = "auto",
     lift: Lift = "mean-of-lifted",
@@ -106,7 +113,12 @@ def report(
     check_places(output, pdf, figures, force=force)
     with Console(file=sys.stderr).status("loading") as status:
         campaign = calib.run_campaign(
-            recordings, tests or [], trim_static=trim_static, progress=status.update, **options
+            recordings,
+            tests or [],
+            trim_static=trim_static,
+            progress=status.update,
+            command=command_line(),
+            **options,
         )
         campaign.write(output, pdf, figures, force=force, progress=status.update)
     if as_json:

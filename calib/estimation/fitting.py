@@ -24,9 +24,9 @@ from calib.calibration.model import Calibration, TagGroup, Uncertainty
 from calib.calibration.pair_offsets import PairOffset
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve
 from calib.calibration.power_curves import lift as lift_power
+from calib.error_mixture import fit_error_mixture
 from calib.estimation.arguments import check_fit
 from calib.estimation.doubts import doubts
-from calib.estimation.error_mixture import fit_error_mixture
 from calib.estimation.error_model import error_model
 from calib.estimation.flat import no_bias, sigma_of
 from calib.estimation.known_delays import imported, std_taken_over, taken_over

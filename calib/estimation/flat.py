@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.calibration.power_curves import DEGREE, Curve, flat_curve
-from calib.estimation.error_mixture import ErrorMixture
+from calib.error_mixture import ErrorMixture
 from calib.estimation.problem import Problem
 from calib.estimation.sigma_curve import SigmaFit, fit_sigma
 from uwblink.arrays import Floats

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lift
-from calib.estimation.error_mixture import fit_error_mixture
+from calib.error_mixture import fit_error_mixture
 from calib.sources import Data, opened
 from uwblink.arrays import Floats
 from uwblink.protocols.table import third_from_target

@@ -17,8 +17,8 @@ from calib.calibration.power_curves import (
     equal_bins,
     knots_for,
 )
+from calib.error_mixture import ErrorMixture, fit_error_mixture
 from calib.errors import UnanswerableError
-from calib.estimation.error_mixture import ErrorMixture, fit_error_mixture
 from calib.estimation.problem import Problem
 from uwblink.arrays import Floats, Ints
 

@@ -57,16 +57,17 @@ def summarize(found: list[Localization]) -> Summary:
 
 def _bounds(count: float, degrees: int) -> tuple[float, float]:
     """Bounds that hold the mean of `count` independent chi-squares with 95 %."""
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
     some = max(count, 1.0)
-    return float(chi2.ppf(0.025, some * degrees) / some), float(chi2.ppf(0.975, some * degrees) / some)
+    half = some * degrees / 2
+    return float(2 * gammaincinv(half, 0.025) / some), float(2 * gammaincinv(half, 0.975) / some)
 
 
 def _inside(values: Floats, degrees: int) -> float:
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
-    low, high = float(chi2.ppf(0.025, degrees)), float(chi2.ppf(0.975, degrees))
+    low, high = float(2 * gammaincinv(degrees / 2, 0.025)), float(2 * gammaincinv(degrees / 2, 0.975))
     return float(np.mean((values >= low) & (values <= high)))
 
 

@@ -24,6 +24,7 @@ from calib.evaluation.localization import localize
 from calib.evaluation.statistics import Evaluation, evaluate
 from calib.evaluation.tracking import Localization
 from calib.ranges import Ranges, concatenate
+from calib.report.origin import Origin, origin_of
 from calib.sources import Data, each, load_each, opened
 
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
@@ -37,7 +38,8 @@ class Campaign:
     """Everything that a report tells of: what was fitted from which recordings, and how it does on which tests.
 
     `refits` are calibrations for other scales of the loss, by scale in ns; `heard` delays as passive listeners see
-    them; `findings` the doctor's, by recording; `tracks` the bodies that were localized.
+    them; `findings` the doctor's, by recording; `tracks` the bodies that were localized; `origin` says when
+    it was made, and from what files.
     """
 
     training: list[Ranges]
@@ -47,6 +49,7 @@ class Campaign:
     heard: dict[int, OverheardDelay] = field(default_factory=dict)
     findings: list[tuple[str, Finding]] = field(default_factory=list)
     tracks: list[Localization] = field(default_factory=list)
+    origin: Origin = field(default_factory=Origin)
 
     def __repr__(self) -> str:
         """Return what it comes to: the fit, how many tests there are, and what the doctor found."""
@@ -89,6 +92,7 @@ class Campaign:
     ) -> None:
         """Write the report as one HTML page, as PDF, and its figures at paper size (PDF and SVG) into a folder.
 
+        Figures come at two widths, a column's (3.5 inch) and a page's (7.16 inch). A `html` that ends in .pdf is a PDF.
         `progress` is told what is being done. Raises the errors of `check_output` before anything is drawn.
         """
         from calib.report.layout import document
@@ -133,14 +137,15 @@ def run_campaign(
     *,
     trim_static: bool = False,
     progress: Progress = lambda _: None,
+    command: str = "",
     **settings: Unpack[FitSettings],
 ) -> Campaign:
     """Fit to the training recordings, judge and localize on the tests, and return all that a report tells of.
 
     Recordings are what `load_ranges` takes, `settings` what `fit` takes. Without tests the training is judged, and the
     report says so. `Ranges` alone are fitted and judged, but neither examined nor localized: that takes a recording.
-    `trim_static` leaves out of the training where nothing moves; `progress` is told what is being done. Raises what
-    `load_ranges` and `fit` raise.
+    `trim_static` leaves out of the training where nothing moves; `progress` is told what is being done; `command` is
+    what the report says it was made by. Raises what `load_ranges` and `fit` raise.
 
     >>> import calib
     >>> campaign = calib.run_campaign(calib.sample_flight(), calib.sample_flight(300, seed=2), loss="huber")
@@ -167,6 +172,7 @@ def run_campaign(
         heard=_heard(recordings, found.calibration),
         findings=findings,
         tracks=_tracks(judged or recordings, found.calibration),
+        origin=origin_of([*recordings, *judged], command),
     )
 
 

@@ -9,9 +9,11 @@ from typing import Final
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.report import sections
-from calib.report.blocks import Block, Document, Heading, Listing, Text
+from calib.report.blocks import Block, Document, Heading, Listing, Table, Text
 from calib.report.campaign import Campaign
 from calib.report.localization_section import localization
+from calib.report.origin import Origin
+from calib.report.verdict import Judged, verdict
 
 Section = Callable[[Campaign], list[Block]]
 """Returns what stands in a section, its heading included; nothing where there is nothing to tell."""
@@ -24,8 +26,8 @@ def register_report_section(name: str, section: Section, *, before: str = PROVEN
     """Add a section to the report of a campaign, above the one called `before`.
 
     `section` takes the `Campaign` and returns blocks (`calib.report.blocks`: `Heading`, `Text`, `Table`, `Picture`,
-    `Listing`), which appear in the HTML page and in the PDF. Raises `BadInputError` for a name that is taken and for a
-    `before` that is not there.
+    `Listing`), which appear in the HTML page and in the PDF; figures are drawn at the width they are asked for.
+    Raises `BadInputError` for a name that is taken and for a `before` that is not there.
 
     >>> import calib
     >>> from calib.report.blocks import Heading, Text
@@ -52,7 +54,8 @@ def register_report_section(name: str, section: Section, *, before: str = PROVEN
 
 def document(campaign: Campaign) -> Document:
     """Return the report of a campaign."""
-    return Document(TITLE, [block for name, section in SECTIONS.items() for block in _checked(name, section(campaign))])
+    blocks = [block for name, section in SECTIONS.items() for block in _checked(name, section(campaign))]
+    return Document(TITLE, blocks, campaign.origin.sentence())
 
 
 def _checked(name: str, blocks: object) -> list[Block]:
@@ -70,14 +73,30 @@ def warnings(sentences: list[str]) -> list[Block]:
     return [Text(f"Warning: {sentence}", "warning") for sentence in sentences]
 
 
-def provenance(calibration: Calibration) -> list[Block]:
-    """Return where a calibration comes from."""
-    return [Heading("Provenance"), Listing(json.dumps(calibration.provenance, indent=1))]
+def provenance(calibration: Calibration, origin: Origin) -> list[Block]:
+    """Return where a report and its calibration come from."""
+    made = [["report", origin.made], ["version", origin.version], ["command", origin.command]]
+    rows = [row for row in made if row[1]] + [[path, f"SHA-256 {digest}"] for path, digest in origin.files.items()]
+    return [
+        Heading("Provenance"),
+        Table(["of", "what"], rows, words=True),
+        Listing(json.dumps(calibration.provenance, indent=1)),
+    ]
 
 
-def _summary(campaign: Campaign) -> list[Block]:
+def _verdict(campaign: Campaign) -> list[Block]:
     on_what = "the tests" if campaign.tests else "the recordings it was fitted from"
-    return [Text(sections.summary(campaign.evaluation, on_what), "lead")]
+    judged = Judged(
+        calibration=campaign.calibration,
+        ranges=campaign.judged,
+        corrected=campaign.corrected,
+        evaluation=campaign.evaluation,
+        held_out=bool(campaign.tests) and not campaign.evaluation.seen,
+        warnings=campaign.fit.warnings,
+        faults=[f"{name}: {finding.fault}" for name, finding in campaign.findings],
+        tracks=campaign.tracks,
+    )
+    return [*verdict(judged), Text(sections.summary(campaign.evaluation, on_what), "lead")]
 
 
 def _warned(campaign: Campaign) -> list[Block]:
@@ -93,7 +112,7 @@ def _sentence(text: str) -> str:
 
 
 def _recorded(campaign: Campaign) -> list[Block]:
-    return [Heading("What was recorded"), sections.recordings(campaign.training, campaign.tests)]
+    return [Heading("What was recorded"), sections.recordings(campaign.training, campaign.tests, campaign.origin.files)]
 
 
 def _determined(campaign: Campaign) -> list[Block]:
@@ -132,7 +151,7 @@ def _over_time(campaign: Campaign) -> list[Block]:
 
 
 SECTIONS: Final[dict[str, Section]] = {
-    "summary": _summary,
+    "verdict": _verdict,
     "warnings": _warned,
     "recordings": _recorded,
     "determined": _determined,
@@ -142,5 +161,5 @@ SECTIONS: Final[dict[str, Section]] = {
     "outliers": _outliers,
     "localization": lambda campaign: localization(campaign.tracks),
     "over time": _over_time,
-    PROVENANCE: lambda campaign: provenance(campaign.calibration),
+    PROVENANCE: lambda campaign: provenance(campaign.calibration, campaign.origin),
 }

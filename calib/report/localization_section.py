@@ -10,7 +10,7 @@ from calib.evaluation.localization import PAPER_RMSE_M
 from calib.evaluation.tracking import Localization, Settings
 from calib.report.blocks import Block, Heading, Picture, Table, Text
 
-MOST_TRACKS: Final = 3
+MOST_TRACKS: Final = 12
 """Bodies whose paths are drawn; the table holds all."""
 
 HEADS: Final = {
@@ -33,6 +33,8 @@ def localization(found: list[Localization]) -> list[Block]:
     rows.append(["mean", *(f"{total.rmse_m[name]:.3f}" for name in names)])
     rows.append(["its spread over seeds", *(f"{total.spread_m[name]:.3f}" for name in names)])
     rows.append(["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())])
+    paper = [f"{PAPER_RMSE_M[name]:.3f}" if name in PAPER_RMSE_M else "" for name in names]
+    rows.append(["ICRA 2023, its own flights", *paper])
     blocks: list[Block] = [
         Heading("Localization"),
         Table(["body", *(HEADS[name] for name in names)], rows, [("", 1), ("RMSE (m)", len(names))]),
@@ -45,23 +47,32 @@ def localization(found: list[Localization]) -> list[Block]:
             f"{100 * total.accepted:.1f} % of the ranges pass the gate. {_verdict(total)}",
             "note",
         ),
-        Picture("rmse", partial(figures_tracks.rmse_bars, found), "RMSE of the position in every scenario."),
+        Picture(
+            "rmse", partial(figures_tracks.rmse_bars, found=found), _told_bars(len(found), figures_tracks.MOST_BARS)
+        ),
     ]
     for one in found[:MOST_TRACKS]:
-        name = "".join(c if c.isalnum() else "-" for c in f"{one.source.removesuffix('.uwb')}-{one.body}")
-        blocks += [
+        blocks.append(
             Picture(
-                f"track-error-{name}",
-                partial(figures_tracks.error_over_time, one),
-                f"{one.source}, {one.body}: position error over time.",
-            ),
-            Picture(
-                f"track-{name}",
-                partial(figures_tracks.trajectories, one),
-                f"{one.source}, {one.body}: paths from above, and height over time.",
-            ),
-        ]
+                f"track-{file_name(one.source, one.body)}",
+                partial(figures_tracks.track, one=one),
+                f"{one.source}, {one.body}: path from above, height, and position error over time, with three "
+                "sigmas of the filter with variance.",
+            )
+        )
+    if len(found) > MOST_TRACKS:
+        blocks.append(Text(f"The first {MOST_TRACKS} of {len(found)} tracks are drawn; the table has all.", "note"))
     return blocks
+
+
+def file_name(source: str, body: str) -> str:
+    """Return what figures of a body in a recording are called."""
+    return "".join(c if c.isalnum() else "-" for c in f"{source.removesuffix('.uwb')}-{body}")
+
+
+def _told_bars(count: int, most: int) -> str:
+    left = f" Of {count} bodies those with the largest are drawn; the mean is over all." if count > most else ""
+    return f"RMSE of the position of each body, and the mean.{left}"
 
 
 def _verdict(total: Summary) -> str:

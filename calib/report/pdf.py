@@ -1,68 +1,168 @@
-"""A report as PDF, on A4."""
+"""A report as PDF, on A4: text and tables set here, figures as the drawings they are, page numbers, contents."""
 
 from __future__ import annotations
 
 import datetime
 import io
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from calib.report.blocks import Block, Document, Heading, Listing, Picture, Table, Text
+from calib.report.blocks import VERDICTS, Block, Document, Heading, Listing, Picture, Table, Text, sentence_apart
+from uwblink.pages.figures import PAGE_IN
 
 if TYPE_CHECKING:
     from fpdf import FPDF
 
-MARGIN_MM: Final = 16
+MM_OF_INCH: Final = 25.4
+PAPER_MM: Final = (210.0, 297.0)
+MARGIN_MM: Final = (PAPER_MM[0] - PAGE_IN * MM_OF_INCH) / 2
+"""So that figures of a page's width are printed as large as they are drawn."""
+
+FOOT_MM: Final = 16.0
 SIZE: Final = 9.5
-SMALL: Final = 7.5
-FILLS: Final = {"lead": (243, 245, 247), "warning": (255, 244, 224)}
+SMALL: Final = 8.0
+"""The smallest text."""
+
+LINE_MM: Final = 5.0
+NUMBER_MM: Final = 12.0
+"""Height of a line of the contents, and width of its page number."""
+
+PADDING_MM: Final = 2.4
+"""Beside the text of a cell."""
+
+FILLS: Final = {
+    "lead": (243, 245, 247),
+    "warning": (255, 244, 224),
+    "good": (229, 244, 236),
+    "doubt": (255, 244, 224),
+    "bad": (253, 234, 234),
+}
 FAMILY: Final = "DejaVu"
 EPOCH: Final = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
-"""Written as the date of creation, so that the same data give the same bytes."""
+"""Written as the date of creation, so that the same data give the same bytes; the title says when it was made."""
+
+
+@dataclass(slots=True)
+class _Placed:
+    """Where figures are to stand (page from 0, left and bottom edge in mm), and on which page each section begins.
+
+    `contents` are page and height in mm of the lines that list the sections.
+    """
+
+    figures: list[tuple[str, int, float, float]] = field(default_factory=list)
+    sections: list[int] = field(default_factory=list)
+    contents: list[tuple[int, float]] = field(default_factory=list)
 
 
 def to_pdf(document: Document, pictures: Mapping[str, bytes]) -> bytes:
-    """Return the document as PDF; `pictures` are its figures as PNG by name."""
+    """Return the document as PDF; `pictures` are its figures by name, PDF files of a page's width."""
+    sizes = {name: _size_mm(data) for name, data in pictures.items()}
+    text, placed = _set(document, sizes)
+    return _with_figures(text, pictures, placed)
+
+
+def _set(document: Document, sizes: Mapping[str, tuple[float, float]]) -> tuple[FPDF, _Placed]:
+    """Set text and tables, and leave room for figures of these sizes in mm."""
+    page, placed = _new(document), _Placed()
+    _write(page, document.title, 18, style="B")
+    if document.subtitle:
+        _write(page, document.subtitle, SMALL)
+    captions, listed = document.captions(), False
+    for block, following in zip(document.blocks, [*document.blocks[1:], None], strict=True):
+        if isinstance(block, Heading) and not listed:
+            _contents(page, document, placed)
+            listed = True
+        if isinstance(block, Heading):
+            _heading(page, block, 20 + sizes[following.name][1] if isinstance(following, Picture) else 45)
+            placed.sections.append(page.page_no())
+        elif isinstance(block, Picture):
+            _picture(page, block, captions[block.name], sizes[block.name], placed)
+        else:
+            _block(page, block)
+    _number_contents(page, placed)
+    return page, placed
+
+
+def _new(document: Document) -> FPDF:
     from fpdf import FPDF
     from matplotlib import get_data_path
 
+    class Numbered(FPDF):
+        """Pages with their numbers at the foot."""
+
+        def footer(self) -> None:
+            self.set_y(-FOOT_MM + 4)
+            self.set_font(FAMILY, "", SMALL)
+            self.cell(0, 5, f"{self.page_no()} / {{nb}}", align="C")
+
     fonts = Path(get_data_path()) / "fonts" / "ttf"
-    page = FPDF(format="A4")
+    page = Numbered(format="A4")
     page.set_creation_date(EPOCH)
     page.set_title(document.title)
+    page.set_lang("en")
     page.set_margin(MARGIN_MM)
-    page.set_auto_page_break(True, MARGIN_MM)
+    page.set_auto_page_break(True, FOOT_MM)
     # matplotlib carries these fonts; the built-in ones of PDF know no Greek and no minus sign.
     page.add_font(FAMILY, "", fonts / "DejaVuSans.ttf")
     page.add_font(FAMILY, "B", fonts / "DejaVuSans-Bold.ttf")
     page.add_page()
-    _write(page, document.title, 18, style="B")
-    for block, following in zip(document.blocks, [*document.blocks[1:], None], strict=True):
-        # A heading stays with what it heads.
-        if isinstance(block, Heading) and page.will_page_break(110 if isinstance(following, Picture) else 45):
+    return page
+
+
+def _contents(page: FPDF, document: Document, placed: _Placed) -> None:
+    """List the sections; their pages are added when all is set."""
+    page.ln(2)
+    page.set_font(FAMILY, "", SIZE)
+    for text in document.contents():
+        if page.will_page_break(LINE_MM):
             page.add_page()
-        _block(page, block, pictures)
-    return bytes(page.output())
+        placed.contents.append((page.page, page.get_y()))
+        page.cell(page.epw - NUMBER_MM, LINE_MM, text, new_x="LMARGIN", new_y="NEXT")
 
 
-def _block(page: FPDF, block: Block, pictures: Mapping[str, bytes]) -> None:
+def _number_contents(page: FPDF, placed: _Placed) -> None:
+    last, at = page.page, page.get_y()
+    for (on, y), begins in zip(placed.contents, placed.sections, strict=True):
+        page.page = on
+        page.set_font(FAMILY, "B", SIZE)  # a page that is gone back to knows nothing of the font now chosen
+        page.set_font(FAMILY, "", SIZE)
+        page.set_xy(page.l_margin, y)
+        link = page.add_link(page=begins)
+        page.cell(page.epw - NUMBER_MM, LINE_MM, "", link=link)
+        page.cell(NUMBER_MM, LINE_MM, str(begins), align="R", link=link)
+    page.page = last
+    page.set_y(at)
+
+
+def _heading(page: FPDF, block: Heading, room_mm: float) -> None:
+    """A heading stays with what it heads."""
+    if page.will_page_break(min(room_mm, page.eph - 10)):
+        page.add_page()
+    page.ln(3)
+    page.start_section(block.text)
+    _write(page, block.text, 13, style="B")
+    page.line(page.l_margin, page.get_y(), page.w - page.r_margin, page.get_y())
+    page.ln(2)
+
+
+def _block(page: FPDF, block: Block) -> None:
     match block:
-        case Heading(text):
-            page.ln(3)
-            _write(page, text, 13, style="B")
-            page.line(page.l_margin, page.get_y(), page.w - page.r_margin, page.get_y())
-            page.ln(2)
+        case Text(text, kind) if kind in VERDICTS:
+            first, rest = sentence_apart(text)
+            _write(page, first, 13, style="B", fill=FILLS[kind])
+            if rest:
+                _write(page, rest, SIZE + 1, fill=FILLS[kind])
+            page.ln(1.5)
         case Text(text, kind):
-            fill = FILLS.get(kind)
-            _write(page, text, SMALL + 0.5 if kind == "note" else SIZE, fill=fill)
+            _write(page, text, SMALL if kind == "note" else SIZE, fill=FILLS.get(kind))
             page.ln(1.5)
         case Listing(text):
             _write(page, text, SMALL, fill=FILLS["lead"])
-        case Picture():
-            _picture(page, pictures[block.name], block.caption)
         case Table():
-            _table(page, block)
+            for part in _parts(page, block):
+                _table(page, part)
 
 
 def _write(page: FPDF, text: str, size: float, *, style: str = "", fill: tuple[int, int, int] | None = None) -> None:
@@ -72,40 +172,65 @@ def _write(page: FPDF, text: str, size: float, *, style: str = "", fill: tuple[i
     page.multi_cell(0, size * 0.5, text, align="L", fill=fill is not None, new_x="LMARGIN", new_y="NEXT", padding=1)
 
 
-def _picture(page: FPDF, png: bytes, caption: str) -> None:
-    from PIL import Image
-
-    with Image.open(io.BytesIO(png)) as image:
-        height = page.epw * image.height / image.width
-    height = min(height, page.eph - 20)
-    if page.will_page_break(height + 8):
+def _picture(page: FPDF, block: Picture, caption: str, size: tuple[float, float], placed: _Placed) -> None:
+    """Leave room for a figure, and write its caption below."""
+    height = size[1]
+    if page.will_page_break(height + 10):
         page.add_page()
-    page.image(io.BytesIO(png), w=page.epw, h=height, keep_aspect_ratio=True)
+    placed.figures.append((block.name, page.page_no() - 1, page.l_margin, page.h - page.get_y() - height))
+    page.ln(height)
     _write(page, caption, SMALL)
     page.ln(1.5)
+
+
+def _widths(page: FPDF, table: Table) -> list[float]:
+    """Return how wide the columns of a table are, as their widest cells."""
+    bold = [table.header, *table.rows[-1:]] if table.total else [table.header]
+    page.set_font(FAMILY, "B", SMALL)
+    wide = [max(page.get_string_width(row[k]) for row in bold) for k in range(len(table.header))]
+    page.set_font(FAMILY, "", SMALL)
+    return [max([w, *(page.get_string_width(row[k]) for row in table.rows)]) + PADDING_MM for k, w in enumerate(wide)]
+
+
+def _parts(page: FPDF, table: Table) -> list[Table]:
+    """Cut a table that is wider than the page into tables with the same first column; text stays as large as it is."""
+    widths = _widths(page, table)
+    if table.words or sum(widths) <= page.epw or len(widths) < 3:
+        return [table]
+    parts, columns, used = [], [0], widths[0]
+    for k in range(1, len(widths)):
+        if used + widths[k] > page.epw and len(columns) > 1:
+            parts.append(_columns(table, columns))
+            columns, used = [0], widths[0]
+        columns.append(k)
+        used += widths[k]
+    return [*parts, _columns(table, columns)]
+
+
+def _columns(table: Table, kept: list[int]) -> Table:
+    """Return some columns of a table."""
+    over = [name for name, span in table.above for _ in range(span)]
+    above: list[tuple[str, int]] = []
+    for k in kept if over else []:
+        same = bool(above) and above[-1][0] == over[k]
+        above = [*above[:-1], (over[k], above[-1][1] + 1)] if same else [*above, (over[k], 1)]
+    return Table([table.header[k] for k in kept], [[row[k] for k in kept] for row in table.rows], above, table.total)
 
 
 def _table(page: FPDF, table: Table) -> None:
     from fpdf.enums import TableBordersLayout
     from fpdf.fonts import FontFace
 
-    columns = len(table.header)
-    size = SIZE - 1 if columns <= 8 else 6.0
-    page.set_font(FAMILY, "", size)
-    # Columns as wide as their widest cell, the whole never wider than the page.
-    cells = [table.header, *table.rows]
-    page.set_font(FAMILY, "B", size)
-    heads = [page.get_string_width(name) for name in table.header]
-    page.set_font(FAMILY, "", size)
-    widths = [max(heads[k], *(page.get_string_width(row[k]) for row in cells)) + 3 for k in range(columns)]
-    scale = min(1.0, page.epw / sum(widths))
+    widths = _widths(page, table)
+    width = min(page.epw, sum(widths))
+    page.set_font(FAMILY, "", SMALL)
     with page.table(
-        col_widths=tuple(w * scale for w in widths),
-        width=sum(widths) * scale,
+        col_widths=tuple(widths),
+        width=width,
         align="LEFT",
-        text_align=("LEFT", *["RIGHT"] * (columns - 1)),
+        text_align="LEFT" if table.words else ("LEFT", *["RIGHT"] * (len(widths) - 1)),
         borders_layout=TableBordersLayout.HORIZONTAL_LINES,
-        line_height=size * 0.55,
+        line_height=SMALL * 0.55,
         headings_style=FontFace(emphasis="BOLD"),
         num_heading_rows=2 if table.above else 1,
         padding=0.4,
@@ -114,8 +239,60 @@ def _table(page: FPDF, table: Table) -> None:
             row = drawn.row()
             for name, span in table.above:
                 row.cell(name, colspan=span, align="CENTER")
-        for k, texts in enumerate(cells):
-            row = drawn.row(style=FontFace(emphasis="BOLD") if table.total and k == len(cells) - 1 else None)
+        for k, texts in enumerate([table.header, *table.rows]):
+            row = drawn.row(style=FontFace(emphasis="BOLD") if table.total and k == len(table.rows) else None)
             for text in texts:
                 row.cell(text)
     page.ln(2)
+
+
+def _size_mm(pdf: bytes) -> tuple[float, float]:
+    """Return width and height of a figure."""
+    from pypdf import PdfReader
+
+    box = PdfReader(io.BytesIO(pdf)).pages[0].mediabox
+    return float(box.width) / 72 * MM_OF_INCH, float(box.height) / 72 * MM_OF_INCH
+
+
+def _with_figures(text: FPDF, pictures: Mapping[str, bytes], placed: _Placed) -> bytes:
+    """Put figures where there is room for them: as forms, so that they stay drawings with text."""
+    from pypdf import PdfReader, PdfWriter
+    from pypdf.generic import DictionaryObject, NameObject, StreamObject
+
+    writer = PdfWriter(clone_from=PdfReader(io.BytesIO(bytes(text.output()))))
+    drawn: dict[int, list[tuple[str, float, float]]] = {}
+    for number, (name, page, left, bottom) in enumerate(placed.figures):
+        source = PdfReader(io.BytesIO(pictures[name])).pages[0]
+        form = StreamObject()
+        form.set_data(source.get_contents().get_data())  # type: ignore[union-attr]  # a figure has contents
+        form.update(
+            {
+                NameObject("/Type"): NameObject("/XObject"),
+                NameObject("/Subtype"): NameObject("/Form"),
+                NameObject("/BBox"): source.mediabox,
+                NameObject("/Resources"): source["/Resources"].clone(writer),
+            }
+        )
+        if "/Group" in source:
+            form[NameObject("/Group")] = source["/Group"].clone(writer)
+        resources: Any = writer.pages[page]["/Resources"].get_object()
+        held = resources.setdefault(NameObject("/XObject"), DictionaryObject()).get_object()
+        held[NameObject(f"/Fig{number}")] = writer._add_object(form.flate_encode())
+        drawn.setdefault(page, []).append((f"Fig{number}", left, bottom))
+    for page, some in drawn.items():
+        _append(writer.pages[page], some)
+    data = io.BytesIO()
+    writer.write(data)
+    return data.getvalue()
+
+
+def _append(page: Any, figures: list[tuple[str, float, float]]) -> None:
+    """Draw forms on a page, at left and bottom edges in mm, after what is there."""
+    from pypdf.generic import NameObject, StreamObject
+
+    point = 72 / MM_OF_INCH
+    words = "".join(f"q 1 0 0 1 {x * point:.3f} {y * point:.3f} cm /{name} Do Q\n" for name, x, y in figures)
+    stream = StreamObject()
+    # fpdf2 leaves a page with the scale and colours that it had; what it saved is restored first.
+    stream.set_data(b"q\n" + page.get_contents().get_data() + b"\nQ\n" + words.encode())
+    page[NameObject("/Contents")] = page.indirect_reference.pdf._add_object(stream.flate_encode())

@@ -1,4 +1,4 @@
-"""The report of an evaluation: how a calibration does on recordings, as one HTML page."""
+"""The report of an evaluation: how a calibration does on recordings, as one HTML page or PDF, and its figures."""
 
 from __future__ import annotations
 
@@ -7,28 +7,39 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from calib.calibration.model import Calibration, require_calibration
-from calib.evaluation.statistics import evaluate
+from calib.evaluation.statistics import Evaluation, evaluate
 from calib.ranges import Ranges, concatenate
 from calib.report import sections
 from calib.report.blocks import Document, Heading, Text
 from calib.report.layout import provenance, warnings
-from calib.report.writing import html_of
-from calib.sources import Data, load_each
-from uwblink.output import check_output, write_text
+from calib.report.origin import Origin, origin_of
+from calib.report.verdict import Judged, verdict
+from calib.report.writing import check_places, html_of, write_document
+from calib.sources import Data, each, load_each
 
 
 def render(data: Data | Iterable[Data], calibration: Calibration) -> str:
     """Return the report of an evaluation as HTML text; `data` is what `load_ranges` takes."""
-    return html_of(_evaluated(load_each(data), calibration))
+    recordings = each(data)
+    return html_of(_evaluated(load_each(recordings), calibration, None, origin_of(recordings)))
 
 
 def write_report(
-    path: str | os.PathLike[str], data: Data | Iterable[Data], calibration: Calibration, *, force: bool = False
+    path: str | os.PathLike[str] | None,
+    data: Data | Iterable[Data],
+    calibration: Calibration,
+    *,
+    figures: str | os.PathLike[str] | None = None,
+    evaluation: Evaluation | None = None,
+    origin: Origin | None = None,
+    force: bool = False,
 ) -> None:
-    """Evaluate a calibration on recordings and write what came out as one HTML file.
+    """Evaluate a calibration on recordings and write what came out as one HTML file, or as PDF where it ends so.
 
-    `data` is what `load_ranges` takes. Raises what `Calibration.apply`, `load_ranges` and `check_output` raise; nothing
-    is written then. The report of a whole campaign is `run_campaign(...).write(path)`.
+    `data` is what `load_ranges` takes. `figures` is a folder for the figures at paper size (PDF and SVG); without a
+    `path` they are all that is written. An `evaluation` of the same recordings is taken instead of another one, and
+    `origin` as what the report says of where it comes from. Raises what `Calibration.apply`, `load_ranges` and
+    `check_output` raise; nothing is written then. The report of a whole campaign is `run_campaign(...).write(path)`.
 
     >>> import calib, pathlib, tempfile
     >>> flight = calib.sample_flight(300)
@@ -39,20 +50,38 @@ def write_report(
     True
     """
     require_calibration(calibration)
-    check_output(Path(path), force=force)
-    write_text(Path(path), render(data, calibration), force=force)
+    output, folder = (None if place is None else Path(place) for place in (path, figures))
+    check_places(output, None, folder, force=force)
+    recordings = each(data)
+    need_power = calibration.needs_power
+    document = _evaluated(
+        load_each(recordings, need_power=need_power), calibration, evaluation, origin or origin_of(recordings)
+    )
+    write_document(document, output, None, folder, force=force)
 
 
-def _evaluated(recordings: list[Ranges], calibration: Calibration) -> Document:
+def _evaluated(
+    recordings: list[Ranges], calibration: Calibration, known: Evaluation | None, origin: Origin
+) -> Document:
     ranges = concatenate(recordings)
-    evaluation, applied = evaluate(ranges, calibration), calibration.apply(ranges)
+    evaluation, applied = known or evaluate(ranges, calibration), calibration.apply(ranges)
+    told = calibration.provenance.get("warnings", [])
+    judged = Judged(
+        calibration=calibration,
+        ranges=ranges,
+        corrected=applied,
+        evaluation=evaluation,
+        held_out=not evaluation.seen,
+        warnings=told,
+    )
     return Document(
         "Calibration report",
         [
+            *verdict(judged),
             Text(sections.summary(evaluation), "lead"),
-            *warnings(calibration.provenance.get("warnings", [])),
+            *warnings(told),
             Heading("Recordings"),
-            sections.recordings(recordings),
+            sections.recordings(recordings, None, origin.files),
             Heading("Antenna delays"),
             *sections.delays(calibration, evaluation.planted, ranges.planted or {}, {}),
             Heading("Before and after"),
@@ -60,6 +89,7 @@ def _evaluated(recordings: list[Ranges], calibration: Calibration) -> Document:
             *sections.errors(ranges, applied, calibration),
             *sections.curves(ranges, applied, calibration),
             *sections.over_time(recordings, calibration),
-            *provenance(calibration),
+            *provenance(calibration, origin),
         ],
+        origin.sentence(),
     )

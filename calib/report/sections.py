@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from calib.calibration.display import pair_rows as offset_rows
 from calib.calibration.model import Calibration, CorrectedRanges
-from calib.estimation.error_mixture import fit_error_mixture
+from calib.error_mixture import fit_error_mixture
 from calib.estimation.passive_listeners import OverheardDelay
 from calib.estimation.result import FitResult
 from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation, PlantedComparison, pair_rows
@@ -24,6 +26,14 @@ NOT_SPLIT: Final = (
 )
 
 
+FOLLOWS_CORE: Final = (
+    "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. Points are "
+    "the centre of that core (below: its spread), told from the tail bin by bin, without the curve. Medians are "
+    "drawn, too, and lie above: with a share s of reflected ranges about the quantile 0.5 / (1 − s) of the core."
+)
+FOLLOWS: Final = {"l2": "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."}
+
+
 def summary(evaluation: Evaluation, on_what: str = "") -> str:
     """Return what the whole comes to, in a few sentences."""
     group = evaluation.overall
@@ -33,14 +43,26 @@ def summary(evaluation: Evaluation, on_what: str = "") -> str:
         f"Over {group.raw.n} ranges{where} the mean error goes from {cm['raw'][0]:+.1f} cm (raw) to "
         f"{cm['delays'][0]:+.1f} cm (delays corrected) and {cm['full'][0]:+.1f} cm (fully corrected); the standard "
         f"deviation from {cm['raw'][1]:.1f} to {cm['full'][1]:.1f} cm, its robust estimate from "
-        f"{100 * group.raw.robust_std_m:.1f} to {100 * group.full.robust_std_m:.1f} cm. A chi-square test at 95 % "
-        f"rejects {100 * group.rejected:.1f} % of the corrected ranges; the others have a mean of "
-        f"{100 * group.accepted.mean_m:+.1f} cm and a standard deviation of {100 * group.accepted.std_m:.1f} cm."
+        f"{100 * group.raw.robust_std_m:.1f} to {100 * group.full.robust_std_m:.1f} cm. {reflected(evaluation)}"
     )
 
 
-def recordings(training: list[Ranges], tests: list[Ranges] | None = None) -> Table:
-    """Return one row a recording."""
+def reflected(evaluation: Evaluation) -> str:
+    """Say what is beyond what noise explains, which is no harm that a calibration does."""
+    group = evaluation.overall
+    return (
+        f"{100 * (1 - group.rejected):.1f} % of the corrected ranges are as near as noise alone explains (95 % would "
+        f"be without reflections), with a mean of {100 * group.accepted.mean_m:+.1f} cm and a standard deviation of "
+        f"{100 * group.accepted.std_m:.1f} cm; the other {100 * group.rejected:.1f} % are mostly reflected ones, which "
+        "no calibration shortens and a filter's gate leaves out."
+    )
+
+
+def recordings(
+    training: list[Ranges], tests: list[Ranges] | None = None, files: Mapping[str, str] | None = None
+) -> Table:
+    """Return one row a recording; `files` are SHA-256 by path, of which a row shows the beginning."""
+    digests = {Path(path).name: digest[:12] for path, digest in (files or {}).items()}
     uses = [("fit", r) for r in training] + [("test", r) for r in tests or []]
     rows = [
         [
@@ -52,11 +74,13 @@ def recordings(training: list[Ranges], tests: list[Ranges] | None = None) -> Tab
             str(len(pair_rows(r))),
             ", ".join(sorted(set(np.unique(r.protocol).tolist()))),
             ", ".join(f"{n} {why}" for why, n in r.excluded.items()) or "none",
+            *([digests.get(r.source, "in memory")] if files is not None else []),
         ]
         for use, r in uses
     ]
     header = ["recording", *(["used to"] if tests is not None else [])]
-    return Table([*header, "ranges", "seconds", "tags", "pairs", "protocol", "left out"], rows)
+    header += ["ranges", "seconds", "tags", "pairs", "protocol", "left out"]
+    return Table([*header, *(["SHA-256"] if files is not None else [])], rows)
 
 
 def determined(ranges: Ranges, calibration: Calibration, fit: FitResult) -> list[Block]:
@@ -88,7 +112,8 @@ def delays(
 
     known = {int(tag): float(d) for tag, d in truth.get("delays_ns", {}).items()} if planted else {}
     header = ["tag", "delay (ns)", "95 % from", "to"]
-    header += ["planted (ns)", "difference (ps)"] if known else []
+    shift = planted.shift_ns if planted else 0.0
+    header += ["planted, same gauge (ns)", "difference (ps)"] if known else []
     header += ["heard by others (ns)", "± 1 std"] if heard else []
     rows = []
     for tag, delay in sorted(calibration.delays_ns.items()):
@@ -96,27 +121,32 @@ def delays(
         bounds = [f"{delay - half:+.4f}", f"{delay + half:+.4f}"] if np.isfinite(half) else ["undetermined", ""]
         row = [str(tag), f"{delay:+.4f}", *bounds]
         if known and planted:
-            row += [f"{known[tag]:+.4f}", f"{1e3 * planted.delay_error_ns[tag]:+.1f}"] if tag in known else ["", ""]
+            beside = (
+                [f"{known[tag] + shift:+.4f}", f"{1e3 * planted.delay_error_ns[tag]:+.1f}"]
+                if tag in known
+                else ["", ""]
+            )
+            row += beside
         if heard:
             row += [f"{heard[tag].delay_ns:+.4f}", f"{heard[tag].std_ns:.4f}"] if tag in heard else ["", ""]
         rows.append(row)
-    shift = planted.shift_ns if planted else 0.0
     if calibration.pair_offsets:
         return [Table(["pair", "ranges too long by (cm)", "95 %"], [list(row) for row in offset_rows(calibration)])]
     blocks: list[Block] = [
         Table(header, rows),
         Picture(
             "delays",
-            partial(figures.alone, partial(figures.delays, calibration, known, shift), figures.LOW),
-            "Antenna delays with their 95 % intervals.",
+            partial(figures.alone, partial(figures.delays, calibration, known, shift)),
+            "Antenna delays with their 95 % intervals"
+            + (", and what was planted, in the same gauge." if known else "."),
         ),
     ]
     if planted:
         blocks.append(
             Text(
-                "A constant in the bias curve and a shift common to all delays are the same thing: the differences, "
-                f"and the planted curve below, are compared after moving the common {shift:+.4f} ns from one to the "
-                f"other. The bias curve is {1e3 * planted.curve_rms_m:.1f} mm rms from the planted one over these "
+                "A constant in the bias curve and a shift common to all delays are the same thing: planted delays, and "
+                f"the planted curve below, are shown after moving the common {shift:+.4f} ns from the curve to the "
+                f"delays. The bias curve is {1e3 * planted.curve_rms_m:.1f} mm rms from the planted one over these "
                 f"ranges, the whole correction of a range {1e3 * planted.correction_rms_m:.1f} mm.",
                 "note",
             )
@@ -130,7 +160,12 @@ def sensitivity(calibration: Calibration, refits: dict[float, Calibration]) -> l
 
     if not refits:
         return []
-    draw = partial(figures_fit.scale_sensitivity, list(refits), list(refits.values()), calibration.scale_ns)
+    draw = partial(
+        figures_fit.scale_sensitivity,
+        scales_ns=list(refits),
+        fits=list(refits.values()),
+        chosen_ns=calibration.scale_ns,
+    )
     return [
         Picture(
             "scale-sensitivity", draw, "What another scale of the loss would have done to the delays, mean removed."
@@ -144,42 +179,56 @@ def curves(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -
 
     return [
         Heading("Bias and standard deviation over power"),
+        Text(FOLLOWS.get(calibration.loss, FOLLOWS_CORE), "note"),
+        Text(
+            "Lifted power is the first-path power p on a scale that stretches where ranges are good and the bias "
+            f"changes: ψ = 10^((p − α) / 10 dB) with α = {calibration.alpha_dbm:g} dBm, so ψ = 1 at α and a tenth of "
+            "it 10 dB lower; of an exchange, "
+            + (
+                "the mean over both ends."
+                if calibration.lift == "mean-of-lifted"
+                else "that of the mean power of both ends."
+            )
+            + " Powers in dBm stand above the figures.",
+            "note",
+        ),
         Picture(
             "bias",
             partial(figures.alone, partial(figures.bias_over_power, ranges, applied, calibration)),
-            "Bias over lifted first-path power: medians of the delay-corrected errors, and the curve with its band. "
-            "Where there are reflections their tail lifts the medians above the curve, which follows the core.",
+            "Bias over power: what the delay-corrected errors centre on, and the curve with its 95 % band.",
         ),
         Picture(
             "sigma",
             partial(figures.alone, partial(figures.sigma_over_power, ranges, applied, calibration)),
-            "Standard deviation over lifted first-path power: robust estimates, and the curve of the core.",
+            "Standard deviation over power: that of the calibrated errors' noise, and the curve with its 95 % band.",
         ),
     ]
 
 
 def before_after(evaluation: Evaluation) -> list[Block]:
     """Return the table of errors by pair and stage, and how well sigma covers them."""
-    header = ["pair", "n", *["mean", "std", "robust"] * len(CORRECTION_STAGES), "95 % |e|", "raw", "full", "clamped"]
+    header = ["pair", "n", *["mean", "std", "robust"] * len(CORRECTION_STAGES), "95 % |e|", "noise", "in 95 %", "new p"]
     rows = [[name, *_cells(group)] for name, group in evaluation.pairs.items()]
     rows.append(["all", *_cells(evaluation.overall)])
-    above = [("", 2), *[(stage, 3) for stage in CORRECTION_STAGES], ("full", 1), ("rejected", 2), ("", 1)]
+    above = [("", 2), *[(stage, 3) for stage in CORRECTION_STAGES], ("full", 3), ("", 1)]
     overall = evaluation.overall
+    levels = list(overall.coverage)
     covered = [
-        [f"{name} %", f"{100 * share:.1f} %", *[f"{100 * g.coverage[name]:.0f} %" for g in evaluation.pairs.values()]]
-        for name, share in overall.coverage.items()
+        [name, *[f"{100 * group.coverage[level]:.0f} %" for level in levels]]
+        for name, group in [*evaluation.pairs.items(), ("all", overall)]
     ]
     low, high = 100 * overall.full.low_m, 100 * overall.full.high_m
     return [
         Table(header, rows, above, total=True),
         Text(
             "Errors in cm. Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
-            f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Rejected: share beyond the "
-            "95 % quantile of chi-square, of raw ranges with the variance that they have as a whole, of calibrated "
-            "ones with their own. Clamped: share at powers the curves were not fitted at.",
+            f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Noise: share of corrected "
+            "ranges that their own sigma explains at 95 %, 95 % without reflections; the rest are mostly reflected. In "
+            "95 %: share within the 95 % intervals that reckon with reflections. New p: share at powers the curves "
+            "were not fitted at.",
             "note",
         ),
-        Table(["nominal", "all", *evaluation.pairs], covered),
+        Table(["pair", *[f"{level} %" for level in levels]], covered, [("", 1), ("nominal", len(levels))], total=True),
         Text(
             "Coverage: how many calibrated errors lie within the bounds that their sigma gives for a normal "
             "distribution. Reflections take from the high levels.",
@@ -193,30 +242,35 @@ def _cells(group: ErrorStatistics) -> list[str]:
     for stage in CORRECTION_STAGES:
         stats = getattr(group, stage)
         cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.std_m, stats.robust_std_m)]
-    shares = [f"{100 * share:.1f} %" for share in (group.rejected_raw, group.rejected, group.clamped)]
+    shares = [_percent(share) for share in (1 - group.rejected, group.inside_95, group.clamped)]
     return [*cells, f"{100 * group.full.abs95_m:.1f}", *shares]
+
+
+def _percent(share: float) -> str:
+    return "–" if share != share else f"{100 * share:.1f} %"
 
 
 def errors(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
     """Return histograms, z-scores, and residuals over distance and power."""
-    from calib import figures
     from calib.report import figures_errors
 
     return [
         Picture(
             "errors",
-            partial(figures.alone, partial(figures.histogram, ranges, applied)),
-            "Range errors. The outermost bins hold everything beyond them.",
+            partial(figures_errors.distribution, ranges=ranges, applied=applied),
+            "Range errors: how many of which size and sign (the outermost bins hold everything beyond them), and how "
+            "many are smaller than so much.",
         ),
         Picture(
             "z-scores",
-            partial(figures_errors.z_scores, ranges, applied),
+            partial(figures_errors.z_scores, ranges=ranges, applied=applied),
             "Calibrated errors over their sigma: density, and quantiles against those of the standard normal.",
         ),
         Picture(
             "residuals",
-            partial(figures_errors.residuals, ranges, applied, calibration.alpha_dbm),
-            "What is left over distance and over power. Medians should lie on zero.",
+            partial(figures_errors.residuals, ranges=ranges, applied=applied, alpha_dbm=calibration.alpha_dbm),
+            "What is left over distance and over power, reflections included: they lift the medians off zero, the more "
+            "of them the higher; a slope or a wave would be a bias that is left. A hundredth of the points is beyond.",
         ),
     ]
 
@@ -257,11 +311,17 @@ def over_time(recordings: list[Ranges], calibration: Calibration) -> list[Block]
 
     blocks: list[Block] = [Heading("Over time")]
     for k, recording in enumerate(recordings):
+        applied, pairs = calibration.apply(recording), len(pair_rows(recording))
         blocks.append(
             Picture(
                 f"over-time-{k + 1}",
-                partial(figures_errors.over_time, recording, calibration.apply(recording)),
-                f"{recording.source}: calibrated errors, and the band in which 95 % should lie.",
+                partial(figures_errors.over_time, ranges=recording, applied=applied),
+                f"{recording.source}: calibrated errors, and the band in which 95 % should lie without reflections."
+                + (
+                    f" Of {pairs} pairs the {figures_errors.MOST_PAIRS} whose errors spread most; others are left out."
+                    if pairs > figures_errors.MOST_PAIRS
+                    else ""
+                ),
             )
         )
     return blocks

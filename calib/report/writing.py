@@ -7,55 +7,92 @@ from pathlib import Path
 from typing import Final
 
 from calib.errors import BadInputError
-from calib.report.blocks import PAPER_DPI, Document, rendered
+from calib.report.blocks import Document, Picture
 from calib.report.html import to_html
 from uwblink.output import check_output, write_bytes, write_text
+from uwblink.pages.figures import WIDTHS, drawn
 
 PAPER_KINDS: Final = ("pdf", "svg")
 
 
 def html_of(document: Document) -> str:
     """Return a document as the text of one HTML page that needs no other file."""
-    return to_html(document, {p.name: rendered(p.draw(), "png") for p in document.pictures()})
+    drawings = {
+        p.name: {name: one["svg"] for name, one in _drawn(p, ["svg"], ["svg"]).items()} for p in document.pictures()
+    }
+    return to_html(document, drawings)
 
 
-def check_places(html: Path, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
+def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
     """Raise, before anything is computed, what would keep the files from being written."""
-    for path in filter(None, (html, pdf)):
+    for path in filter(None, (output, pdf)):
         check_output(path, force=force)
+    if pdf is not None and output is not None and output.resolve() == pdf.resolve():
+        raise BadInputError(f"{output} is the page already; give the PDF another name", parameter="pdf")
     if figures is not None and figures.exists() and not figures.is_dir():
         raise BadInputError(f"{figures} is a file, expected a folder", parameter="figures")
+    if figures is not None and not force and any(f for k in PAPER_KINDS for f in figures.glob(f"*.{k}")):
+        raise BadInputError(f"{figures} holds figures already; give another folder, or `force` to replace them",
+                            parameter="figures")  # fmt: skip
     if figures is not None and not figures.parent.is_dir():
         raise BadInputError(f"{figures.parent} does not exist", parameter="figures")
 
 
+def is_pdf(path: Path) -> bool:
+    """Return whether a file of that name is to be a PDF."""
+    return path.suffix.lower() == ".pdf"
+
+
 def write_document(
     document: Document,
-    html: Path,
+    output: Path | None,
     pdf: Path | None,
     figures: Path | None,
     *,
     force: bool,
-    progress: Callable[[str], None],
+    progress: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Write a document as HTML, as PDF, and its figures (PDF and SVG) into a folder; draws each figure once."""
-    check_places(html, pdf, figures, force=force)
-    pictures: dict[str, bytes] = {}
-    files: dict[str, bytes] = {}
+    """Write a document as HTML (as PDF where `output` ends so), as PDF, and its figures into a folder.
+
+    Each figure is drawn once at each width, a column's and a page's; the folder has PDF and SVG of both.
+    """
+    check_places(output, pdf, figures, force=force)
+    papers = [path for path in (output, pdf) if path is not None and (path is pdf or is_pdf(path))]
+    page = None if output is None or is_pdf(output) else output
+    of_page = [kind for kind, so in (("svg", page or figures), ("pdf", papers or figures)) if so]
+    of_column = ["svg", "pdf"] if figures else (["svg"] if page else [])
+    made: dict[str, dict[str, dict[str, bytes]]] = {}
     for picture in document.pictures():
         progress(f"drawing {picture.name}")
-        figure = picture.draw()
-        pictures[picture.name] = rendered(figure, "png")
-        if figures:
-            files |= {f"{picture.name}.{kind}": rendered(figure, kind, PAPER_DPI) for kind in PAPER_KINDS}
-    text = to_html(document, pictures)
-    if pdf:
+        made[picture.name] = _drawn(picture, of_page, of_column)
+    if papers:
         from calib.report.pdf import to_pdf
 
         progress("setting the PDF")
-        write_bytes(pdf, to_pdf(document, pictures), force=force)
+        data = to_pdf(document, {name: widths["page"]["pdf"] for name, widths in made.items()})
+        for path in papers:
+            write_bytes(path, data, force=force)
     if figures:
-        figures.mkdir(parents=True, exist_ok=True)
-        for name, data in files.items():
-            write_bytes(figures / name, data, force=True)
-    write_text(html, text, force=force)
+        _write_figures(figures, made, force=force)
+    if page:
+        progress("writing the page")
+        drawings = {name: {w: kinds["svg"] for w, kinds in widths.items()} for name, widths in made.items()}
+        write_text(page, to_html(document, drawings), force=force)
+
+
+def _drawn(picture: Picture, of_page: list[str], of_column: list[str]) -> dict[str, dict[str, bytes]]:
+    """Draw a figure at both widths, as far as anything is wanted of them; files by width and kind."""
+    wanted = {"page": of_page, "column": of_column}
+    return {
+        name: drawn(picture.draw, WIDTHS[name], kinds, salt=f"{picture.name} {name}")
+        for name, kinds in wanted.items()
+        if kinds
+    }
+
+
+def _write_figures(folder: Path, made: dict[str, dict[str, dict[str, bytes]]], *, force: bool) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, widths in made.items():
+        for width, kinds in widths.items():
+            for kind in PAPER_KINDS:
+                write_bytes(folder / f"{name}-{width}.{kind}", kinds[kind], force=force)

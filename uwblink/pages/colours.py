@@ -1,0 +1,65 @@
+"""The colours of figures and pages, on white and on a dark page.
+
+Any two of the first six are at least 15 apart (CIEDE2000) for people who see all colours and for those without one
+kind of cones (Machado, Oliveira and Fernandes 2009), on either ground; more than six differ by marker and dashes, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+BLUE: Final = "#0072b2"
+VERMILION: Final = "#c8500a"
+GREEN: Final = "#128a63"
+MAROON: Final = "#770000"
+NAVY: Final = "#222299"
+PLUM: Final = "#553344"
+INK: Final = "#1a1a1a"
+MUTED: Final = "#595959"
+GRID: Final = "#d8d8d8"
+PALE: Final = "#b4b4b4"
+
+SERIES: Final = (BLUE, VERMILION, GREEN, MAROON, NAVY, PLUM)
+"""Colours of what is of one kind: tags, bodies, protocols."""
+
+DARK: Final = {
+    BLUE: "#4aa8e8",
+    VERMILION: "#f08a4b",
+    GREEN: "#2fbf8f",
+    MAROON: "#eeccdd",
+    NAVY: "#ddee00",
+    PLUM: "#777788",
+    INK: "#e8e8e8",
+    MUTED: "#a8adb3",
+    GRID: "#3a3f45",
+    PALE: "#6a7078",
+}
+"""What stands on a dark page for each colour."""
+
+GROUND: Final = {"light": "#ffffff", "dark": "#16181b"}
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
+DASHES: Final[tuple[Any, ...]] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How one of several is drawn: its colour, marker and dashes."""
+
+    colour: str
+    marker: str
+    dashes: Any
+
+    def line(self, *, marker: bool = True) -> dict[str, Any]:
+        """Return it as arguments of matplotlib's `plot`."""
+        shape = {"marker": self.marker, "ms": 3.2} if marker else {}
+        return {"color": self.colour, "ls": self.dashes, "lw": 1.1, **shape}
+
+
+def look(number: int) -> Look:
+    """Return the look of one of many: 6 colours, 7 markers and 4 kinds of dashes, so no two of 84 are alike."""
+    return Look(
+        SERIES[number % len(SERIES)],
+        MARKERS[number % len(MARKERS)],
+        DASHES[(number // len(SERIES) + number) % len(DASHES)],
+    )
