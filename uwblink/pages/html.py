@@ -7,8 +7,7 @@ from html import escape
 from typing import Final
 
 from uwblink.pages.drawings import inline
-from uwblink.pages.script import JS, PARTS
-from uwblink.pages.stylesheet import CSS
+from uwblink.pages.stylesheet import CSS, JS, PARTS
 
 MANY: Final = 10
 """Columns from which a table is set smaller."""

@@ -1,10 +1,3 @@
-"""What a page does when somebody points at a figure or clicks on it; without scripts all is there but this."""
-
-from __future__ import annotations
-
-from typing import Final
-
-JS: Final = r"""
 (() => {
 const tip = document.getElementById('tip'), zoom = document.getElementById('zoom');
 const where = (svg, event) => { const p = new DOMPoint(event.clientX, event.clientY);
@@ -56,9 +49,3 @@ const closer = svg => {
 zoom.addEventListener('close', () => { document.body.append(tip); zoom.querySelector('div').replaceChildren(); });
 document.querySelectorAll('figure .wide svg').forEach(svg => svg.addEventListener('click', () => closer(svg)));
 })();
-"""
-
-PARTS: Final = (
-    "<div id='tip'></div><dialog id='zoom' aria-label='Figure, closer'><form method='dialog'><button>Close</button> "
-    "wheel: closer · drag: move · double click: all</form><div style='height:100%'></div></dialog>"
-)
