@@ -173,7 +173,7 @@ class Ranges:
         return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
 
     def usable(self, why_no_truth: str = "", *, need_power: bool = True) -> Ranges:
-        """Leave out what has no true distance, no power at either end, or impossible stamps, and count it.
+        """Leave out what is of a tag with itself, has no true distance, no power or impossible stamps, and count it.
 
         Without `need_power`, ranges without any stay. Raises `UnanswerableError` where nothing is left, with
         `why_no_truth` where that is the reason.
@@ -181,6 +181,7 @@ class Ranges:
         if not len(self):
             raise UnanswerableError(f"{self.source}: holds no exchanges")
         reasons = {
+            "a tag with itself": self.initiator != self.target,
             "no true distance": np.isfinite(self.truth_m),
             "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm) | (not need_power),
             "impossible stamps": np.isfinite(self.raw_m) & (np.abs(self.raw_m) < LONGEST_M),
@@ -196,7 +197,8 @@ class Ranges:
             most = max(excluded, key=lambda reason: excluded[reason])
             hints = {
                 "no true distance": why_no_truth or "it needs poses and lever arms, or measured distances",
-                "no power": "`delays_only` needs none",
+                "no power": "a calibration without a curve needs none: `calib fit --delays-only` makes one",
+                "a tag with itself": "look at from_id and to_id of what was imported",
             }
             hint = f"; {hints[most]}" if most in hints else ""
             raise UnanswerableError(f"{self.source}: none of its {len(self)} exchanges can be used: {most}{hint}")

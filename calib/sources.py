@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import BadInputError
+from calib.errors import BadInputError, UnanswerableError
 from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
@@ -233,6 +233,15 @@ class Flight:
         names = sorted(set(self.poses.body.tolist()))
         spans = {n: np.ptp(self.poses.position_m[self.poses.body == n], axis=0).max() for n in names}
         return [name for name in names if spans[name] > 0.1]
+
+
+def require_times(ranges: Ranges) -> None:
+    """Raise `UnanswerableError` where all ranges have one time, as where nobody recorded any."""
+    if len(ranges) > 1 and not np.ptp(ranges.time_ns):
+        raise UnanswerableError(
+            f"{ranges.source}: all of its {len(ranges)} ranges have the same time, so nothing can be tracked; import "
+            "them with a column time_s"
+        )
 
 
 def load_flight(data: Data, *, need_power: bool = True) -> Flight:

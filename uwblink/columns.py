@@ -52,6 +52,8 @@ def numbers(name: str, values: ArrayLike | None, count: int) -> Floats:
 def words(name: str, values: ArrayLike, count: int) -> NDArray[np.str_]:
     """Return text (count,)."""
     found = _rows(name, values, count)
+    if not count:  # an empty list has no type of its own
+        return np.zeros(0, np.str_)
     if found.dtype.kind not in "UTO" or not all(isinstance(value, str) for value in found.tolist()):
         raise ArgumentError(f"{name}: found {_kind(found)}, expected text")
     return found.astype(np.str_)
@@ -63,6 +65,8 @@ def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
         found = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"{name}: found what is no array of numbers, expected shape ({count}, {size})") from error
+    if not count and not found.size:
+        return np.zeros((0, size))
     if found.shape not in ((size,), (count, size)):
         raise ArgumentError(f"{name}: found an array of shape {found.shape}, expected ({count}, {size}) or ({size},)")
     found = np.array(np.broadcast_to(found, (count, size)))

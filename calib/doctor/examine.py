@@ -78,7 +78,7 @@ def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
     bad = timestamps.impossible(view)
     findings += timestamps.corrupted(view, bad)
     if bad.all():
-        return findings, None
+        return [*findings, *timestamps.with_itself(view)], None
     whole, view = view, chosen(view, ~bad)
     # Only stamps that make sense can say something about poses, and only right poses something about radios.
     suspected = [finding for examination in GEOMETRY for finding in examination(view)]
@@ -128,12 +128,14 @@ STRUCTURE: Final[tuple[Examination, ...]] = (
     timestamps.swapped_roles,
     timestamps.speed_of_light,
     timestamps.contradicting,
+    timestamps.with_itself,
     clocks.unread,
     clocks.carriers,
     pairs.pairs,
     pairs.silent,
     pairs.still,
     radio.confounded,
+    radio.unpowered,
     pairs.no_truth,
 )
-OF_ALL_ROWS: Final = (timestamps.contradicting, pairs.silent)
+OF_ALL_ROWS: Final = (timestamps.contradicting, timestamps.with_itself, pairs.silent)

@@ -56,12 +56,26 @@ def impossible(view: RecordingView) -> Bools:
     e = view.exchanges
     with np.errstate(all="ignore"):
         said = np.abs(board_range(e) - e.range_m)
-        bad = ~(np.abs(view.raw_m) < PLAUSIBLE_M) | ~sound_clocks(e)
+        bad = ~(np.abs(view.raw_m) < PLAUSIBLE_M) | ~sound_clocks(e) | (e.initiator == e.target)
         away = np.abs(view.error_m) > FARTHEST_M
     if not _is_scaled(view):
         bad |= np.isfinite(said) & (said > CONTRADICTS_M)
     # Where most are far off, something else is wrong with all of them.
     return np.asarray(bad | away if np.mean(away) < MOST_CORRUPT else bad)
+
+
+def with_itself(view: RecordingView) -> Iterator[Finding]:
+    """Exchanges of a tag with itself, which no radio makes."""
+    e = view.exchanges
+    same = e.initiator == e.target
+    if same.any():
+        tags = ", ".join(map(str, np.unique(e.initiator[same])[:6].tolist()))
+        yield Finding(
+            "a tag with itself",
+            f"{np.count_nonzero(same)} of {len(e)} exchanges have one tag at both ends ({tags})",
+            "import again with other columns for from_id and to_id; a fit leaves these exchanges out",
+            0.97,
+        )
 
 
 def corrupted(view: RecordingView, bad: Bools) -> Iterator[Finding]:

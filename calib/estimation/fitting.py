@@ -112,7 +112,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     pinned = {int(tag): float(delay) for tag, delay in fixed.items()}
     groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
     ranges = load_ranges(data, need_power=not delays_only)
-    fixed = taken_over(source, ranges) | pinned
+    fixed = taken_over(source, ranges, curve=not delays_only) | pinned
     refuse_impossible(ranges)
     chosen = loss
     loss = loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)

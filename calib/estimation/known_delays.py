@@ -19,14 +19,22 @@ def imported(delays_from: Calibration | str | os.PathLike[str] | None) -> Calibr
     return known
 
 
-def taken_over(known: Calibration | None, ranges: Ranges) -> dict[int, float]:
-    """Return the delays that a calibration has for tags of these ranges; raises `BadInputError` where it has none."""
+def taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dict[int, float]:
+    """Return the delays that a calibration has for tags of these ranges.
+
+    Raises `BadInputError` where it has none, and where it has all and no `curve` is fitted beside them.
+    """
     if known is None:
         return {}
     found = {tag: known.delays_ns[tag] for tag in ranges.tags() if tag in known.delays_ns}
     if not found:
         there, here = (", ".join(map(str, sorted(tags))) for tags in (known.delays_ns, ranges.tags()))
         raise BadInputError(f"its tags are {there}, those of the ranges {here}", parameter="delays_from")
+    if not curve and len(found) == len(ranges.tags()):
+        raise BadInputError(
+            "it has the delays of all tags, and `delays_only` fits no curve, so nothing is left to fit",
+            parameter="delays_from",
+        )
     return found
 
 

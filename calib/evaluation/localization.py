@@ -17,7 +17,7 @@ from calib.errors import UnanswerableError
 from calib.evaluation.tracking import FixedStd, Localization, Settings
 from calib.evaluation.tracking_filters import FilterRanges, filter_ranges, run_filters
 from calib.evaluation.tracking_problem import Noise, problems
-from calib.sources import Data, Flight, load_flight
+from calib.sources import Data, Flight, load_flight, require_times
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 """Mean over six scenarios (ICRA 2023, its only table): flights of its own, another filter's noise."""
@@ -55,6 +55,7 @@ def localize(
     chosen = settings or Settings()
     flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
     fixed = fixed_std(calibration, chosen, training)
+    require_times(flight.ranges)
     applied = calibration.apply(flight.ranges)
     found = []
     for problem in problems(flight):

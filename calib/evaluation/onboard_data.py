@@ -13,7 +13,7 @@ from calib.calibration.model import Calibration
 from calib.errors import UnanswerableError
 from calib.evaluation.range_updates import RangeErrors
 from calib.ranges import LONGEST_M, Ranges
-from calib.sources import Data, opened
+from calib.sources import Data, opened, require_times
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.target_reports import single_reports
@@ -107,6 +107,7 @@ def _of_body(
     own = np.where(np.isin(some.initiator, mine), some.initiator, some.target)
     other = np.where(np.isin(some.initiator, mine), some.target, some.initiator)
     corrected, noise, errors = _corrected(some, calibration)
+    require_times(ranges)
     began = int(ranges.time_ns.min())
     imu_rows, height_rows = _rows(imu, body), _rows(heights, body)
     has_truth = np.any(poses.body == body)

@@ -25,6 +25,8 @@ from uwblink.importers.trials import CLEARLY, SAMPLE, Reading, Sample, Trial
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.twr import STAMPS
 
+RECORDING: Final = ".uwb"
+
 
 @dataclass(frozen=True, slots=True)
 class Guess:
@@ -36,6 +38,8 @@ class Guess:
 
 def guess_map(path: Path) -> Guess:
     """Look at a table and return the map that it would be read with; raises `ImportTableError`."""
+    if path.suffix.lower() == RECORDING:
+        raise ImportTableError(f"{path}: is a recording already, and needs no map; 'uwblink show' says what it holds")
     with Table(path) as table:
         columns = named_columns(table.names)
         columns = stamp_and_event(table, columns) or columns

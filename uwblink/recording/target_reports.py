@@ -36,7 +36,8 @@ class SingleReports:
 
 def single_reports(exchanges: Exchanges) -> SingleReports:
     """Return each exchange once: the initiator's report where there is one, otherwise the target's."""
-    by_target = np.flatnonzero(exchanges.reporter == exchanges.target)
+    # An exchange of a tag with itself, which a wrong import makes, is no second report of itself.
+    by_target = np.flatnonzero((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target))
     if not len(by_target):
         return SingleReports(exchanges, 0, np.empty((0, 2), dtype=np.int64))
     by_initiator = np.flatnonzero(exchanges.reporter == exchanges.initiator)

@@ -132,8 +132,9 @@ class Flight:
         exchanges = exchanges[order]
         spots = [antennas_m(flown.poses, list(tags), ids, exchanges.time_ns) for ids in _ids(exchanges)]
         good = np.isfinite(spots[0] + spots[1]).all(axis=1) & _powered(exchanges) & ~without_stamps(exchanges)
+        good &= exchanges.initiator != exchanges.target
         if np.count_nonzero(good) < fewest:
-            raise ScenarioError(
+            raise UnanswerableError(
                 f"{where}: {np.count_nonzero(good)} of {len(good)} exchanges have stamps, both powers and poses around "
                 f"them, a twin needs {fewest} or more; record longer, and with motion capture all the time"
             )
@@ -199,7 +200,9 @@ def _those_that_range(tags: Sequence[Tag], exchanges: Exchanges, where: str) -> 
     known = {tag.tag for tag in tags}
     if ids - known:
         lacking = ", ".join(map(str, sorted(ids - known)))
-        raise ScenarioError(f"{where}: does not say on which body tag {lacking} sits; give tags with their lever arms")
+        raise UnanswerableError(
+            f"{where}: does not say on which body tag {lacking} sits; give tags with 'uwblink poses --tags'"
+        )
     return tuple(tag for tag in tags if tag.tag in ids)
 
 
