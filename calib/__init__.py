@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from calib.report.report import write_report
     from calib.samples import sample_flight
     from calib.sources import load_ranges
+    from calib.surveys.knowledge import Knowledge, KnownPosition
+    from calib.surveys.result import SurveyResult
+    from calib.surveys.samples import sample_arrangements
+    from calib.surveys.surveying import survey
     from calib.trajectories.fitting import fit_from_ranges
 
 __all__ = [
@@ -37,8 +41,11 @@ __all__ = [
     "Calibration",
     "CorrectedRanges",
     "FitResult",
+    "Knowledge",
+    "KnownPosition",
     "OnboardSettings",
     "Ranges",
+    "SurveyResult",
     "UnanswerableError",
     "add_tag",
     "apply",
@@ -55,7 +62,9 @@ __all__ = [
     "register_loss",
     "register_report_section",
     "run_campaign",
+    "sample_arrangements",
     "sample_flight",
+    "survey",
     "write_report",
 ]
 
@@ -65,8 +74,11 @@ _HOMES: Final = {
     "Calibration": "calib.calibration.model",
     "CorrectedRanges": "calib.calibration.model",
     "FitResult": "calib.estimation.result",
+    "Knowledge": "calib.surveys.knowledge",
+    "KnownPosition": "calib.surveys.knowledge",
     "OnboardSettings": "calib.evaluation.onboard",
     "Ranges": "calib.ranges",
+    "SurveyResult": "calib.surveys.result",
     "UnanswerableError": "calib.errors",
     "add_tag": "calib.estimation.new_tag",
     "apply": "calib.calibration.correction",
@@ -83,7 +95,9 @@ _HOMES: Final = {
     "register_loss": "calib.estimation.losses",
     "register_report_section": "calib.report.layout",
     "run_campaign": "calib.report.campaign",
+    "sample_arrangements": "calib.surveys.samples",
     "sample_flight": "calib.samples",
+    "survey": "calib.surveys.surveying",
     "write_report": "calib.report.report",
 }
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.errors import BadInputError, UnanswerableError
 from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
 from uwblink.recording.target_reports import single_reports
 from uwblink.twr import Exchanges
 
@@ -96,6 +96,16 @@ class RecordedSource:
     def imu(self) -> dict[str, NDArray[Any]]:
         """Return the columns of inertial readings."""
         return self._recording.imu()
+
+    @cached_property
+    def arrangements(self) -> list[Arrangement]:
+        """Return the stretches of time in which boards stood still."""
+        return self._recording.arrangements()
+
+    @cached_property
+    def known_distances(self) -> list[KnownDistance]:
+        """Return the distances that were measured otherwise."""
+        return self._recording.known_distances()
 
     @cached_property
     def height(self) -> dict[str, NDArray[Any]]:

@@ -25,7 +25,13 @@ CONFINED = {
     "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
     "pydantic": lambda path: path.startswith("uwbsim/"),
     "threadpoolctl": lambda path: (
-        path in {"calib/estimation/fitting.py", "calib/trajectories/fitting.py", "uwbsim/twins/fitting.py"}
+        path
+        in {
+            "calib/estimation/fitting.py",
+            "calib/surveys/surveying.py",
+            "calib/trajectories/fitting.py",
+            "uwbsim/twins/fitting.py",
+        }
     ),
     "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/rosbag2.py"},
     "foxglove": lambda path: path == "uwblink/streaming/foxglove_server.py",
@@ -59,7 +65,7 @@ FLOORS = {
         ("calibration", "sources"),
         ("evaluation",),
         ("figures",),
-        ("estimation",),
+        ("estimation", "surveys"),
         ("doctor", "trajectories"),
         ("report",),
         ("cli",),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from uwblink.protocols.table import PROTOCOLS, register_protocol
     from uwblink.recording.contents import Contents, load
     from uwblink.recording.file import Recording
-    from uwblink.recording.schema import Poses, Tag
+    from uwblink.recording.schema import Arrangement, KnownDistance, Poses, Tag
     from uwblink.streaming.ranges import StreamedRange
     from uwblink.streaming.sources import stream
     from uwblink.ticks import SPEED_OF_LIGHT
@@ -33,10 +33,12 @@ __version__ = "0.2.0"
 __all__ = [
     "PROTOCOLS",
     "SPEED_OF_LIGHT",
+    "Arrangement",
     "Board",
     "Contents",
     "Exchanges",
     "Heard",
+    "KnownDistance",
     "Listener",
     "Poses",
     "ProtocolMessage",
@@ -59,10 +61,12 @@ __all__ = [
 _HOMES: Final = {
     "PROTOCOLS": "uwblink.protocols.table",
     "SPEED_OF_LIGHT": "uwblink.ticks",
+    "Arrangement": "uwblink.recording.schema",
     "Board": "uwblink.boards.board",
     "Contents": "uwblink.recording.contents",
     "Exchanges": "uwblink.twr",
     "Heard": "uwblink.boards.listeners",
+    "KnownDistance": "uwblink.recording.schema",
     "Listener": "uwblink.boards.listeners",
     "Poses": "uwblink.recording.schema",
     "ProtocolMessage": "uwblink.protocols.rows",

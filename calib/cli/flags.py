@@ -10,6 +10,7 @@ FLAGS: Final = {
     "fixed_ns": "--fix",
     "groups": "--group",
     "scale_ns": "--scale",
+    "pair_error_m": "--pair-error",
     "reference_power_dbm": "--reference-power",
     "poses_until_s": "--poses-until",
     "heading_std_deg": "--heading-std",

@@ -15,7 +15,7 @@ from uwblink.arrays import Bools, Ints
 from uwblink.display import as_html, first_few, printable
 from uwblink.errors import ArgumentError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
+from uwblink.recording.schema import Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.recording.summary import counted
 from uwblink.twr import Exchanges
 
@@ -55,6 +55,8 @@ class Contents:
     cirs: list[CirRow] = field(default_factory=list)
     frames: list[FrameRow] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
+    arrangements: list[Arrangement] = field(default_factory=list)
+    known_distances: list[KnownDistance] = field(default_factory=list)
     meta: Mapping[str, Any] = field(default_factory=dict)
 
     def select(
@@ -88,6 +90,7 @@ class Contents:
             cirs=[row for row in self.cirs if chosen.has(row.time_ns, row.initiator, row.target)],
             frames=[row for row in self.frames if first_ns <= row.time_ns < end_ns],
             faults=[row for row in self.faults if first_ns <= row.time_ns < end_ns],
+            arrangements=[row for row in self.arrangements if row.start_ns < end_ns and first_ns <= row.end_ns],
             meta={**self.meta, "selected": {key: value for key, value in kept.items() if value is not None}},
         )
 
@@ -104,6 +107,8 @@ class Contents:
             recording.append_cirs(self.cirs)
             recording.append_frames(self.frames)
             recording.append_faults(self.faults)
+            recording.append_arrangements(self.arrangements)
+            recording.append_distances(self.known_distances)
 
     def __repr__(self) -> str:
         """Return a headline, what else there is, and the first exchanges."""
@@ -123,7 +128,7 @@ class Contents:
         numbers = {"exchanges": len(self.exchanges), "poses": len(self.poses)}
         columns = {name: getattr(self, name) for name in _COLUMNS}
         numbers |= {name: len(found["time_ns"]) if found else 0 for name, found in columns.items()}
-        return numbers | {name: len(getattr(self, name)) for name in ("cirs", "frames", "faults")}
+        return numbers | {name: len(getattr(self, name)) for name in _LISTS}
 
     def counts(self) -> dict[str, int]:
         """Return how many rows there are by table: the exchanges, and of the others those that have any."""
@@ -140,6 +145,9 @@ class Contents:
         first = -far if start_s is None else origin + round(start_s * 1e9)
         return first, far if stop_s is None else origin + round(stop_s * 1e9)
 
+
+_LISTS: Final = ("cirs", "frames", "faults", "arrangements", "known_distances")
+"""The tables that are held as lists of rows."""
 
 _COLUMNS: Final = ("overheard", "imu", "height", "powers", "temperature", "corrected")
 """The tables that are held as columns by name."""
@@ -161,7 +169,8 @@ def load(path: str | os.PathLike[str]) -> Contents:
         return Contents(
             exchanges=r.exchanges(), tags=r.tags(), poses=r.poses(), overheard=r.overheard(), imu=r.imu(),
             height=r.heights(), powers=r.powers(), temperature=r.temperatures(), corrected=r.corrected(),
-            cirs=r.cirs(), frames=r.frames(), faults=r.faults(), meta=r.meta(),
+            cirs=r.cirs(), frames=r.frames(), faults=r.faults(), arrangements=r.arrangements(),
+            known_distances=r.known_distances(), meta=r.meta(),
         )  # fmt: skip
 
 

@@ -27,9 +27,11 @@ from uwblink.recording.schema import (
     FORMAT_VERSION,
     SUFFIX,
     TABLES,
+    Arrangement,
     CirRow,
     Fault,
     FrameRow,
+    KnownDistance,
     Poses,
     Tag,
     standard_meta,
@@ -189,6 +191,16 @@ class Recording:
         columns = {n: np.array([getattr(r, n) for r in rows]) for n in ("time_ns", "board", "kind", "detail")}
         columns |= {n: _optional([getattr(r, n) for r in rows]) for n in ("initiator", "target")}
         self._store.insert("faults", columns)
+
+    def append_arrangements(self, arrangements: Iterable[Arrangement]) -> None:
+        """Add stretches of time in which boards stood still."""
+        for a in arrangements:
+            self._store.insert_row("arrangements", [a.start_ns, a.end_ns, a.name, a.known])
+
+    def append_distances(self, distances: Iterable[KnownDistance]) -> None:
+        """Add distances that were measured otherwise."""
+        for d in distances:
+            self._store.insert_row("distances", [d.first, d.second, d.distance_m, d.sigma_m, d.arrangement])
 
     def append_frames(self, rows: Iterable[FrameRow]) -> None:
         """Add raw bytes, in one transaction."""
@@ -404,6 +416,27 @@ class Recording:
         rows = zip(r["time_ns"], r["board"], r["kind"], r["detail"], *ends, strict=True)
         return [Fault(int(t), str(b), str(k), str(d), i, j) for t, b, k, d, i, j in rows]
 
+    def arrangements(self) -> list[Arrangement]:
+        """Return the stretches of time in which boards stood still, in order of time; none in older files."""
+        rows = self._whole_rows("arrangements", "start_ns")
+        return [Arrangement(str(n), int(start), int(end), str(known)) for start, end, n, known in rows]
+
+    def known_distances(self) -> list[KnownDistance]:
+        """Return the distances between tags that were measured otherwise, in order of tags; none in older files."""
+        rows = self._whole_rows("distances", "first, second")
+        return [KnownDistance(int(i), int(j), float(d), float(s), str(a)) for i, j, d, s, a in rows]
+
+    def _whole_rows(self, table: str, order: str) -> list[tuple[Any, ...]]:
+        """Return the rows of a table that older files lack; raises `RecordingError` where one lacks a value."""
+        if table not in self._store.columns():
+            return []
+        names = ", ".join(f'"{name}"' for name in TABLES[table])
+        rows = self._store.rows(f"SELECT {names} FROM {table} ORDER BY {order}, rowid")  # noqa: S608 - keys of TABLES
+        for row in rows:
+            if None in row:
+                raise RecordingError(f"{self.path}: table {table}: a row with nothing in one of its columns, {row}")
+        return rows
+
     def _check_version(self) -> None:
         version = self.meta().get("format_version")
         if not isinstance(version, int):
@@ -428,6 +461,8 @@ _APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
     "powers": lambda recording, columns: recording.append_columns("powers", columns),
     "temperature": lambda recording, columns: recording.append_columns("temperature", columns),
     "corrected": lambda recording, columns: recording.append_columns("corrected", columns),
+    "arrangements": Recording.append_arrangements,
+    "distances": Recording.append_distances,
 }
 
 _EMPTY: Final = {"BIGINT": np.int64, "BOOLEAN": np.bool_, "DOUBLE": np.float64, "USMALLINT": np.uint16}

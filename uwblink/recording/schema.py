@@ -78,6 +78,12 @@ TABLES: Final[dict[str, dict[str, str]]] = {
         "tag": "USMALLINT",
         **dict.fromkeys(("temperature_c", "supply_v"), "DOUBLE"),
     },
+    "arrangements": {"start_ns": "BIGINT", "end_ns": "BIGINT", **dict.fromkeys(("name", "known"), "VARCHAR")},
+    "distances": {
+        **dict.fromkeys(("first", "second"), "USMALLINT"),
+        **dict.fromkeys(("distance_m", "sigma_m"), "DOUBLE"),
+        "arrangement": "VARCHAR",
+    },
     "corrected": {
         "time_ns": "BIGINT",
         **dict.fromkeys(("initiator", "target"), "USMALLINT"),
@@ -94,6 +100,8 @@ ADDED_LATER: Final = {
     "powers": frozenset(TABLES["powers"]),
     "temperature": frozenset(TABLES["temperature"]),
     "corrected": frozenset(TABLES["corrected"]),
+    "arrangements": frozenset(TABLES["arrangements"]),
+    "distances": frozenset(TABLES["distances"]),
 }
 """Columns that a recording may lack, because it is older than they are; where all of a table's are, the table."""
 
@@ -193,6 +201,43 @@ class Fault:
     detail: str
     initiator: int | None = None
     target: int | None = None
+
+
+SHAPES: Final = ("", "line", "plane")
+"""What may be known of where the boards of an arrangement stand: nothing, on a straight line, in a plane."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrangement:
+    """A stretch of time in which boards stood still: its name, and whether on a "line" or a "plane" ("": not known).
+
+    >>> from uwblink import Arrangement
+    >>> Arrangement("A", 0, 60_000_000_000, "line").name
+    'A'
+    """
+
+    name: str
+    start_ns: int
+    end_ns: int
+    known: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownDistance:
+    """A distance between two tags' antennas that was measured otherwise (a tape, a laser), and its standard deviation.
+
+    It holds in one arrangement, or in all where that is "".
+
+    >>> from uwblink import KnownDistance
+    >>> KnownDistance(1, 2, 3.06, 0.005).sigma_m
+    0.005
+    """
+
+    first: int
+    second: int
+    distance_m: float
+    sigma_m: float
+    arrangement: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from tests.uwblink.recording.test_file import random_exchanges
 from uwblink.errors import RecordingError, RecordingExistsError
 from uwblink.recording import store
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow, Poses, Tag
+from uwblink.recording.schema import TABLES, Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 
 HEARD = {name: 7.5 if kind == "DOUBLE" else 3 for name, kind in TABLES["overheard"].items()}
 CIRS = [
@@ -35,6 +35,8 @@ INSTEAD = {
     "temperature": {name: np.array([2.0]) for name in TABLES["temperature"]},
     "corrected": {name: np.array([1.0]) for name in TABLES["corrected"]},
     "height": {"time_ns": np.array([3]), "body": np.array(["z"]), "height_m": np.array([np.nan])},
+    "arrangements": [Arrangement("Z", 1, 2, "plane")],
+    "distances": [],
 }
 
 
@@ -56,6 +58,8 @@ def full(tmp_path):
         r.append_columns("temperature", {"time_ns": np.array([4, 3]), "tag": np.array([1, 3])} | celsius)
         r.append_columns("corrected", {name: np.array([1, 0]) for name in TABLES["corrected"] if name != "sigma_m"})
         r.append_columns("height", {"height_m": np.array([0.5, 0.25])} | readings)
+        r.append_arrangements([Arrangement("B", 5, 9, "line"), Arrangement("A", 1, 4)])
+        r.append_distances([KnownDistance(1, 2, 3.06, 0.005, "A"), KnownDistance(1, 3, 2.5, 0.01)])
         r.append_faults([Fault(9, "1", "time-out", "no answer"), Fault(2, "2", "failed exchange", "é", 2, 1)])
     with duckdb.connect(str(path)) as db:
         db.execute("INSERT INTO exchanges (time_ns, initiator, target, protocol) VALUES (1, 2, 3, 'ds')")
@@ -63,6 +67,12 @@ def full(tmp_path):
         db.execute("INSERT INTO cirs VALUES (9, 1, 1, 2, NULL, NULL)")
         db.execute("INSERT INTO faults VALUES (9, NULL, 'power', NULL, NULL, 3)")
     return path
+
+
+def test_arrangements_and_distances_come_back_in_order(full):
+    with Recording.open(full) as source:
+        assert source.arrangements() == [Arrangement("A", 1, 4), Arrangement("B", 5, 9, "line")]
+        assert source.known_distances() == [KnownDistance(1, 2, 3.06, 0.005, "A"), KnownDistance(1, 3, 2.5, 0.01)]
 
 
 def rows(path):

@@ -1,0 +1,103 @@
+"""Commands that calibrate without true distances: survey."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.cli.arguments import AsJson, DelaysOnly, Fix, Force, NewCalibration
+from calib.cli.flags import with_flags
+
+if TYPE_CHECKING:
+    import calib
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command()(survey)
+
+
+def survey(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings of boards that stand still (.uwb).")],
+    output: NewCalibration,
+    known: Annotated[
+        str, typer.Option(help="What is known of the arrangements: line, plane, or a file that says more (.toml).")
+    ] = "",
+    anchors: Annotated[
+        Path | None, typer.Option(help="Where boards stood, to write: \\[[anchors]] (.toml) or for ROS (.yaml).")
+    ] = None,
+    arrangement: Annotated[str | None, typer.Option(help="The arrangement that --anchors writes.")] = None,
+    fix: Fix = None,
+    pair_error: Annotated[
+        float | None, typer.Option(help="Constant error of a pair in an arrangement (m); by default estimated.")
+    ] = None,
+    delays_only: DelaysOnly = False,
+    regardless: Annotated[
+        bool, typer.Option("--regardless", help="Survey even where ranges contradict what is said to be known.")
+    ] = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Calibrate without true distances: boards that stand still, in arrangements of which little is known."""
+    import calib
+    from calib.cli.options import fixed_ns
+    from uwblink.output import check_output
+
+    check_output(output, force=force)
+    if anchors:
+        check_output(anchors, force=force)
+    try:
+        result = calib.survey(
+            recordings,
+            known=known,
+            fixed_ns=fixed_ns(fix or ()),
+            pair_error_m=pair_error,
+            delays_only=delays_only,
+            regardless=regardless,
+        )
+        if anchors:
+            result.save_anchors(anchors, arrangement=arrangement, force=force)
+    except calib.UnanswerableError as error:
+        if as_json:
+            typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
+        raise
+    result.save(output, force=force)
+    if as_json:
+        typer.echo(json.dumps(_figures(result), indent=1))
+        return
+    typer.echo(f"{output}: {result.headline()}")
+    for line in _lines(result):
+        typer.echo(line)
+    if anchors:
+        typer.echo(f"{anchors}: boards of {result.arrangement(arrangement).name}")
+    for warning in result.warnings:
+        typer.echo(f"warning: {with_flags(warning)}", err=True)
+
+
+def _lines(result: calib.SurveyResult) -> Iterator[str]:
+    from calib.cli.fitting import delay_lines
+
+    yield from delay_lines(result.calibration)
+    for one in result.arrangements:
+        shape = f", on a {one.known}" if one.known else ""
+        yield f"  arrangement {one.name}{shape}: {one.frame}"
+        for board in one.boards:
+            place = "  ".join(f"{value:+8.3f}" for value in board.position_m)
+            half = 196 * math.sqrt(max(float(board.covariance_m2.trace()), 0.0))
+            known = f"± {half:.1f} cm (95 %)" if board.determined else "undetermined"
+            yield f"    tag {board.tag:3d}  {place} m  {known}"
+
+
+def _figures(result: calib.SurveyResult) -> dict[str, Any]:
+    return {
+        "calibration": json.loads(result.calibration.to_json()),
+        "arrangements": [one.to_dict() for one in result.arrangements],
+        "pair_error_m": result.pair_error_m,
+        "findings": list(result.findings),
+        "warnings": [with_flags(text) for text in result.warnings],
+    }

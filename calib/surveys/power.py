@@ -1,0 +1,71 @@
+"""The curve of bias over power where boards stand still: few powers, so it is drawn to what such curves are like.
+
+A Gaussian process over decibels is what is known beforehand: a standard deviation that is estimated with the rest, and
+a length over which a curve bends. It is zero at the reference power, like every fitted curve here, and is written as
+cubic splines over lifted power.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from calib.calibration.power_curves import ALPHA_DBM, DEGREE, basis
+from uwblink.arrays import Bools, Floats
+
+SEGMENTS: Final = 4
+BEND_DB: Final = 8.0
+"""Length of the process: how far apart powers are whose biases have little to do with each other."""
+
+NARROWEST_DB: Final = 3.0
+"""Span of powers below which there is no curve to speak of."""
+
+
+@dataclass(frozen=True, slots=True)
+class PowerModel:
+    """Cubic splines (n, m) at the powers of rows, and the information (m, m) on coefficients for a spread of 1."""
+
+    knots: Floats
+    design: Floats
+    precision: Floats
+
+    @property
+    def size(self) -> int:
+        """How many coefficients there are."""
+        return int(self.design.shape[1])
+
+    def only(self, rows: Bools) -> PowerModel:
+        """Return the model of some rows."""
+        return replace(self, design=self.design[rows])
+
+
+def in_dbm(lifted: Floats) -> Floats:
+    """Return the powers that lifted ones stand for."""
+    return np.asarray(ALPHA_DBM + 10 * np.log10(lifted))
+
+
+def power_model(lifted: Floats) -> PowerModel | None:
+    """Return the model of a curve at lifted powers (n,); None where powers lack, or hardly vary."""
+    if not len(lifted) or not np.isfinite(lifted).all() or not (lifted > 0).all():
+        return None
+    power = in_dbm(lifted)
+    low, high = float(power.min()), float(power.max())
+    if high - low < NARROWEST_DB:
+        return None
+    inner = 10 ** ((np.linspace(low, high, SEGMENTS + 1) - ALPHA_DBM) / 10)
+    knots = np.concatenate([[inner[0]] * DEGREE, inner, [inner[-1]] * DEGREE])
+    dense = np.linspace(low, high, 60)
+    splines = basis(10 ** ((dense - ALPHA_DBM) / 10), knots)
+    back = np.linalg.pinv(splines)
+    covariance = back @ _process(dense) @ back.T
+    precision: Floats = np.asarray(np.linalg.inv(covariance + 1e-4 * np.eye(len(covariance))), dtype=np.float64)
+    return PowerModel(knots, basis(lifted, knots), precision)
+
+
+def _process(power: Floats) -> Floats:
+    """Return the covariance (n, n) of a process with a spread of 1, given that it is zero at the reference."""
+    both = np.append(power, ALPHA_DBM)
+    whole = np.exp(-0.5 * ((both[:, None] - both) / BEND_DB) ** 2)
+    return np.asarray(whole[:-1, :-1] - np.outer(whole[:-1, -1], whole[-1, :-1]))

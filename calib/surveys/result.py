@@ -1,0 +1,152 @@
+"""What a survey returns: a calibration, where boards stood, and what both rest on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.calibration.model import Calibration
+from calib.errors import BadInputError
+from calib.information import Verdict
+from calib.surveys.minima import SecondBest
+from uwblink.arrays import Floats
+from uwblink.output import write_text
+
+FORMATS = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml"}
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyedBoard:
+    """Where a tag's antenna was: metres, and the covariance (3, 3); zero along what the frame or the shape fixes.
+
+    `determined` is whether the ranges determine the place.
+    """
+
+    tag: int
+    position_m: tuple[float, float, float]
+    covariance_m2: Floats
+    determined: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyedArrangement:
+    """An arrangement: its name, what was said of it ("line", "plane" or ""), its boards, and the frame in words."""
+
+    name: str
+    known: str
+    boards: tuple[SurveyedBoard, ...]
+    frame: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as JSON takes it, in metres."""
+        boards = [
+            {
+                "tag": board.tag,
+                "position_m": [round(value, 5) for value in board.position_m],
+                "covariance_m2": board.covariance_m2.tolist(),
+                "determined": board.determined,
+            }
+            for board in self.boards
+        ]
+        return {"name": self.name, "known": self.known, "frame": self.frame, "boards": boards}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SurveyResult:
+    """A calibration from boards that stood still, and where they stood.
+
+    `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` says what
+    of the delays (in ns) is determined; `findings` are contradictions between the ranges and what was said to be known;
+    `warnings` what a user should know. `second_best` is the best other solution.
+
+    >>> import calib
+    >>> result = calib.survey(calib.sample_arrangements(), known="line")
+    >>> sorted(result.calibration.delays_ns)
+    [1, 2, 3, 4]
+    """
+
+    calibration: Calibration
+    arrangements: tuple[SurveyedArrangement, ...]
+    verdict: Verdict
+    pair_error_m: float
+    second_best: SecondBest | None
+    findings: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Return the calibration as a table, below what it rests on, above the warnings."""
+        lines = [self.headline(), repr(self.calibration), *(f"warning: {text}" for text in self.warnings)]
+        return "\n".join(lines)
+
+    def headline(self) -> str:
+        """Return what the survey rests on, in one line."""
+        count = len(self.arrangements)
+        pairs = self.calibration.provenance["pairs"]
+        return (
+            f"Survey of {count} arrangement{'s' * (count > 1)}, {pairs} pairs: constant error of a pair "
+            f"{100 * self.pair_error_m:.1f} cm"
+        )
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
+        self.calibration.save(path, force=force)
+
+    def save_anchors(
+        self, path: str | os.PathLike[str], *, arrangement: str | None = None, force: bool = False
+    ) -> None:
+        """Write where boards stood: `[[anchors]]` (.toml) or parameters for ROS (.yaml), with covariance.
+
+        `arrangement` names which, where there are several. Raises `BadInputError`.
+        """
+        place = Path(path)
+        form = FORMATS.get(place.suffix.lower())
+        if form is None:
+            raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .toml or .yaml", parameter="anchors")
+        lines = _toml if form == "toml" else _yaml
+        write_text(place, "\n".join(lines(self.arrangement(arrangement))) + "\n", force=force)
+
+    def arrangement(self, name: str | None = None) -> SurveyedArrangement:
+        """Return an arrangement by name, the only one where none is given; raises `BadInputError`."""
+        known = {one.name: one for one in self.arrangements}
+        if name is None and len(known) == 1:
+            return self.arrangements[0]
+        if name not in known:
+            found = "none is named" if name is None else f"found {name!r:.40}"
+            raise BadInputError(f"{found}, there are {', '.join(known)}", parameter="arrangement")
+        return known[name]
+
+
+def _rows(found: SurveyedArrangement) -> Iterator[tuple[SurveyedBoard, list[float], list[float]]]:
+    for board in found.boards:
+        if board.determined:
+            upper = board.covariance_m2[np.triu_indices(3)].tolist()
+            yield board, [round(value, 5) for value in board.position_m], [float(f"{value:.6g}") for value in upper]
+
+
+def _toml(found: SurveyedArrangement) -> Iterator[str]:
+    yield f"# Arrangement {found.name}, surveyed from ranges. Frame: {found.frame}. Metres."
+    yield "# covariance_m2: xx xy xz yy yz zz."
+    for board, position, upper in _rows(found):
+        yield ""
+        yield "[[anchors]]"
+        yield f"id = {board.tag}"
+        yield f"position_m = [{', '.join(map(str, position))}]"
+        yield f"# covariance_m2 = [{', '.join(map(str, upper))}]"
+
+
+def _yaml(found: SurveyedArrangement) -> Iterator[str]:
+    yield f"# Arrangement {found.name}, surveyed from ranges. Frame: {found.frame}. Metres."
+    yield "# covariance: xx xy xz yy yz zz, m^2."
+    yield "/**:"
+    yield "  ros__parameters:"
+    yield "    anchors:"
+    yield f"      ids: [{', '.join(str(board.tag) for board, _, _ in _rows(found))}]"
+    for board, position, upper in _rows(found):
+        yield f"      anchor_{board.tag}:"
+        yield f"        position: [{', '.join(map(str, position))}]"
+        yield f"        covariance: [{', '.join(map(str, upper))}]"

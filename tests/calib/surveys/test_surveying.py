@@ -1,0 +1,310 @@
+"""Surveys of boards that stand still: planted delays and places, what is not determined, and what is said wrongly."""
+
+import json
+import math
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import calib
+from benchmarks.standing import standing_boards
+from calib.cli.commands import app
+from calib.errors import BadInputError, UnanswerableError
+from calib.surveys.knowledge import load_knowledge
+from calib.surveys.samples import DELAYS_NS
+from uwblink import Arrangement, Contents, Exchanges
+from uwblink.recording.schema import KnownDistance
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
+
+
+def in_order(*orders):
+    """Places on a line (boards, 3) by the order in which boards lie, at uneven steps."""
+    steps = np.array([0.0, 0.9, 2.1, 3.6])
+    found = []
+    for order in orders:
+        place = np.zeros((len(order), 3))
+        place[np.array(order) - 1, 0] = steps[: len(order)]
+        found.append(place)
+    return found
+
+
+FOUR = in_order((1, 2, 3, 4), (2, 1, 4, 3), (3, 1, 4, 2), (2, 4, 1, 3), (4, 3, 2, 1), (1, 3, 4, 2), (3, 2, 4, 1))
+
+
+def scores(result, planted):
+    found = result.calibration
+    return {t: (d - planted[t]) / found.delays_std_ns[t] for t, d in found.delays_ns.items()}
+
+
+def test_without_noise_delays_and_places_are_exact():
+    world = standing_boards(1, places=FOUR, pair_error_m=0.0, noise_m=0.0)
+    result = calib.survey(world.ranges, known="line")
+    for tag, delay in world.delays_ns.items():
+        assert result.calibration.delays_ns[tag] == pytest.approx(delay, abs=2e-4)
+    for k, one in enumerate(result.arrangements):
+        found = np.array([board.position_m[0] for board in one.boards])
+        place = world.places[k][:, 0] - world.places[k][0, 0]
+        assert found == pytest.approx(place * np.sign(place[1]), abs=1e-4)
+    assert result.warnings == ()
+    assert result.second_best is None
+
+
+@pytest.mark.parametrize(("shape", "boards", "count"), [("line", 4, 8), ("plane", 6, 8), ("space", 8, 6)])
+def test_planted_delays_lie_within_their_intervals(shape, boards, count):
+    world = standing_boards(3, shape, boards=boards, arrangements=count)
+    result = calib.survey(world.ranges, known="" if shape == "space" else shape)
+    assert len(result.arrangements) == count
+    assert result.pair_error_m == pytest.approx(0.02, rel=0.4)
+    found = scores(result, world.delays_ns)
+    assert max(map(abs, found.values())) < 3.5
+    assert np.mean([abs(d - world.delays_ns[t]) for t, d in result.calibration.delays_ns.items()]) < 0.1
+
+
+def test_three_boards_in_a_row_give_the_delay_of_the_middle_one_alone():
+    world = standing_boards(5, boards=3, places=in_order((1, 2, 3)), pair_error_m=0.005)
+    result = calib.survey(world.ranges, known="line")
+    assert list(result.calibration.delays_ns) == [2]
+    assert abs(result.calibration.delays_ns[2] - world.delays_ns[2]) < 0.15
+    assert any("not determined, and left out: " in text for text in result.warnings)
+    assert result.verdict.named("delay") == ("1", "3")
+
+
+def test_one_arrangement_in_space_determines_nothing_and_says_of_whom():
+    world = standing_boards(5, "space", boards=5, arrangements=1)
+    with pytest.raises(UnanswerableError, match=r"determine no delay: .* can change .*`calib plan`") as caught:
+        calib.survey(world.ranges)
+    assert caught.value.undetermined == [[1, 2, 3, 4, 5]]
+
+
+def test_a_tape_settles_the_delays_that_a_row_of_three_leaves_open():
+    world = standing_boards(5, boards=3, places=in_order((1, 2, 3)), pair_error_m=0.005)
+    taped = calib.Knowledge(shape="line", distances=(KnownDistance(1, 2, 0.9, 0.002), KnownDistance(2, 3, 1.2, 0.002)))
+    result = calib.survey(world.ranges, known=taped)
+    assert list(result.calibration.delays_ns) == [1, 2, 3]
+    assert max(map(abs, scores(result, world.delays_ns).values())) < 3
+
+
+def test_a_curve_over_power_is_found_along_with_the_delays():
+    world = standing_boards(2, "plane", boards=6, arrangements=8, bias_size_m=0.06, size_m=9.0, pair_error_m=0.01)
+    result = calib.survey(world.ranges, known="plane")
+    curve = result.calibration.bias_curve
+    assert float(curve(np.array([1.0]))[0]) == pytest.approx(0.0, abs=2e-3)
+    assert max(map(abs, scores(result, world.delays_ns).values())) < 3.5
+    # -77 dBm at a metre: from 0.4 m (-69) to 9 m (-96) the planted curve rises by 11 cm.
+    low, high = curve.range
+    assert float(curve(np.array([low]))[0] - curve(np.array([high]))[0]) > 0.05
+
+
+def test_known_positions_give_the_frame_and_the_mirror_is_told():
+    corners = np.array(
+        [[0.0, 0.0, 1.0], [6.0, 0.0, 1.2], [6.0, 5.0, 0.9], [0.0, 5.0, 1.1], [2.5, 2.0, 2.4], [3.0, 4, 0.2]]
+    )
+    world = standing_boards(4, "space", boards=6, places=[corners], pair_error_m=0.01)
+    known = calib.Knowledge(
+        positions=tuple(calib.KnownPosition(t, tuple(corners[t - 1].tolist()), 0.005) for t in (1, 2, 3, 4))
+    )
+    result = calib.survey(world.ranges, known=known)
+    (one,) = result.arrangements
+    assert one.frame == "that of the known positions"
+    for board in one.boards:
+        away = np.array(board.position_m) - corners[board.tag - 1]
+        assert np.abs(away).max() < 4 * math.sqrt(np.diag(board.covariance_m2).max())
+
+
+def test_intervals_of_places_hold_in_the_stated_frame():
+    inside = []
+    for seed in range(3):
+        world = standing_boards(40 + seed, "plane", boards=5, arrangements=6)
+        result = calib.survey(world.ranges, known="plane")
+        for k, one in enumerate(result.arrangements):
+            a, b = world.places[k][:2, :2]
+            x = (b - a) / np.linalg.norm(b - a)
+            truth = (world.places[k][:, :2] - a) @ np.array([x, [-x[1], x[0]]]).T
+            beside = next(v for v in truth[2:, 1] if abs(v) > 0.2 * np.abs(truth[2:, 1]).max())
+            truth[:, 1] *= np.sign(beside)
+            for n, board in enumerate(one.boards[2:], start=2):
+                away = np.array(board.position_m[:2]) - truth[n]
+                cov = board.covariance_m2[:2, :2] + 1e-12 * np.eye(2)
+                inside.append(float(away @ np.linalg.solve(cov, away)) < 5.99)
+    assert np.mean(inside) > 0.8  # of 54, those of one arrangement dependent
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_line_that_is_none_is_named(seed):
+    places = [p.copy() for p in FOUR]
+    places[2][3, 1] = 0.8
+    world = standing_boards(seed, places=places, pair_error_m=0.01)
+    with pytest.raises(UnanswerableError, match=r"^3 is said to be a line and is none"):
+        calib.survey(world.ranges, known="line")
+    result = calib.survey(world.ranges, known="line", regardless=True)
+    assert max(map(abs, scores(result, world.delays_ns).values())) < 4
+    assert [one.known for one in result.arrangements] == ["line", "line", "plane", *["line"] * 4]
+
+
+@pytest.mark.parametrize("moved", [0.10, -0.25])
+def test_a_board_that_was_moved_is_named(moved):
+    world = standing_boards(6, places=FOUR, pair_error_m=0.01)
+    r = world.ranges
+    start = 2 * 70e9 + 25e9
+    late = (r.time_ns > start) & (r.time_ns < 3 * 70e9 - 5e9) & ((r.initiator == 4) | (r.target == 4))
+    other = np.where(r.initiator == 4, r.target, r.initiator)
+    place = world.places[2][:, 0]
+    before = np.abs(place[3] - place[other - 1])
+    after = np.abs(place[3] + moved - place[other - 1])
+    raw = r.raw_m + np.where(late, after - before, 0.0)
+    known = calib.Knowledge(shape="line", spans_s={str(k + 1): (70.0 * k, 70.0 * k + 60) for k in range(7)})
+    with pytest.raises(UnanswerableError, match=r"^3: board 4 was moved 2\d s after its beginning"):
+        calib.survey(replace(r, raw_m=raw), known=known)
+
+
+def test_exchanged_labels_are_named():
+    world = standing_boards(8, "plane", boards=6, arrangements=6, pair_error_m=0.01)
+    names = {1: 2, 2: 1}
+    where = world.places[0]
+    said = tuple(calib.KnownPosition(names.get(t, t), tuple(where[t - 1].tolist()), 0.01, "1") for t in range(1, 7))
+    with pytest.raises(UnanswerableError, match="if 1 and 2 are exchanged"):
+        calib.survey(world.ranges, known=calib.Knowledge(shape="plane", positions=said))
+
+
+def test_a_tape_that_is_off_by_30_cm_is_named():
+    world = standing_boards(9, places=FOUR, pair_error_m=0.01)
+    said = (KnownDistance(1, 3, 2.1 + 0.3, 0.005, "1"), KnownDistance(2, 4, 2.7, 0.005, "1"))
+    with pytest.raises(UnanswerableError, match=r"the known distance of 1 and 3 in 1 is \+\d+ cm off"):
+        calib.survey(world.ranges, known=calib.Knowledge(shape="line", distances=said))
+
+
+def test_a_reflected_pair_is_left_out_and_named():
+    world = standing_boards(10, places=FOUR, pair_error_m=0.01)
+    r = world.ranges
+    hit = (r.time_ns < 65e9) & (np.minimum(r.initiator, r.target) == 1) & (np.maximum(r.initiator, r.target) == 4)
+    result = calib.survey(replace(r, raw_m=r.raw_m + 0.4 * hit), known="line")
+    assert any(text.startswith("1: the range of 1 and 4 is +") for text in result.warnings)
+    assert max(map(abs, scores(result, world.delays_ns).values())) < 3.5
+
+
+def test_nothing_is_said_against_what_is_right():
+    for seed in range(2):
+        world = standing_boards(seed, places=FOUR)
+        said = calib.Knowledge(shape="line", distances=(KnownDistance(1, 3, 2.1, 0.01, "1"),))
+        assert calib.survey(world.ranges, known=said).findings == ()
+
+
+def test_a_known_delay_stays_and_the_others_follow():
+    world = standing_boards(5, boards=3, places=in_order((1, 2, 3), (2, 1, 3)), pair_error_m=0.005)
+    result = calib.survey(world.ranges, known="line", fixed_ns={3: world.delays_ns[3]})
+    assert result.calibration.delays_ns[3] == pytest.approx(world.delays_ns[3], abs=1e-3)
+    assert result.calibration.delays_std_ns[3] == 0.0
+    assert set(result.calibration.delays_ns) == {1, 2, 3}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("known = 'ring'", "known: found 'ring'"),
+        ("knwn = 'line'", "knwn: unknown key"),
+        ("[[distances]]\nbetween = [1, 1]\ndistance_m = 2.0", r"distances\[0\].between"),
+        ("[[distances]]\nbetween = [1, 2]\ndistance_m = -2.0", r"distances\[0\].distance_m"),
+        ("[[distances]]\nbetween = [1, 2]", r"distances\[0\].distance_m"),
+        ("[[distances]]\nbetween = [1, 2]\ndistance_m = 2\nsigma_m = 0", r"distances\[0\].sigma_m"),
+        ("[[positions]]\ntag = 300\nposition_m = [1, 2, 3]", r"positions\[0\].tag"),
+        ("[[positions]]\ntag = 3\nposition_m = [1, 2]", r"positions\[0\].position_m"),
+        ("[[arrangements]]\nname = 'a'\nstart_s = 3", "give both start_s and end_s"),
+        ("[[arrangements]]\nname = 'a'\nstart_s = 3\nend_s = 2", "end_s"),
+        ("[[arrangements]]\nname = 'a'\n[[arrangements]]\nname = 'a'", "each name once"),
+        ("[[arrangements]]\nknown = 'line'", "name"),
+        ("distances = 3", "distances"),
+        ("known = ", "not valid TOML"),
+    ],
+)
+def test_mistakes_in_the_file_of_what_is_known_are_one_line(tmp_path, text, message):
+    path = tmp_path / "known.toml"
+    path.write_text(text)
+    with pytest.raises(BadInputError, match=message) as caught:
+        load_knowledge(path)
+    assert "\n" not in str(caught.value).replace("\n", "", 0) or "TOML" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"known": 3}, "known"),
+        ({"known": "nowhere.toml"}, "no such file of what is known"),
+        ({"known": calib.Knowledge(shape="ring")}, "ring"),
+        ({"known": calib.Knowledge(shapes={"9": "line"})}, "names an arrangement '9'"),
+        ({"known": calib.Knowledge(distances=(KnownDistance(1, 9, 1.0, 0.1),))}, "do not range"),
+        ({"known": calib.Knowledge(distances=(KnownDistance(1, 2, math.nan, 0.1),))}, "expected more than 0"),
+        ({"known": calib.Knowledge(positions=(calib.KnownPosition(9, (0, 0, 0)),))}, "do not range"),
+        ({"pair_error_m": -1.0}, "pair_error_m"),
+        ({"fixed_ns": {9: 0.1}}, "fixed_ns"),
+        ({"fixed_ns": {1: math.nan}}, "fixed_ns"),
+    ],
+)
+def test_arguments_that_cannot_be_used_are_refused(settings, message):
+    with pytest.raises(BadInputError, match=message):
+        calib.survey(calib.sample_arrangements(2), **settings)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """The arrangements of the sample, each a recording of its own with its mark."""
+    ranges = calib.sample_arrangements(4)
+    paths = []
+    for k in range(4):
+        rows = (ranges.time_ns >= 40e9 * k) & (ranges.time_ns < 40e9 * (k + 1))
+        r = ranges[rows]
+        start = np.zeros(len(r), dtype=np.int64)
+        back = np.rint(2 * r.raw_m / SPEED_OF_LIGHT / TICK_S).astype(np.int64) + 20_000_000
+        x = Exchanges.from_arrays(
+            r.initiator, r.target, tx1=start, rx1=start, tx2=start + 20_000_000, rx2=back, time_ns=r.time_ns
+        )
+        marks = [Arrangement("ABCD"[k], int(r.time_ns[0]), int(r.time_ns[-1]) + 1, "line")]
+        Contents(exchanges=x, arrangements=marks).save(tmp_path / f"{k}.uwb")
+        paths.append(str(tmp_path / f"{k}.uwb"))
+    return paths
+
+
+def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_read(recording, tmp_path):
+    out, anchors = tmp_path / "c.json", tmp_path / "anchors.toml"
+    words = ["survey", *recording, "-o", str(out), "--anchors", str(anchors), "--arrangement", "B", "--json"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert [one["name"] for one in told["arrangements"]] == list("ABCD")
+    assert {one["known"] for one in told["arrangements"]} == {"line"}
+    known = calib.load_calibration(out)
+    assert known.provenance["recipe"] == "survey"
+    assert known.provenance["rests_on"]["arrangements"][1] == {"name": "B", "known": "line", "tags": [1, 2, 3, 4]}
+    assert max(abs(d - DELAYS_NS[t]) for t, d in known.delays_ns.items()) < 0.2
+    rows = tomllib.loads(anchors.read_text())["anchors"]
+    assert [row["id"] for row in rows] == [1, 2, 3, 4]
+    assert rows[0]["position_m"] == [0.0, 0.0, 0.0]
+    # A corrected recording comes of it as of any other calibration.
+    assert calib.apply(recording[0], known, tmp_path / "corrected.uwb").count == 600
+
+
+def test_anchors_for_ros_carry_the_covariance(recording, tmp_path):
+    result = calib.survey(recording)
+    result.save_anchors(tmp_path / "a.yaml", arrangement="A")
+    text = (tmp_path / "a.yaml").read_text()
+    assert "ids: [1, 2, 3, 4]" in text
+    assert text.count("covariance: [") == 4
+    with pytest.raises(BadInputError, match="none is named, there are A, B, C, D"):
+        result.save_anchors(tmp_path / "b.yaml")
+    with pytest.raises(BadInputError, match=r"expected .toml or .yaml"):
+        result.save_anchors(tmp_path / "b.txt", arrangement="A")
+
+
+def test_the_command_says_what_is_not_determined_and_writes_nothing(recording, tmp_path):
+    words = ["survey", recording[0], "-o", str(tmp_path / "c.json"), "--json", "--known", "plane"]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, UnanswerableError)
+    assert json.loads(done.stdout)["undetermined"] == [[1, 2, 3, 4]]
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_two_arrangements_of_one_name_are_refused(recording):
+    with pytest.raises(BadInputError, match="two arrangements are called 'A'"):
+        calib.survey([recording[0], recording[0]])
