@@ -6,27 +6,41 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from calib.cli.arguments import AsJson, DelaysOnly, Fix, Force, NewCalibration
 from calib.cli.flags import with_flags
+from uwblink.cli.guide import add
 
 if TYPE_CHECKING:
     import calib
 
+PANEL: Final = "Calibrate"
+
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command()(survey)
+    add(
+        app,
+        survey,
+        "calib survey string.uwb -o delays.json --known line",
+        "calib survey a.uwb b.uwb c.uwb -o delays.json --known known.toml",
+        "calib survey room.uwb -o delays.json --known known.toml --anchors anchors.yaml",
+        panel=PANEL,
+    )
 
 
 def survey(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings of boards that stand still (.uwb).")],
     output: NewCalibration,
     known: Annotated[
-        str, typer.Option(help="What is known of the arrangements: line, plane, or a file that says more (.toml).")
+        str,
+        typer.Option(
+            metavar="line|plane|FILE",
+            help="What is known of the arrangements: all on a line, all on a plane, or a file that says more (.toml).",
+        ),
     ] = "",
     anchors: Annotated[
         Path | None, typer.Option(help="Where boards stood, to write: \\[[anchors]] (.toml) or for ROS (.yaml).")
