@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from calib.samples import sample_flight
     from calib.sources import load_ranges
     from calib.surveys.knowledge import Knowledge, KnownPosition
+    from calib.surveys.planning import Plan, plan
     from calib.surveys.result import SurveyResult
     from calib.surveys.samples import sample_arrangements
     from calib.surveys.surveying import survey
@@ -44,6 +45,7 @@ __all__ = [
     "Knowledge",
     "KnownPosition",
     "OnboardSettings",
+    "Plan",
     "Ranges",
     "SurveyResult",
     "UnanswerableError",
@@ -59,6 +61,7 @@ __all__ = [
     "load_ranges",
     "localize",
     "localize_onboard",
+    "plan",
     "register_loss",
     "register_report_section",
     "run_campaign",
@@ -77,6 +80,7 @@ _HOMES: Final = {
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",
     "OnboardSettings": "calib.evaluation.onboard",
+    "Plan": "calib.surveys.planning",
     "Ranges": "calib.ranges",
     "SurveyResult": "calib.surveys.result",
     "UnanswerableError": "calib.errors",
@@ -92,6 +96,7 @@ _HOMES: Final = {
     "load_ranges": "calib.sources",
     "localize": "calib.evaluation.localization",
     "localize_onboard": "calib.evaluation.onboard",
+    "plan": "calib.surveys.planning",
     "register_loss": "calib.estimation.losses",
     "register_report_section": "calib.report.layout",
     "run_campaign": "calib.report.campaign",

@@ -19,7 +19,7 @@ from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, flat_curve
 from calib.errors import BadInputError, UnanswerableError
 from calib.information import Unknown, Verdict, judge, reduced
 from calib.sources import Data
-from calib.surveys.adjustment import PAIR_WORTH, Adjusted, adjust
+from calib.surveys.adjustment import Adjusted, adjust
 from calib.surveys.doubts import worst
 from calib.surveys.frames import framed
 from calib.surveys.gathering import Gathered, gather
@@ -29,16 +29,13 @@ from calib.surveys.network import DIMENSIONS, Known, Network, Place
 from calib.surveys.pair_means import LIFT
 from calib.surveys.power import PowerModel, power_model
 from calib.surveys.result import SurveyedArrangement, SurveyedBoard, SurveyResult
+from calib.surveys.scales import DELAY_SCALE_NS, M_PER_NS
+from calib.surveys.scales import widened as student
 from uwblink.arrays import Floats
 from uwblink.recording.schema import SHAPES, KnownDistance
 from uwblink.ticks import SPEED_OF_LIGHT
 
-DELAY_SCALE_NS: Final = 0.5
-"""How far a delay is known without any data: devices of one design differ by that."""
-
-M_PER_NS: Final = SPEED_OF_LIGHT * 1e-9
 MOST_DOUBTS: Final = 0.15
-TWO_SIDED: Final = 1.959963984540054
 
 
 def survey(
@@ -216,7 +213,7 @@ def _result(gathered: Gathered, settled: _Settled, findings: tuple[str, ...]) ->
             undetermined=[[int(tag) for tag in free]],
         )
     warnings = [*gathered.warnings, *findings, *settled.left_out, *_said(found, settled.second, verdict)]
-    widened = _student(found.freedom + PAIR_WORTH)
+    widened = student(found.freedom)
     calibration = _calibration(gathered, found, verdict, widened, warnings)
     return SurveyResult(
         calibration=calibration,
@@ -250,13 +247,6 @@ def _said(found: Adjusted, second: SecondBest | None, verdict: Verdict) -> list[
             f"which boards {who} are elsewhere"
         )
     return said
-
-
-def _student(freedom: float) -> float:
-    """Return by how much Student's 95 % quantile is more than the normal one: spreads are estimated."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(freedom, 1.0), 0.975)) / TWO_SIDED
 
 
 def _calibration(

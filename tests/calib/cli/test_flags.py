@@ -32,6 +32,7 @@ ONLY_FROM_PYTHON = {
     "start_m",
     "information",
     "loosest",
+    "boards",
 }
 
 
