@@ -164,8 +164,20 @@ def plan(
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
         return
-    for line in str(found).splitlines():
-        typer.echo(line)
+    typer.echo(str(found))
+    typer.echo("\nCommands, one after the other:")
+    for line in _commands(found):
+        typer.echo(f"  {line}")
+
+
+def _commands(found: calib.Plan) -> Iterator[str]:
+    """Yield the commands that follow the steps, a line each."""
+    for one in found.arrangements:
+        words = f"--pairs all --arrangement {one.name} --duration {found.seconds_each:.0f} -o {one.name}.uwb"
+        yield f"uwblink record PORTS {words}"
+    known = "known.toml" if found.known_beside else found.on
+    shape = f" --known {known}" if known else ""
+    yield f"calib survey {' '.join(f'{one.name}.uwb' for one in found.arrangements)}{shape} -o calibration.json"
 
 
 def _boards(text: str) -> int | list[int]:

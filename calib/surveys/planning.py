@@ -61,7 +61,8 @@ class Plan:
     """A procedure in steps, and the interval (ns, half of 95 %) that each delay will have; infinite where none.
 
     `verdict` says what the arrangements determine; `common_ns` is the half interval of what all delays share, to which
-    every absolute distance owes as much; `next_best` are the next arrangement and the next taped distance.
+    every absolute distance owes as much; `next_best` are the next arrangement and the next taped distance. With
+    `known_beside`, distances or places are known that a survey must be told.
 
     >>> import calib
     >>> plan = calib.plan(4, on="line", arrangements=6)
@@ -80,6 +81,7 @@ class Plan:
     next_best: tuple[NextBest, ...]
     seconds_each: float
     pair_error_m: float
+    known_beside: bool
     steps: tuple[str, ...]
 
     @property
@@ -124,7 +126,7 @@ class Plan:
         }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Given:
     """What one has, checked."""
 
@@ -197,6 +199,7 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
         next_best=tuple(_next_best(given, informations, candidates, layouts_chosen, total, wide)),
         seconds_each=seconds,
         pair_error_m=given.pair_error_m,
+        known_beside=bool(given.anchors) or given.taped > 0,
         steps=tuple(_steps(given, made, seconds)),
     )
 
@@ -234,7 +237,15 @@ def _given(  # noqa: PLR0913 - what `plan` takes, checked
             "stand in a plane or in space; on a line say how many distances are taped", parameter="anchors"
         )
     return _Given(
-        tags, on, _size(on, size_m, len(tags)), taped, tape_sigma_m, pair_error_m, tuple(anchors), anchor_sigma_m, seed
+        tags=tags,
+        on=on,
+        size_m=_size(on, size_m, len(tags)),
+        taped=taped,
+        tape_sigma_m=tape_sigma_m,
+        pair_error_m=pair_error_m,
+        anchors=tuple(anchors),
+        anchor_sigma_m=anchor_sigma_m,
+        seed=seed,
     )
 
 
@@ -378,17 +389,11 @@ def _steps(given: _Given, made: tuple[PlannedArrangement, ...], seconds: float) 
         lines += picture(given.on, one)
         for i, j in one.taped:
             lines.append(f"   Tape the distance of {i} and {j}, antenna to antenna.")
-        lines.append(
-            f"   `uwblink record PORTS --pairs all --arrangement {one.name} --duration {seconds:.0f} -o {one.name}.uwb`"
-        )
-    files = " ".join(f"{one.name}.uwb" for one in made)
-    taped = any(one.taped for one in made) or bool(given.anchors)
-    last = f"`calib survey {files} -o calibration.json`"
-    if taped or given.on:
-        last = f"`calib survey {files} --known {'known.toml' if taped else given.on} -o calibration.json`"
-    lines.append(f"{len(made) + 2}. {last}")
-    if taped:
-        lines.append("   known.toml says the shape, the taped distances and the anchors' places.")
+        lines.append(f"   Record all pairs as arrangement {one.name} for {seconds:.0f} s.")
+    shape = f", known to be on a {given.on}" if given.on else ""
+    lines.append(f"{len(made) + 2}. Survey all recordings together{shape}.")
+    if given.taped or given.anchors:
+        lines.append("   A file says what is known beside: the taped distances, the anchors' places.")
     return lines
 
 

@@ -88,7 +88,7 @@ def test_without_a_number_it_stops_when_more_are_not_worth_it():
 
 def test_steps_name_commands_that_exist_and_pictures_show_orders():
     found = calib.plan([7, 12, 3], on="line", arrangements=2)
-    assert any(line.endswith("--known line -o calibration.json`") for line in found.steps)
+    assert found.steps[-1] == "4. Survey all recordings together, known to be on a line."
     for one in found.arrangements:
         drawn = next(line for line in found.steps if line.strip("- ").startswith(str(one.order()[0])) and "-" in line)
         assert set(drawn) & set("712")
@@ -98,7 +98,8 @@ def test_steps_name_commands_that_exist_and_pictures_show_orders():
 def test_the_command_prints_steps_and_json():
     done = CliRunner().invoke(app, ["plan", "3", "--on", "line", "--arrangements", "2"])
     assert done.exit_code == 0
-    assert "uwblink record PORTS --pairs all --arrangement A" in done.stdout
+    assert "  uwblink record PORTS --pairs all --arrangement A --duration 30 -o A.uwb\n" in done.stdout
+    assert done.stdout.endswith("  calib survey A.uwb B.uwb --known line -o calibration.json\n")
     told = json.loads(CliRunner().invoke(app, ["plan", "1,2,5", "--arrangements", "1", "--json"]).stdout)
     assert sorted(told["half_interval_ns"]) == ["1", "2", "5"]
     assert len(told["undetermined"]) == 2
