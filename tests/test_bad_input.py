@@ -1,15 +1,14 @@
 """Every mistake a user can make at the three commands: one line, the right status, nothing written."""
 
 import gzip
-import subprocess
-import sys
 from pathlib import Path
 
 import duckdb
 import pytest
 
+from tests import processes
+
 ROOT = Path(__file__).parents[1]
-BIN = Path(sys.executable).parent
 NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 HEADER = "time_s,from_id,to_id,tx1,rx1,tx2,rx2"
 GOOD = "0.0,1,2,100,200,300,500"
@@ -17,7 +16,7 @@ GOOD = "0.0,1,2,100,200,300,500"
 
 def run(*arguments):
     words = [str(a) for a in arguments]
-    return subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True)
+    return processes.run(*words)
 
 
 def refused(done, status, *fragments):

@@ -1,21 +1,19 @@
 """Mistakes at the commands for boards: one line, status 2, nothing written."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests import processes
 from tests.boards import served
 
 ROOT = Path(__file__).parents[1]
-BIN = Path(sys.executable).parent
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 
 
 def run(*arguments):
     words = [str(a) for a in arguments]
-    return subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True, timeout=180)
+    return processes.run(*words, timeout=180)
 
 
 def refused(done, *fragments):

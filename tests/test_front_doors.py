@@ -80,3 +80,15 @@ def test_importing_a_package_costs_nothing(package):
     """Not a matter of seconds, which depend on the machine: nothing large is loaded."""
     code = f"import sys, {package}; print(*(m for m in {HEAVY} if m in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split() == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_name_is_that_of_a_module_beside_it(package):
+    """A module that is imported becomes an attribute of its package: it would take the name's place."""
+    rooms = [
+        package,
+        *(m.name for m in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.") if m.ispkg),
+    ]
+    for room in map(importlib.import_module, rooms):
+        beside = {module.name for module in pkgutil.iter_modules(room.__path__)}
+        assert sorted(beside & set(getattr(room, "__all__", ()))) == [], room.__name__

@@ -1,11 +1,10 @@
 """Every scenario in the tree runs, at a few seconds' length, and its recording opens."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests import processes
 from uwblink.recording.file import Recording
 
 ROOT = Path(__file__).parents[1]
@@ -41,14 +40,9 @@ def test_scenarios_that_bite_say_what_they_test(name):
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_scenario_runs(scenario, tmp_path):
     output = tmp_path / "out.uwb"
-    uwbsim = Path(sys.executable).parent / "uwbsim"
     # Thirty hours of an exchange every twenty seconds have none in the first three seconds.
     seconds = 300 if scenario.parent.name == "wrap" else 3
-    done = subprocess.run(
-        [uwbsim, "run", scenario, "-o", output, "--set", f"run.duration_s={seconds}"],
-        capture_output=True,
-        text=True,
-    )
+    done = processes.run("uwbsim", "run", scenario, "-o", output, "--set", f"run.duration_s={seconds}")
     assert done.returncode == 0, done.stderr
     with Recording.open(output) as recording:
         assert len(recording.exchanges()) > 0

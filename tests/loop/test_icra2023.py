@@ -2,8 +2,6 @@
 
 import itertools
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +11,18 @@ from scipy.interpolate import BSpline
 from calib.calibration.model import Calibration, load_calibration
 from calib.ranges import concatenate
 from calib.sources import load_ranges
+from tests import processes
 from tests.shared_data import shared
 from uwblink.recording.file import Recording
 from uwblink.ticks import SPEED_OF_LIGHT
 
 ROOT = Path(__file__).parents[2]
 SCENARIOS = ROOT / "scenarios" / "icra2023"
-BIN = Path(sys.executable).parent
 
 
 def run(*arguments):
     words = [str(a) for a in arguments]
-    done = subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True)
+    done = processes.run(*words)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

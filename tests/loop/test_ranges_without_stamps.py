@@ -3,14 +3,12 @@ commands. The world that wrote it is here."""
 
 import csv
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-BIN = Path(sys.executable).parent
+from tests import processes
+
 ANCHORS = {1: (0.0, 0.0, 2.5), 2: (8.0, 0.0, 2.2), 3: (8.0, 6.0, 2.6), 4: (0.0, 6.0, 2.4), 5: (4.0, 3.0, 3.0)}
 CONSTANTS_M = {1: 0.05, 2: -0.03, 3: 0.1, 4: 0.0, 5: 0.02}
 SIGMA_M = 0.04
@@ -57,7 +55,7 @@ def folder(tmp_path_factory):
 
 
 def run(folder, *words):
-    done = subprocess.run([str(BIN / words[0]), *words[1:]], cwd=folder, capture_output=True, text=True, timeout=300)
+    done = processes.run(*words, cwd=folder, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
 

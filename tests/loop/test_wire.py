@@ -1,12 +1,11 @@
 """The loop through the wire: bytes change nothing, and served boards calibrate like simulated ones."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests import processes
 from tests.boards import served
 from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
@@ -17,13 +16,12 @@ from uwbsim.boards.server import extended
 from uwbsim.scenario.loading import load
 
 ROOT = Path(__file__).parents[2]
-BIN = Path(sys.executable).parent
 TRAIN = ROOT / "scenarios" / "icra2023" / "train.toml"
 
 
 def run(*arguments):
     words = [str(a) for a in arguments]
-    done = subprocess.run([str(BIN / words[0]), *words[1:]], capture_output=True, text=True)
+    done = processes.run(*words)
     assert done.returncode == 0, done.stderr
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import processes
 from tests.boards import served
 
 ROOT = Path(__file__).parents[2]
@@ -47,9 +48,7 @@ def test_twr_prints_each_line_when_it_comes_and_a_summary_at_the_end(number):
 
 def test_twr_that_is_not_interrupted_has_status_0_and_a_summary():
     with served() as server:
-        done = subprocess.run(
-            [str(BIN / "uwblink"), "twr", server.names[1], "2", "-n", "5", "--json"], capture_output=True, text=True
-        )
+        done = processes.run("uwblink", "twr", server.names[1], "2", "-n", "5", "--json")
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert done.returncode == 0
     assert [set(row) == {"summary"} for row in rows] == [False] * 5 + [True]

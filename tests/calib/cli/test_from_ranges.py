@@ -1,20 +1,16 @@
 """`calib fit --truth ranges`, as one types it."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
+from tests import processes
 from tests.calib.trajectories.sines import flight
 from uwblink.recording.file import Recording
 
-BIN = Path(sys.executable).parent
-
 
 def fit(*words):
-    return subprocess.run([str(BIN / "calib"), "fit", *map(str, words)], capture_output=True, text=True)
+    return processes.run("calib", "fit", *words)
 
 
 @pytest.fixture(scope="module")

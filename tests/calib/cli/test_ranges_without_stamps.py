@@ -1,19 +1,15 @@
 """A table of ranges with power and places, no stamps, robots and anchors: import, curve, localization, by commands."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
+from tests import processes
 from tests.calib.plain_tables import DELAYS_NS, Plan, bias_m, write
-
-BIN = Path(sys.executable).parent
 
 
 def run(*words):
-    done = subprocess.run([str(BIN / words[0]), *map(str, words[1:])], capture_output=True, text=True)
+    done = processes.run(*words)
     assert done.returncode == 0, done.stderr
     return done
 

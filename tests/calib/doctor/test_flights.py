@@ -2,10 +2,7 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +10,7 @@ import pytest
 import calib
 from benchmarks import doctor as planted
 from benchmarks.flights import LIGHT, Plan, fly
+from tests import processes
 from uwblink.recording.file import Recording
 
 SHORT = Plan(seconds=60, per_second=80)
@@ -157,12 +155,12 @@ def test_the_command_prints_clocks_and_takes_several(tmp_path):
             recording.append_tags(flight.tags)
             recording.append_poses(flight.poses)
             recording.append_exchanges(flight.exchanges)
-    words = [str(Path(sys.executable).parent / "calib"), "doctor", str(tmp_path / "0.uwb"), str(tmp_path / "1.uwb")]
-    shown = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    words = ["calib", "doctor", tmp_path / "0.uwb", tmp_path / "1.uwb"]
+    shown = processes.run(*words).stdout
     assert "nothing found" in shown
     assert shown.count("pair 10-20: ") == 2
     assert "same sign" in shown
-    found = json.loads(subprocess.run([*words, "--json"], capture_output=True, text=True, check=True).stdout)
+    found = json.loads(processes.run(*words, "--json").stdout)
     assert found["findings"] == []
     (pairs, _) = found["clock_skews"].values()
     assert len(pairs) == 10

@@ -1,13 +1,8 @@
 """Whoever judges a calibration on what it was fitted to is told so."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import calib
+from tests import processes
 from uwblink import Contents
-
-CALIB = Path(sys.executable).parent / "calib"
 
 
 def saved(path, flight):
@@ -25,14 +20,10 @@ def test_the_recording_is_known_by_what_it_holds_and_not_by_its_name(tmp_path):
     assert calib.evaluate([train, test], found.calibration).seen == ("memory",)
 
     found.save(tmp_path / "c.json")
-    done = subprocess.run(
-        [CALIB, "evaluate", tmp_path / "c" / "flight.uwb", tmp_path / "b" / "flight.uwb", "-c", tmp_path / "c.json"],
-        capture_output=True,
-        text=True,
+    done = processes.run(
+        "calib", "evaluate", tmp_path / "c" / "flight.uwb", tmp_path / "b" / "flight.uwb", "-c", tmp_path / "c.json"
     )
     assert done.returncode == 0
     assert done.stderr.startswith("warning: the calibration was fitted to flight.uwb: ")
-    other = subprocess.run(
-        [CALIB, "evaluate", tmp_path / "b" / "flight.uwb", "-c", tmp_path / "c.json"], capture_output=True, text=True
-    )
+    other = processes.run("calib", "evaluate", tmp_path / "b" / "flight.uwb", "-c", tmp_path / "c.json")
     assert (other.returncode, other.stderr) == (0, "")

@@ -2,10 +2,7 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -13,9 +10,8 @@ import calib
 from calib.report.blocks import Heading, Text
 from calib.report.layout import SECTIONS
 from calib.samples import sample_flight
+from tests import processes
 from uwblink.recording.file import Recording
-
-BIN = Path(sys.executable).parent
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +32,7 @@ def test_it_is_what_the_command_makes(recordings, tmp_path):
     campaign = replace(campaign, origin=replace(campaign.origin, files={}))
     campaign.write(tmp_path / "python.html")
     words = ["report", "train.uwb", "--tests", "test.uwb", "-o", "command.html", "--loss", "huber", "--json"]
-    done = subprocess.run([BIN / "calib", *words], cwd=recordings, capture_output=True, text=True)
+    done = processes.run("calib", *words, cwd=recordings)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == json.loads(json.dumps(campaign.to_dict()))
     pages = [(tmp_path / "python.html").read_text(), (recordings / "command.html").read_text()]

@@ -4,7 +4,6 @@ import hashlib
 import re
 import shutil
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from pypdf import PdfReader
 from calib.cli.reporting import spread
 from calib.estimation.fitting import fit
 from calib.report.report import render
+from tests import processes
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 
@@ -56,11 +56,10 @@ def test_without_planted_truth_there_is_no_such_column():
 
 
 ROOT = Path(__file__).parents[3]
-BIN = Path(sys.executable).parent
 
 
 def run(*arguments, cwd):
-    done = subprocess.run([BIN / arguments[0], *arguments[1:]], capture_output=True, text=True, cwd=cwd)
+    done = processes.run(*arguments, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done
 

@@ -1,12 +1,11 @@
 """Motion-capture poses from files, and the offset of their clock."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests import processes
 from uwblink.errors import ImportTableError
 from uwblink.importers.motion_capture import add_poses
 from uwblink.importers.pose_columns import poses_of_table
@@ -145,8 +144,7 @@ def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, tmp_pat
     copy.write_bytes((flight / "f.uwb").read_bytes())
 
     def run(*words):
-        command = [str(Path(sys.executable).parent / "uwblink"), "poses", str(copy), *map(str, words)]
-        return subprocess.run(command, capture_output=True, text=True)
+        return processes.run("uwblink", "poses", copy, *words)
 
     assert "3320 of 3320 exchanges have a true distance" in run("--from", flight / "p.csv", "--offset", "-3.21").stdout
     for words, fragment in (

@@ -3,20 +3,17 @@
 import csv
 import gzip
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import duckdb
 import numpy as np
 import pytest
 
+from tests import processes
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers import import_recording, read_source
 from uwblink.importers.exchange_tables import read_table, read_tables
 from uwblink.recording.contents import load
 
-BIN = Path(sys.executable).parent
 TICKS = 128 * 499_200_000
 AIR = 299_702_547.0
 HEADER = ["time_s", "from_id", "to_id", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3", "fpp1", "fpp2"]
@@ -113,8 +110,7 @@ def test_several_files_are_one_table(tmp_path):
     same(read_tables(paths), rows[0::2] + rows[1::2])
     same(read_source(paths), rows[0::2] + rows[1::2])
     assert len(read_table(tmp_path).exchanges) == len(rows)
-    words = [BIN / "uwblink", "import", "csv", *paths, "-o", tmp_path / "o.uwb"]
-    done = subprocess.run([*map(str, words)], capture_output=True, text=True)
+    done = processes.run("uwblink", "import", "csv", *paths, "-o", tmp_path / "o.uwb")
     assert (done.returncode, done.stdout.splitlines()[0].split(": ")[1]) == (0, f"{len(rows)} exchanges")
     with pytest.raises(ArgumentError, match="found no files"):
         read_source([])

@@ -12,6 +12,7 @@ import pytest
 
 import calib
 import uwblink
+from tests import processes
 from tests.boards import bench_scenario, served
 from uwblink.boards import Progress
 from uwblink.errors import ArgumentError, PlanError, PortError
@@ -118,7 +119,7 @@ def test_ports_that_are_not_there_and_ranges_that_are_corrected_already(tmp_path
 
 
 def run(*words, **more):
-    return subprocess.run([str(BIN / "uwblink"), *map(str, words)], capture_output=True, text=True, timeout=120, **more)
+    return processes.run("uwblink", *words, timeout=120, **more)
 
 
 def test_the_command_prints_a_line_a_range(tmp_path, calibration):

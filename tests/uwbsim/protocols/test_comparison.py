@@ -2,13 +2,12 @@
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests import processes
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.protocols.comparison import calibrated, compare, costs, over_reply, over_skew, paper_bias_m, winners
 from uwbsim.protocols.conditions import conditions_of
@@ -20,13 +19,12 @@ from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate
 
 ROOT = Path(__file__).parents[3]
-BIN = Path(sys.executable).parent
 TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
 ROWS = list(PROTOCOLS.values())
 
 
 def run(*words):
-    return subprocess.run([BIN / "uwbsim", *map(str, words)], capture_output=True, text=True)
+    return processes.run("uwbsim", *words)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +180,7 @@ def test_predict_and_optimum_answer_in_words_and_json(tmp_path):
     ],
 )
 def test_what_cannot_be_is_one_line(tmp_path, words, fragments):
-    done = subprocess.run([BIN / "uwbsim", *map(str, words)], capture_output=True, text=True, cwd=tmp_path)
+    done = processes.run("uwbsim", *words, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1

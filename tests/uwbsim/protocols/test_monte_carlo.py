@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests import processes
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import COLUMNS, raw_range
@@ -38,16 +39,13 @@ def test_without_contention_the_stamps_are_those_of_the_event_loop(name):
 
 
 def test_the_command_can_do_without_contention(tmp_path):
-    import subprocess
-    import sys
-
     from uwblink.recording.file import Recording
 
     found = []
     for option in ("--contention", "--no-contention"):
-        words: list[str | Path] = [Path(sys.executable).parent / "uwbsim", "run", SCENARIOS / "noiseless.toml", option]
+        words: list[str | Path] = ["uwbsim", "run", SCENARIOS / "noiseless.toml", option]
         words += ["-o", tmp_path / f"{option}.uwb", "--set", "run.duration_s=3", "--set", "ranging.rate_hz=100"]
-        subprocess.run(words, check=True, capture_output=True)
+        assert processes.run(*words).returncode == 0
         with Recording.open(tmp_path / f"{option}.uwb") as recording:
             found.append(recording.exchanges())
     np.testing.assert_array_equal(found[0].rx3, found[1].rx3)

@@ -1,13 +1,12 @@
 """Scenarios of the world: what cannot be is one clear line, and what is named is read."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests import processes
 from uwblink.recording.file import Recording
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
@@ -19,7 +18,6 @@ from uwbsim.world.world import World
 ROOT = Path(__file__).parents[3]
 OFFICE = ROOT / "scenarios" / "nlos_office" / "office.toml"
 NOISELESS = ROOT / "scenarios" / "noiseless.toml"
-BIN = Path(sys.executable).parent
 
 
 def changed(tmp_path, old, new):
@@ -63,7 +61,7 @@ def changed(tmp_path, old, new):
 )
 def test_worlds_that_cannot_be(tmp_path, old, new, fragments):
     scenario = changed(tmp_path, old, new)
-    done = subprocess.run([BIN / "uwbsim", "run", scenario, "-o", tmp_path / "o.uwb"], capture_output=True, text=True)
+    done = processes.run("uwbsim", "run", scenario, "-o", tmp_path / "o.uwb")
     assert done.returncode == 2, done.stdout + done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
     for fragment in fragments:
@@ -163,7 +161,7 @@ def test_motion_capture_has_gaps_and_latency():
 
 def test_show_and_validate(tmp_path):
     def run(*words):
-        return subprocess.run([str(BIN / "uwbsim"), *map(str, words)], capture_output=True, text=True)
+        return processes.run("uwbsim", *words)
 
     assert run("show", OFFICE, "-o", tmp_path / "s.html").returncode == 0
     page = (tmp_path / "s.html").read_text()
@@ -183,9 +181,8 @@ def test_show_and_validate(tmp_path):
 def test_listed_success_counts_failures(tmp_path):
     flight = tmp_path / "f.uwb"
     aloha = ROOT / "scenarios" / "collisions" / "aloha.toml"
-    words = [BIN / "uwbsim", "run", aloha, "-o", flight, "--set", "run.duration_s=5"]
-    subprocess.run(words, check=True, capture_output=True)
-    done = subprocess.run([BIN / "uwblink", "show", flight, "--json"], capture_output=True, text=True)
+    assert processes.run("uwbsim", "run", aloha, "-o", flight, "--set", "run.duration_s=5").returncode == 0
+    done = processes.run("uwblink", "show", flight, "--json")
     shown = json.loads(done.stdout)
     with Recording.open(flight) as recording:
         assert sum(p["failed"] for p in shown["pairs"]) == recording.count("faults") > 0

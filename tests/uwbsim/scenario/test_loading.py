@@ -1,12 +1,11 @@
 """Scenario files: overrides, and the schema that is printed."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests import processes
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.loading import load
 
@@ -46,7 +45,7 @@ def test_overrides_that_lead_nowhere(text, fragment):
 
 
 def test_schema_is_json_schema_and_names_every_section():
-    done = subprocess.run([str(Path(sys.executable).parent / "uwbsim"), "schema"], capture_output=True, text=True)
+    done = processes.run("uwbsim", "schema")
     schema = json.loads(done.stdout)
     assert schema["type"] == "object"
     assert {"run", "ranging", "radio", "bodies", "tags", "mocap"} <= set(schema["properties"])
