@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.carriers import ClocksApart, clocks_apart, farthest
 from calib.errors import BadInputError, UnanswerableError
 from calib.single_sided import LeftSkew, left_skew, worst
 from uwblink.arrays import Bools, Floats, Ints
@@ -58,6 +59,7 @@ class Ranges:
     excluded: dict[str, int]
     planted: dict[str, Any] | None
     left_skew: LeftSkew | None = None
+    clocks_apart: ClocksApart | None = None
     recordings: tuple[tuple[str, str], ...] = ()
 
     @classmethod
@@ -97,6 +99,7 @@ class Ranges:
             excluded={},
             planted=dict(planted) if planted else None,
             left_skew=left_skew(exchanges),
+            clocks_apart=clocks_apart(exchanges),
         )
 
     @classmethod
@@ -205,9 +208,10 @@ class Ranges:
         return replace(self[keep], excluded=self.excluded | {r: n for r, n in excluded.items() if n})
 
 
-COLUMNS = tuple(
-    f.name for f in fields(Ranges) if f.name not in {"source", "excluded", "planted", "left_skew", "recordings"}
-)
+APART: Final = ("source", "excluded", "planted", "left_skew", "clocks_apart", "recordings")
+"""What is no column."""
+
+COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in APART)
 
 
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
@@ -219,6 +223,7 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         excluded={r: sum(p.excluded.get(r, 0) for p in parts) for r in reasons},
         planted=parts[0].planted,
         left_skew=worst([p.left_skew for p in parts]),
+        clocks_apart=farthest(p.clocks_apart for p in parts),
         recordings=tuple(one for p in parts for one in p.recordings),
         **columns,
     )

@@ -60,7 +60,7 @@ FLOORS = {
         ("cli",),
     ),
     "calib": (
-        ("densities", "errors", "samples", "single_sided", "spread"),
+        ("carriers", "densities", "errors", "samples", "single_sided", "spread"),
         ("error_mixture", "information", "ranges"),
         ("calibration", "sources"),
         ("evaluation",),

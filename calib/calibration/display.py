@@ -96,4 +96,5 @@ def _headline(calibration: Calibration) -> str:
     return (
         f"Calibration of {len(calibration.delays_ns)} tags{of}: {calibration.loss} loss, scale "
         f"{calibration.scale_ns:.3g} ns, {calibration.lift} power above {calibration.alpha_dbm:g} dBm"
+        f"{'; NOT SETTLED, its fit stopped' if calibration.stopped else ''}"
     )

@@ -148,6 +148,11 @@ class Calibration:
         write_text(Path(path), self.to_json(), force=force)
 
     @property
+    def stopped(self) -> bool:
+        """Whether the fit behind it stopped before it settled, so that delays and intervals are not final."""
+        return self.provenance.get("converged") is False
+
+    @property
     def needs_power(self) -> bool:
         """Whether ranges without any power cannot be corrected whole."""
         curves = [self.bias_curve, self.sigma_curve]

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from calib.evaluation import Evaluation
 
 from calib.cli.arguments import CalibrationFile, Figures, Force, Recordings
+from calib.cli.loading import known_calibration
 from uwblink.cli.guide import add, choice
 from uwblink.cli.waiting import waiting
 
@@ -59,7 +60,7 @@ def evaluate(
         from calib.report import check_places
 
         check_places(report, None, figures, force=force)
-    known = calib.load_calibration(calibration)
+    known = known_calibration(calibration)
     with waiting("evaluating"):
         parts = load_each(recordings, need_power=known.needs_power)
         evaluation = calib.evaluate(parts, known)
@@ -126,7 +127,7 @@ def localize(
         from calib.report import check_places, write_track_figures
 
         check_places(None, None, figures, force=force)
-    known = calib.load_calibration(calibration)
+    known = known_calibration(calibration)
     if model != "poses":
         _onboard(recordings, known, model, tum, figures, as_json=as_json, force=force)
         return
@@ -220,7 +221,7 @@ def compare(
         from calib.report import check_places, write_comparison_figures
 
         check_places(None, None, figures, force=force)
-    known = [calib.load_calibration(path) for path in (first, second)]
+    known = [known_calibration(path) for path in (first, second)]
     found = calib.compare(*known)
     if figures:
         write_comparison_figures(found, known, [first.stem, second.stem], figures, force=force)

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from calib.cli.arguments import CalibrationFile, Force
+from calib.cli.loading import known_calibration
 from uwblink.cli.guide import add, choice, epilog
 from uwblink.cli.waiting import waiting
 
@@ -58,7 +59,7 @@ def apply(
     import calib
 
     with waiting("correcting"):
-        applied = calib.apply(recording, calib.load_calibration(calibration), output, to=to, force=force)
+        applied = calib.apply(recording, known_calibration(calibration), output, to=to, force=force)
     typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
     if applied.unpowered:
         typer.echo(
@@ -86,7 +87,7 @@ def export(
     from calib.calibration import programmed
 
     registers = programmed(base) if base else None
-    text = calib.export(calib.load_calibration(calibration), to, output, base=registers, force=force)
+    text = calib.export(known_calibration(calibration), to, output, base=registers, force=force)
     if output is None:
         typer.echo(text, nl=False)
     else:

@@ -35,6 +35,7 @@ from calib.cli.arguments import (
     Truth,
 )
 from calib.cli.flags import with_flags
+from calib.cli.loading import STOPPED, known_calibration
 from uwblink.cli.guide import add, tags_of
 from uwblink.cli.waiting import waiting
 
@@ -117,7 +118,14 @@ def fit(
     result.save(output, force=force)
     if as_json:
         typer.echo(result.calibration.to_json(), nl=False)
-        return
+    else:
+        _tell(output, result)
+    if not result.success:
+        raise typer.Exit(STOPPED)
+
+
+def _tell(output: Path, result: calib.FitResult) -> None:
+    """Print what was found, and on standard error what is to be doubted."""
     found = result.calibration
     typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
     for line in delay_lines(found):
@@ -157,7 +165,7 @@ def add_tag(
 
     check_output(output, force=force)
     with waiting("fitting"):
-        found = calib.add_tag(recording, calib.load_calibration(calibration), tag)
+        found = calib.add_tag(recording, known_calibration(calibration), tag)
     found.save(output, force=force)
     half = 1.96 * found.delays_std_ns[tag]
     typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")

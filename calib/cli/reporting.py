@@ -31,6 +31,7 @@ from calib.cli.arguments import (
 )
 from calib.cli.evaluating import PANEL, tell_seen
 from calib.cli.flags import with_flags
+from calib.cli.loading import STOPPED
 from uwblink.cli.guide import add
 
 MANY: Final = "--tests"
@@ -123,11 +124,13 @@ def report(
         campaign.write(output, pdf, figures, force=force, progress=status.update)
     if as_json:
         typer.echo(json.dumps(campaign.to_dict(), indent=1))
-        return
-    for path in filter(None, (output, pdf, figures)):
-        typer.echo(f"report: {path}")
-    if tests:  # without any, the report itself says that the training was judged
-        tell_seen(campaign.evaluation)
-    findings = [f"{name}: {finding.fault}" for name, finding in campaign.findings]
-    for warning in [*campaign.fit.warnings, *findings]:
-        typer.echo(f"warning: {with_flags(warning)}", err=True)
+    else:
+        for path in filter(None, (output, pdf, figures)):
+            typer.echo(f"report: {path}")
+        if tests:  # without any, the report itself says that the training was judged
+            tell_seen(campaign.evaluation)
+        findings = [f"{name}: {finding.fault}" for name, finding in campaign.findings]
+        for warning in [*campaign.fit.warnings, *findings]:
+            typer.echo(f"warning: {with_flags(warning)}", err=True)
+    if not campaign.fit.success:
+        raise typer.Exit(STOPPED)

@@ -35,6 +35,8 @@ def limits(ranges: Ranges, problem: Problem, residuals_m: Floats, fixed: Mapping
             "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
             "cannot be said, and looks like antenna delays"
         )
+    if ranges.clocks_apart is not None:
+        yield str(ranges.clocks_apart)
     if unknowns.of_pairs:
         yield (
             f"{_pairs(len(problem.pairs.ends))}: antenna delays stay unknown, other pairs cannot be corrected, and "

@@ -18,14 +18,17 @@ def evaluate_flight(flight: Data) -> Mapping[str, Any]:
     `flight` is what `uwbsim.simulate` gives, or one of whatever else `load_ranges` takes. The row has the number of
     `exchanges` that could be used; mean, standard deviation and robust spread in metres of the errors of `raw`,
     `delays` and `full` ranges; `rejected`; and, beside what was planted, `delays_rms_ns`, `curve_rms_m` and
-    `correction_rms_m`, None where nothing was. Raises `UnanswerableError` where the flight cannot be fitted.
+    `correction_rms_m`, None where nothing was; and `settled`, 0 where the fit stopped before it did. Raises
+    `UnanswerableError` where the flight cannot be fitted.
     """
     ranges = load_ranges(flight)
-    found = evaluate(ranges, fit(ranges).calibration).to_dict()
+    result = fit(ranges)
+    found = evaluate(ranges, result.calibration).to_dict()
     overall, planted = found["overall"], found.get("planted") or {}
     row: dict[str, Any] = {"exchanges": overall["raw"]["n"]}
     for stage in ("raw", "delays", "full"):
         row |= {f"{stage}_{what}": overall[stage][what] for what in ("mean_m", "std_m", "robust_std_m")}
+    row["settled"] = int(result.success)
     row["rejected"] = overall["rejected"]
     delays = list((planted.get("delay_error_ns") or {}).values())
     row["delays_rms_ns"] = float(np.sqrt(np.mean(np.square(delays)))) if delays else None
