@@ -10,7 +10,7 @@ import numpy as np
 
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.clock_skews import IMPOSSIBLE_PPM, target_faster_ppm
+from uwblink.recording.relative_clocks import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals
 
