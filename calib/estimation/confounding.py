@@ -23,12 +23,17 @@ Tags on turning quadcopters leave a third and more, an anchor on a pole and a bo
 """
 
 
+def some_of(count: int) -> slice:
+    """Return which of so many ranges are looked at."""
+    return slice(None, None, max(count // ENOUGH, 1))
+
+
 def explained_by_distance(lifted: Floats, truth_m: Floats) -> float | None:
     """Return the share of the variance of lifted powers (n,) that distance explains, where it is too much, else None.
 
     A curve over power then learns what belongs to distance.
     """
-    every = slice(None, None, max(len(lifted) // ENOUGH, 1))
+    every = some_of(len(lifted))
     lifted, truth_m = lifted[every], truth_m[every]
     good = np.isfinite(lifted) & np.isfinite(truth_m) & (truth_m > 0)
     if np.count_nonzero(good) < FEWEST or np.ptp(truth_m[good]) < SHORTEST_M:

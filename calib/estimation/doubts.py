@@ -68,7 +68,7 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
         found.delays,
         kept(blocks),
         seconds,
-        tested=list(tested),
+        tested=tested,
         shape_m=kept(_of_another_shape(problem, found)),
     )
     covariance = plain + judged.widening_ns2

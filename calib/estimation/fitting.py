@@ -36,7 +36,7 @@ from calib.estimation.pairs import pairs_of
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.result import FitResult
-from calib.estimation.solver import Solved, solve
+from calib.estimation.solver import Ended, Solved, solve
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
 from calib.ranges import Ranges
@@ -131,7 +131,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             minimum_norm=minimum_norm,
             sequential=sequential,
             unknowns=Unknowns(curve=not delays_only, constants=constants),
-        )
+        ).without_readings()
         reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
         found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)
         if found.astray:
@@ -144,20 +144,23 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         calibration = calibration_of(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
         stds = std_taken_over(source, set(fixed) - set(pinned))
         calibration = replace(calibration, delays_std_ns=calibration.delays_std_ns | stds)
+        # Of the search no more than this is asked from here on.
+        problem, ended = problem.without_design(), found.ended
+        del found
         # What errors are made of is known now, and of no use for the residuals.
         applied = replace(calibration, errors=None).apply(ranges)
         residuals = applied.corrected_m - ranges.truth_m
         inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
         warnings = [
             *limits(ranges, problem, residuals, fixed),
-            *_stopped(found),
+            *_stopped(ended),
             *doubted.sentences,
             *skewed,
             *implausible(calibration.delays_ns, residuals),
             *_beyond(reference, alpha_dbm, problem),
             *warnings_of(ranges, applied, float(np.mean(inliers)), problem.free),
         ]
-        provenance = _provenance(ranges, inliers, fixed, sequential, problem, found, warnings, reference)
+        provenance = _provenance(ranges, inliers, fixed, sequential, problem, ended, warnings, reference)
         provenance["error_std_m"] = {
             "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
             "corrected": float(np.std(residuals)),
@@ -167,8 +170,8 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             ranges=ranges,
             residuals_m=residuals,
             inliers=inliers,
-            success=found.success,
-            message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
+            success=ended.success,
+            message=f"{'converged' if ended.success else 'stopped'} after {ended.steps} steps",
             warnings=warnings,
         )
 
@@ -202,10 +205,10 @@ def _lifted(power_dbm: float, alpha_dbm: float) -> float:
     return float(lift_power(np.array(power_dbm), alpha_dbm))
 
 
-def _stopped(found: Solved) -> list[str]:
-    if found.success:
+def _stopped(ended: Ended) -> list[str]:
+    if ended.success:
         return []
-    return [f"the fit stopped after {found.steps} steps before it settled: delays and intervals are not final"]
+    return [f"the fit stopped after {ended.steps} steps before it settled: delays and intervals are not final"]
 
 
 def _beyond(reference: float | None, alpha_dbm: float, problem: Problem) -> list[str]:
@@ -317,7 +320,7 @@ def _provenance(
     fixed: dict[int, float],
     sequential: bool,
     problem: Problem,
-    found: Solved,
+    ended: Ended,
     warnings: list[str],
     reference: float | None,
 ) -> dict[str, Any]:
@@ -337,8 +340,8 @@ def _provenance(
         "excluded": ranges.excluded,
         "recipe": "sequential" if sequential else "joint",
         "fitted": problem.unknowns.told(len(problem.tags)),
-        "converged": found.success,
-        "standard_errors": f"sandwich over {found.lasting.stretches:.0f} independent stretches of time",
+        "converged": ended.success,
+        "standard_errors": f"sandwich over {ended.stretches:.0f} independent stretches of time",
         "warnings": warnings,
         "gauge": _gauge(problem, reference),
     }

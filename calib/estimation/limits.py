@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
-from calib.estimation.confounding import explained_by_distance
+from calib.estimation.confounding import explained_by_distance, some_of
 from calib.estimation.pairs import pairs_of
 from calib.estimation.problem import Problem
 from calib.ranges import NO_STAMPS, Ranges
@@ -42,7 +42,8 @@ def limits(ranges: Ranges, problem: Problem, residuals_m: Floats, fixed: Mapping
             f"{_pairs(len(problem.pairs.ends))}: antenna delays stay unknown, other pairs cannot be corrected, and "
             "what else is constant in the ranges of a pair (an obstacle, a wrong lever arm) is in its constant"
         )
-    share = explained_by_distance(_lifted(ranges), ranges.truth_m) if unknowns.curve else None
+    some = ranges[some_of(len(ranges))]
+    share = explained_by_distance(_lifted(some), some.truth_m) if unknowns.curve else None
     if share is not None:
         yield (
             f"distance explains {100 * share:.0f} % of the power's variance: the curve may hold what belongs to "

@@ -8,7 +8,7 @@ as far as pairs close (quadruples of pairs over four tags); with three tags noth
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -94,11 +94,14 @@ class Judgement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tested:
-    """A family's efficient slopes: sums (k,), their covariance (k, k), information (k, k), effects (tags, k) in ns/m.
+    """A family's kind and names, and its efficient slopes: sums (k,), their covariance (k, k), information (k, k), and
+    effects (tags, k) in ns/m.
 
     `whole` is the largest information that an alternative would have, were nothing else fitted.
     """
 
+    kind: str
+    names: list[str]
     total: Floats
     covariance: Floats
     information: Floats
@@ -161,7 +164,7 @@ def examine(
     blocks: Ints,
     seconds: float,
     *,
-    tested: list[Family],
+    tested: Iterable[Family],
     shape_m: Floats,
 ) -> Judgement:
     """Hold a fit against alternatives.
@@ -171,16 +174,14 @@ def examine(
     into delays in ns. `shape_m` (n,) is by how much ranges would be off, were the shape that the fit takes for the tail
     of reflections another one. Rows are in the order in which the design keeps them.
     """
-    found, several, results = [], sum(len(family.names) for family in tested), {}
     effect = -delays @ (scores.linked(shape_m, *everywhere(scores)) @ inverse)[0, : delays.shape[1]]
     widening = np.outer(effect, effect)
-    for family in tested:
-        result = _test(family, scores, own, inverse, delays, blocks, seconds)
-        results[family.kind] = result
-        if family.kind == "pair":
-            widening += _spread_of_pairs(result)
-        found += list(_findings(family, result, several))
-    found += list(_of_gain(found, tested, results))
+    # One family at a time: each has columns of its own.
+    results = [_test(family, scores, own, inverse, delays, blocks, seconds) for family in tested]
+    several = sum(len(result.names) for result in results)
+    found = [finding for result in results for finding in _findings(result, several)]
+    widening += sum(_spread_of_pairs(result) for result in results if result.kind == "pair")
+    found += list(_of_gain(found, results))
     return Judgement(findings=sorted(found, key=lambda finding: -abs(finding.deviation)), widening_ns2=widening)
 
 
@@ -190,18 +191,19 @@ def everywhere(scores: Scores) -> tuple[Runs, list[tuple[Ints, float]], int]:
     return runs, [(np.zeros_like(runs.block), 1.0)], 1
 
 
-def _of_gain(found: list[Finding], tested: list[Family], results: dict[str, Tested]) -> Iterator[Finding]:
+def _of_gain(found: list[Finding], results: list[Tested]) -> Iterator[Finding]:
     """Yield wrong decibels of tags whose errors go with power in another way, where they suggest such.
 
     How errors go with power says that a tag is not as the others, decibels what that does to its delay.
     """
-    names = next((family.names for family in tested if family.kind == "decibels"), [])
+    result = next((result for result in results if result.kind == "decibels"), None)
+    names = result.names if result else []
     certain = {name for finding in found if finding.kind == "decibels" for name in finding.names}
     for finding in found:
         name = finding.names[0]
-        if finding.kind != "power" or name not in names or name in certain:
+        if result is None or finding.kind != "power" or name not in names or name in certain:
             continue
-        result, k = results["decibels"], names.index(name)
+        k = names.index(name)
         known = max(float(result.information[k, k]), 1e-300)
         offset = float(result.total[k]) / known
         if known > REACHED * result.whole and abs(offset) > SUGGESTED * np.sqrt(result.covariance[k, k]) / known:
@@ -232,6 +234,8 @@ def _test(
     # What an alternative does must not pass for errors that last: those are judged within spans of time.
     lasting = persistence(_spans(efficient, segments(seconds) if family.kind == "time" else SPANS), seconds, int(free))
     return Tested(
+        kind=family.kind,
+        names=family.names,
         total=efficient.sum(axis=0),
         covariance=lasting.factor * (efficient.T @ efficient),
         information=information,
@@ -268,7 +272,7 @@ def _spread_of_pairs(result: Tested) -> Floats:
     return np.asarray(variance * result.effects @ result.effects.T)
 
 
-def _findings(family: Family, result: Tested, several: int) -> Iterator[Finding]:
+def _findings(result: Tested, several: int) -> Iterator[Finding]:
     """Yield the alternatives that stand out, one after the other, each beside those already found."""
     from scipy.special import stdtrit
 
@@ -285,9 +289,9 @@ def _findings(family: Family, result: Tested, several: int) -> Iterator[Finding]
         offset = float(total[top] / information[top, top])
         alike = np.abs(covariance[top] / (std[top] * std)) > SAME
         close = alike & known & (np.abs(deviation) > SAME * abs(deviation[top]))
-        names = tuple(dict.fromkeys(family.names[k] for k in np.flatnonzero(close)))
+        names = tuple(dict.fromkeys(result.names[k] for k in np.flatnonzero(close)))
         yield Finding(
-            kind=family.kind,
+            kind=result.kind,
             names=names,
             offset_m=-offset,
             deviation=float(deviation[top]),

@@ -83,6 +83,27 @@ class Problem:
         share = self.shares[group]
         return np.ones(len(self.error)) if share is None else share
 
+    def without_readings(self) -> Problem:
+        """Return the problem without the columns of ranges that are in errors and design by now.
+
+        Times, ends and true distances stay; millions of the rest need not be there twice.
+        """
+        nothing = np.broadcast_to(np.nan, len(self.error))
+        bare = replace(
+            self.ranges,
+            protocol=np.broadcast_to(np.array(""), len(self.error)),
+            raw_m=nothing,
+            weight_initiator=nothing,
+            weight_target=nothing,
+            fpp1_dbm=nothing,
+            fpp2_dbm=nothing,
+        )
+        return replace(self, ranges=bare)
+
+    def without_design(self) -> Problem:
+        """Return the problem for those who only ask what was looked for, and at which powers."""
+        return replace(self, error=self.error[:0], design=self.design.sample(slice(0, 0)))
+
     @property
     def rank(self) -> int:
         """Return how many parameters stand for delays."""

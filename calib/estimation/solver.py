@@ -35,6 +35,15 @@ FIRST_SMOOTHNESS: Final = 1e-6
 """Of the pilot's curve, before the data are asked: a row's share of the penalty's trace."""
 
 
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a search ended: whether it settled, after how many steps, and on how many independent stretches of time."""
+
+    success: bool
+    steps: int
+    stretches: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solved:
     """Parameters (m,) and their covariance (m, m), stated by the gauge, and how it ended.
@@ -61,6 +70,11 @@ class Solved:
     lasting: Persistence
     mixture: PairMixture | None = None
     astray: bool = False
+
+    @property
+    def ended(self) -> Ended:
+        """Return how it ended."""
+        return Ended(self.success, self.steps, self.lasting.stretches)
 
 
 def solve(
