@@ -271,6 +271,9 @@ def test_calibrations_of_other_tags_and_versions(tmp_path, flight):
     huge = document | {"delays_ns": document["delays_ns"] | {"3": 10**400}}
     (tmp_path / "c.json").write_text(json.dumps(huge))
     refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "delays_ns: 3", "a finite number")
+    huge = document | {"delays_ns": document["delays_ns"] | {"9" * 5000: 0.1}}
+    (tmp_path / "c.json").write_text(json.dumps(huge))
+    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "delays_ns", "tag ids as keys")
     document["uncertainty"]["bias_m2"] = [[1.0]]
     (tmp_path / "c.json").write_text(json.dumps(document))
     refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "uncertainty", "bias_m2", "rows")

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.calibration.json_format import Reader
+from calib.calibration.json_format import Reader, is_tag
 from calib.calibration.power_curves import Curve
 from calib.densities import ROOT_2PI, densities
 from calib.errors import BadInputError
@@ -260,7 +260,7 @@ def read_errors(read: Reader) -> ErrorModel:
 
 def _is_pair(name: str) -> bool:
     ends = name.split("-")
-    return len(ends) == 2 and all(end.isascii() and end.isdecimal() for end in ends)
+    return len(ends) == 2 and all(map(is_tag, ends))
 
 
 def _pair(read: Reader) -> PairErrors:

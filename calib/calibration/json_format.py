@@ -7,8 +7,14 @@ from typing import Any
 
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
+from uwblink.twr import LARGEST_ID
 
 Matrix = tuple[tuple[float, ...], ...]
+
+
+def is_tag(text: str) -> bool:
+    """Whether a text is the id of a tag, as keys of calibrations are."""
+    return text.isascii() and text.isdecimal() and len(text) < 9 and int(text) <= LARGEST_ID
 
 
 class Reader:
@@ -61,7 +67,7 @@ class Reader:
         """Return numbers by tag; `missing` stands for null, which is wrong by default."""
         table = self.table(key)
         inner = Reader(table, f"{self._where}: {key}")
-        if not all(tag.isdecimal() and tag.isascii() for tag in table):
+        if not all(map(is_tag, table)):
             raise self.wrong(key, "tag ids as keys")
         return {
             int(tag): missing if value is None and missing is not None else inner.number(tag)

@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from calib.calibration.json_format import Reader
+from calib.calibration.json_format import Reader, is_tag
 from calib.errors import BadInputError
 from calib.ranges import Ranges
 from uwblink.arrays import Floats
@@ -62,7 +62,7 @@ def offsets_from(read: Reader) -> dict[tuple[int, int], PairOffset]:
     inner, found = read.inside("pair_offsets"), {}
     for key in read.table("pair_offsets"):
         first, between, second = key.partition(BETWEEN)
-        if not (between and all(part.isdecimal() and part.isascii() for part in (first, second))):
+        if not (between and is_tag(first) and is_tag(second)):
             raise BadInputError(f"pair_offsets: found {key[:40]!r}, expected two tag ids, as in 1-2")
         one = inner.inside(key)
         pair = sorted((int(first), int(second)))

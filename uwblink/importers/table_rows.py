@@ -246,7 +246,7 @@ def _numbered(
     text = {n: words[n] if n in words else _as_words(cells[n]) for n in IDS if n in cells or n in words}
     distinct = sorted({name for column in text.values() for name in np.unique(column).tolist()} - {""})
     numbers = dict(column_map.ids)
-    numbers |= {n: int(n) for n in distinct if n not in numbers and n.isdecimal() and int(n) <= LARGEST_ID}
+    numbers |= {n: int(n) for n in distinct if n not in numbers and _is_tag(n)}
     free = iter(sorted(set(range(1, LARGEST_ID + 1)) - set(numbers.values())))
     for name in distinct:
         if name not in numbers:
@@ -263,7 +263,7 @@ def _numbered(
 def _mostly_empty(words: dict[str, NDArray[np.str_]]) -> bool:
     """Whether what is no number is nothing: empty cells are faults, not names."""
     filled = np.concatenate([column[column != ""] for column in words.values()])
-    return all(name.isdecimal() and int(name) <= LARGEST_ID for name in np.unique(filled).tolist())
+    return all(map(_is_tag, np.unique(filled).tolist()))
 
 
 def _as_words(cells: Floats) -> NDArray[np.str_]:
@@ -282,3 +282,8 @@ def take(rows: Rows, chosen: Ints) -> Rows:
         row=rows.row[chosen],
         origin=rows.origin[chosen],
     )
+
+
+def _is_tag(text: str) -> bool:
+    # Texts of thousands of digits are no numbers to Python, either.
+    return text.isdecimal() and len(text) < 9 and int(text) <= LARGEST_ID

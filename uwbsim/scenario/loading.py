@@ -129,7 +129,7 @@ def _step(node: Any, step: str, key: str) -> Any:
 
 
 def _index(node: list[Any], step: str, key: str) -> int:
-    if step.isdecimal() and int(step) < len(node):
+    if step.isdecimal() and len(step) < 9 and int(step) < len(node):
         return int(step)
     raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}")
 
