@@ -2,15 +2,17 @@
 
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uwblink.errors import ArgumentError
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.ticks import METRES_PER_TICK, TICK_S, elapsed
-from uwblink.twr import Exchanges, delay_weights, time_of_flight, truncate4
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed, seconds
+from uwblink.twr import Exchanges, board_range, delay_weights, raw_range, time_of_flight, truncate4, without_stamps
 
 
 def initiator_stamps(protocol):
@@ -132,3 +134,41 @@ def test_degenerate_stamps_make_no_range_and_no_warning(protocol):
     none = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[9], tx2=[9], rx2=[50], tx3=[9], rx3=[70], protocol=protocol)
     found = time_of_flight(none)
     assert protocol != "ds" or not np.isfinite(found[0])
+
+
+def test_ticks_are_seconds_of_the_counter_s_clock():
+    # 2^40 ticks are 17.2 s (DW1000 User Manual, section 7.2.8).
+    assert seconds([0, 1, 2**40]).tolist() == [0.0, 1 / 63_897_600_000, pytest.approx(17.2074, abs=1e-4)]
+
+
+def test_boards_print_single_sided_ranges_of_whole_ticks_and_cut_all_of_them():
+    def printed(rx2, protocol, **third):
+        stamps: Any = {"tx1": [0], "rx1": [1000], "tx2": [101_000], "rx2": [rx2]}
+        return board_range(Exchanges.from_arrays(1, 2, **stamps, **third, protocol=protocol))[0]
+
+    # (102 001 - 100 000)/2 = 1000.5 ticks: 1000 of 4.690357 mm are 4.69035..., and half a tick more of ds is kept.
+    assert printed(102_001, "ss") == 4.6903
+    assert printed(102_000, "ss") == 4.6903
+    assert printed(102_001, "ds", tx3=[201_000], rx3=[202_001]) == 4.6927
+    # Towards zero from below, too: -0.5 ticks are none, -1.5 are one.
+    assert printed(99_999, "ss") == 0.0
+    assert printed(99_997, "ss") == -0.0046
+
+
+def test_a_row_without_any_stamp_has_the_range_that_was_reported():
+    stamps: Any = {"tx1": [0, 0, 0, 0], "rx1": [0, 5, 0, 0], "tx2": [0, 1005, 0, 2000], "rx2": [0, 3000, 3000, 5000]}
+    e = Exchanges.from_arrays(1, 2, **stamps, range_m=[7.5, 9.0, 9.0, 9.0])
+    assert without_stamps(e).tolist() == [True, False, False, False]
+    expected = [7.5, *(np.array([1000.0, 1500.0, 1500.0]) * METRES_PER_TICK)]
+    np.testing.assert_allclose(raw_range(e), expected, rtol=1e-12)
+    np.testing.assert_allclose(time_of_flight(e)[0], 7.5 / SPEED_OF_LIGHT, rtol=1e-12)
+
+
+def test_a_stamp_that_is_too_long_says_that_wider_ones_need_bits():
+    stamps: Any = {"tx1": [2**32], "rx1": [5], "tx2": [1005], "rx2": [3000]}
+    with pytest.raises(ArgumentError, match="stamps of 40 bits need bits=40"):
+        Exchanges.from_arrays(1, 2, **stamps)
+    assert Exchanges.from_arrays(1, 2, **stamps, bits=40).tx1[0] == 2**32
+    with pytest.raises(ArgumentError) as caught:
+        Exchanges.from_arrays(1, 2, **stamps | {"tx1": [2**40]}, bits=40)
+    assert "need bits" not in str(caught.value)

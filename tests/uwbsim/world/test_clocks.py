@@ -86,3 +86,19 @@ def test_the_noises_of_two_clocks_have_nothing_to_do_with_each_other():
     steps = [np.diff(c.noise.phase(np.full(len(time), k), time)) for k in (0, 1)]
     # 100 000 independent pairs know a correlation to 0.003.
     assert abs(np.corrcoef(*steps)[0, 1]) < 0.015
+
+
+def test_the_walk_goes_on_to_its_last_step_and_stands_from_there():
+    c = clocks(skews=(0.0, 0.0), drift=0.1, duration=5.0)
+    tenth = SUBTICKS_PER_SECOND // 10
+    last = c.walk_rate.shape[1] - 2
+    assert last == 50 + 20 - 1, "two seconds beyond the run: the last exchange may end after it"
+    steps = np.arange(last + 30)
+    which = np.zeros(len(steps), dtype=np.int64)
+    expected = c.walk_rate[0, np.minimum(steps, last)]
+    np.testing.assert_array_equal(c.rate(which, steps * tenth + tenth // 2), expected)
+    assert len(np.unique(expected)) == last + 1, "every step has a rate of its own"
+    # The clock's reading is the integral of it, across the end, too; before the run it is as at its first step.
+    read = c.read(which, steps * tenth) - c.offset[0] - steps * tenth
+    np.testing.assert_allclose(np.diff(read), expected[:-1] * tenth, atol=2)
+    assert c.rate(which[:1], np.array([-5 * tenth]))[0] == c.walk_rate[0, 0]

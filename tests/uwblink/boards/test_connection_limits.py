@@ -1,0 +1,180 @@
+"""The bounds of a conversation: what a board may be told, how long it is waited for, and when it is left alone."""
+
+import pytest
+
+from tests.uwblink.boards.test_connection import OTHER, REPORT, asked
+from uwblink.boards.connection import ANSWER_S, DEAD, FENCE, PATIENT_S, Connection, checked
+from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
+from uwblink.wire import messages as m
+from uwblink.wire.codec import encode
+
+CIR = encode(m.Cir(1, 2, 747_015, tuple(range(1016))))
+
+
+@pytest.mark.parametrize(("delay", "good"), [(279, False), (280, True), (6500, True), (6501, False)])
+def test_response_delays_have_the_bounds_at_which_exchanges_still_succeed(delay, good):
+    if good:
+        assert checked(m.SetResponseDelay(delay)) == b"C08|%d\r" % delay
+        return
+    with pytest.raises(RefusedError, match=rf"response delay {delay}: allowed are 280 to 6500"):
+        checked(m.SetResponseDelay(delay))
+
+
+@pytest.mark.parametrize(("number", "good"), [(9999.0, True), (-9999.0, True), (9999.1, False), (float("nan"), False)])
+def test_numbers_that_overflow_the_board_s_buffer_are_not_sent(number, good):
+    command = m.DoTests(1, "a", True, number, b"")
+    if good:
+        assert checked(command) == encode(command)
+        return
+    with pytest.raises(RefusedError, match="overwrites the board's memory"):
+        checked(command)
+
+
+@pytest.mark.parametrize(("length", "good"), [(57, True), (58, False)])
+def test_a_broadcast_fits_one_packet(length, good):
+    if good:
+        assert len(checked(m.Broadcast(bytes(length)))) == 64
+        return
+    with pytest.raises(RefusedError, match="at most 57 fit; a command must fit one USB packet of 64 bytes"):
+        checked(m.Broadcast(bytes(length)))
+
+
+def test_any_command_fits_one_packet():
+    fits = m.DoTests(1, "a" * 47, True, 1.0, b"")
+    assert len(checked(fits)) == 64
+    with pytest.raises(RefusedError, match="DoTests of 65 bytes"):
+        checked(m.DoTests(1, "a" * 48, True, 1.0, b""))
+    with pytest.raises(RefusedError, match="IdReport is not a command"):
+        checked(m.IdReport(1))
+    with pytest.raises(RefusedError, match="C05 target"):
+        checked(m.RangeCommand(300))
+
+
+def test_a_command_is_waited_for_150_ms_and_a_fence_in_doubt_a_second():
+    connection = Connection("port")
+    assert (connection.busy, connection.deadline_s()) == (False, None)
+    connection.send(FENCE, 5.0)
+    assert (connection.busy, connection.deadline_s()) == (True, 5.0 + ANSWER_S)
+    assert connection.expire(5.0 + ANSWER_S - 1e-9) is None
+    assert connection.expire(5.0 + ANSWER_S).reply is None
+    assert connection.doubtful
+    assert connection.expire(9.0) is None
+    connection.send(FENCE, 10.0)
+    assert connection.deadline_s() == 10.0 + PATIENT_S
+    silent = connection.expire(11.0)
+    assert str(silent.error).endswith(f"within 1000 ms; heard nothing; {DEAD}")
+    connection.send(m.GetId(), 12.0)
+    assert connection.deadline_s() == 12.0 + ANSWER_S
+    assert DEAD not in str(connection.expire(13.0).error)
+
+
+def test_a_patient_connection_stays_patient():
+    connection = Connection("port", answer_s=2.0)
+    connection.send(FENCE, 0.0)
+    assert connection.deadline_s() == 2.0
+    connection.expire(2.0)
+    connection.send(FENCE, 3.0)
+    assert connection.deadline_s() == 5.0
+    connection.settled()
+    assert not connection.doubtful
+
+
+def test_the_last_60_bytes_are_quoted():
+    connection = asked()
+    connection.receive(b"\xff" + b"a" * 40, 0.01)
+    connection.receive(b"b" * 21, 0.02)
+    error = connection.expire(1.0).error
+    assert isinstance(error, NoAnswerError)
+    assert str(error).endswith("heard '" + "a" * 39 + "b" * 21 + "'")
+
+
+def test_a_fence_that_is_answered_settles_what_was_in_doubt():
+    connection = asked()
+    connection.expire(1.0)
+    connection.send(FENCE, 2.0)
+    _, outcome = connection.receive(b"R00\r\n", 2.1)
+    assert outcome.reply == m.IdleSet()
+    assert outcome.error is None
+    assert (connection.doubtful, connection.busy) == (False, False)
+
+
+def test_reports_after_the_outcome_or_without_a_command_are_late():
+    connection = asked()
+    _, outcome = connection.receive(REPORT + OTHER, 0.1)
+    assert outcome.reply.neighbour == 2
+    assert connection.late == 1
+    connection.receive(REPORT + REPORT.replace(b"R05", b"S05"), 0.2)
+    assert connection.late == 2, "the target's own report answers nobody, and is late for nobody"
+
+
+def test_the_first_of_two_replies_is_the_outcome():
+    connection = asked(m.GetId())
+    _, outcome = connection.receive(b"R01|4\r\nR01|5\r\n", 0.1)
+    assert outcome.reply == m.IdReport(4)
+
+
+def test_only_an_impulse_response_that_was_asked_for_keeps_the_board_quiet():
+    connection = asked(m.RangeCommand(2))
+    connection.receive(REPORT, 1.0)
+    assert connection.ready_s(1.0) == 0.0
+    with_cir = asked(m.RangeCommand(2, get_cir=True))
+    with_cir.receive(REPORT, 1.0)
+    assert with_cir.ready_s(1.0) == pytest.approx(0.030)
+    assert with_cir.ready_s(1.02) == pytest.approx(0.010)
+    # Once it is there, the report of a target may follow within 3 ms.
+    with_cir.receive(CIR, 1.01)
+    assert with_cir.ready_s(1.01) == pytest.approx(0.003)
+    assert with_cir.ready_s(1.02) == 0.0
+
+
+def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
+    connection = Connection("port")
+    connection.receive(CIR[:400], 2.0)
+    assert connection.ready_s(2.0) == pytest.approx(0.005)
+    assert connection.ready_s(2.004) == pytest.approx(0.001)
+    connection.receive(b"", 2.004)
+    assert connection.ready_s(2.004) == pytest.approx(0.001), "nothing came"
+    connection.receive(CIR[400:800], 2.004)
+    assert connection.ready_s(2.004) == pytest.approx(0.005)
+    connection.leave_alone(2.5)
+    assert connection.ready_s(2.4) == pytest.approx(0.1)
+    connection.receive(CIR[800:], 2.41)
+    assert connection.ready_s(2.41) == pytest.approx(0.003)
+
+
+def test_being_left_alone_is_never_cut_short():
+    connection = Connection("port")
+    connection.leave_alone(3.0)
+    connection.leave_alone(2.0)
+    assert connection.ready_s(2.5) == pytest.approx(0.5)
+    assert connection.ready_s(3.5) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [(m.RangeCommand(2), "ranging with 2"), (m.Broadcast(b"x"), "the broadcast")],
+)
+def test_what_failed_is_named_and_each_line_quoted_once(command, what):
+    connection = asked(command)
+    warned = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
+    assert connection.receive(warned + warned, 0.01)[1] is None
+    outcome = connection.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.02)[1]
+    assert isinstance(outcome.error, RangingFailedError)
+    assert str(outcome.error).startswith(f"port: {what} failed; the board says: WARNING")
+    assert str(outcome.error).count("WARNING") == 1
+    assert (outcome.reply, connection.busy) == (None, False)
+    assert not connection.doubtful
+
+
+def test_a_report_answers_only_who_asked_for_that_target_and_that_protocol():
+    single = REPORT.replace(b"|1332123700|2454699099|", b"|0|0|")
+    connection = asked(m.RangeCommand(2, double_sided=False))
+    assert connection.receive(OTHER.replace(b"|1332123700|2454699099|", b"|0|0|"), 0.01)[1] is None
+    assert connection.receive(single, 0.02)[1].reply.tx3 == 0
+    both = asked(m.RangeCommand(2))
+    assert both.receive(single, 0.01)[1] is None
+    assert both.late == 1
+    assert both.receive(REPORT, 0.02)[1].reply.tx3 != 0
+    other = asked(m.GetId())
+    assert other.receive(REPORT, 0.01)[1] is None
+    assert other.late == 0, "nobody's report while another command is out is no reply to it"
