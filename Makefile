@@ -50,6 +50,9 @@ lowest newest: ## run the whole test suite on the lowest versions that pyproject
 fuzz: setup ## run commands on 2000 damaged files and options (10 minutes)
 	$(BIN)/python -m tests.fuzz.commands
 
+mutants: setup ## put faults into the code, 40 a file, and name those that no test notices (30 minutes)
+	$(BIN)/python -m tests.mutants --each 40
+
 lint: setup ## check style (ruff) and types (mypy)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

@@ -27,7 +27,7 @@ from _pytest.runner import runtestprotocol
 
 from tests.mutants.operators import Mutant
 
-KILLED, SURVIVED = 1, 0
+KILLED, SURVIVED, BROKEN = 1, 0, 99
 MOST_BYTES: Final = 4_000_000_000
 LONGEST_TESTS_S: Final = 40.0
 """How long the tests of one fault took on sound code, at most; the slower of many that reach a line are left out."""
@@ -56,7 +56,10 @@ class Reach(NamedTuple):
 
 
 def in_fork(work: Callable[[], int], longest_s: float) -> int:
-    """Do work in a fork; returns its status, and `KILLED` where it does not end in time."""
+    """Do work in a fork; returns `KILLED` or `SURVIVED`, the former where it does not end in time.
+
+    Raises `SystemExit` where the work itself cannot be done.
+    """
     sys.stdout.flush()
     child = os.fork()
     if not child:
@@ -66,6 +69,7 @@ def in_fork(work: Callable[[], int], longest_s: float) -> int:
             resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
             status = work()
         except BaseException:
+            status = BROKEN
             traceback.print_exc(file=sys.__stderr__)
         finally:
             os._exit(status)
@@ -73,6 +77,8 @@ def in_fork(work: Callable[[], int], longest_s: float) -> int:
     while time.monotonic() < until:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
+            if os.waitstatus_to_exitcode(status) == BROKEN:
+                raise SystemExit("the tests could not be run")
             return KILLED if os.waitstatus_to_exitcode(status) else SURVIVED
         time.sleep(0.01)
     os.killpg(child, signal.SIGKILL)
