@@ -83,6 +83,9 @@ bench-import: setup ## measure how long tables and poses take to come in (2 minu
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy
 
+campaigns: setup ## what a training flight needs, into docs/tutorials/motion-capture.md (5 minutes)
+	$(BIN)/python -m benchmarks.campaigns
+
 worlds: setup ## fits in worlds that share nothing with the simulator, into docs/accuracy.md (20 minutes)
 	$(BIN)/python -m benchmarks.worlds_report
 

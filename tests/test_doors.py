@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import pkgutil
 from pathlib import Path
 
 import pytest
@@ -86,3 +87,17 @@ def test_what_the_door_of_a_room_offers_is_there(package):
         assert len(names) == len(set(names))
         for name in names:
             assert getattr(module, name) is not None
+
+
+def rooms(package):
+    """A package and its rooms, by the names that import them."""
+    path = importlib.import_module(package).__path__
+    return [package, *(f"{package}.{room.name}" for room in pkgutil.iter_modules(path) if room.ispkg)]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_name_at_a_door_is_that_of_a_module_behind_it(package):
+    """Importing such a module, from anywhere, would put it in the place of what the door offers."""
+    for room in rooms(package):
+        modules = {found.name for found in pkgutil.iter_modules(importlib.import_module(room).__path__)}
+        assert sorted(modules & offered(room)) == [], room

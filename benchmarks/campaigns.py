@@ -1,0 +1,127 @@
+"""What a training flight needs: length, room, motion and pairs, planted beside fitted, into a tutorial's table.
+
+`python -m benchmarks.campaigns` writes it into docs/tutorials/motion-capture.md. Every flight is that of
+scenarios/icra2023/train.toml with one thing changed; what it gives is judged on the test flight, which is not changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import calib
+import uwbsim
+
+PAGE: Final = Path("docs/tutorials/motion-capture.md")
+FLIGHTS: Final = Path("scenarios/icra2023")
+LENGTH_S: Final = 60.0
+COLUMNS: Final = (
+    "the training flight",
+    "ranges",
+    "delays off by, rms",
+    "half of their 95 % intervals",
+    "corrections of another flight off by, rms",
+)
+HEAD: Final = f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|\n"
+
+Table = dict[str, Any]
+
+
+def lasting(seconds: float) -> Callable[[Table], None]:
+    """Return a change of how long the flight is."""
+
+    def change(table: Table) -> None:
+        table["run"]["duration_s"] = seconds
+
+    return change
+
+
+def in_boxes_of(size_m: float) -> Callable[[Table], None]:
+    """Return a change of the boxes that bodies fly in: cubes around the middles of theirs."""
+
+    def change(table: Table) -> None:
+        for body in table["bodies"]:
+            motion = body["motion"]
+            middle = (np.array(motion["box_min_m"]) + np.array(motion["box_max_m"])) / 2
+            motion["box_min_m"] = (middle - size_m / 2).tolist()
+            motion["box_max_m"] = (middle + size_m / 2).tolist()
+
+    return change
+
+
+def hovering(table: Table) -> None:
+    """Have all bodies stand where the middles of their boxes are."""
+    for body in table["bodies"]:
+        motion = body["motion"]
+        middle = (np.array(motion["box_min_m"]) + np.array(motion["box_max_m"])) / 2
+        body["motion"] = {"model": "static", "position_m": middle.tolist()}
+
+
+def in_a_row(table: Table) -> None:
+    """Have every tag range with the next one only, so that each pair's constant could be one tag's or the other's."""
+    table["ranging"]["pairs"] = [[1, 3], [3, 5], [2, 4], [4, 6]]
+
+
+CASES: Final[dict[str, Callable[[Table], None]]] = {
+    "10 s": lasting(10.0),
+    "30 s": lasting(30.0),
+    "60 s": lasting(60.0),
+    "120 s": lasting(120.0),
+    "240 s, as it is": lasting(240.0),
+    "60 s, each drone in a cube of 1 m": in_boxes_of(1.0),
+    "60 s, each drone in a cube of 0.3 m": in_boxes_of(0.3),
+    "60 s, hovering": hovering,
+    "60 s, four pairs in two rows (1-3-5, 2-4-6)": in_a_row,
+}
+
+
+def judged(case: str, seed: int) -> list[float] | str:
+    """Return the figures of a case with a seed, or why there are none."""
+    table = copy.deepcopy(tomllib.loads((FLIGHTS / "train.toml").read_text(encoding="utf-8")))
+    table["run"] |= {"duration_s": LENGTH_S, "seed": seed}
+    CASES[case](table)
+    try:
+        fitted = calib.fit(uwbsim.simulate(uwbsim.load(table)))
+    except calib.UnanswerableError as error:
+        return str(error)
+    found = calib.evaluate(uwbsim.simulate(uwbsim.load(FLIGHTS / "test1.toml")), fitted.calibration)
+    if found.planted is None:
+        raise ValueError("the test flight does not say what it planted")
+    half = 1.96 * np.median(list(fitted.calibration.delays_std_ns.values()))
+    delays = np.sqrt(np.mean(np.square(list(found.planted.delay_error_ns.values()))))
+    exchanges = table["run"]["duration_s"] * table["ranging"]["rate_hz"]
+    return [exchanges, 1000 * delays, 1000 * half, 1000 * found.planted.correction_rms_m]
+
+
+def row(case: str, seeds: int) -> str:
+    """Return a case's row of the table: medians over seeds."""
+    outcomes = [judged(case, seed) for seed in range(1, seeds + 1)]
+    figures = [outcome for outcome in outcomes if not isinstance(outcome, str)]
+    if not figures:
+        return f"| {case} | | refused | | |\n"
+    count, delays, half, correction = np.median(np.array(figures), axis=0)
+    return f"| {case} | {count:.0f} | {delays:.0f} ps | {half:.0f} ps | {correction:.1f} mm |\n"
+
+
+def main(seeds: int) -> None:
+    """Measure every case and write the table into the page."""
+    table = HEAD
+    for case in CASES:
+        table += row(case, seeds)
+        print(table.splitlines()[-1], flush=True)
+    page = PAGE.read_text(encoding="utf-8")
+    between = f"<!-- campaigns -->\n{table}<!-- end of campaigns -->"
+    PAGE.write_text(re.sub("<!-- campaigns -->.*?<!-- end of campaigns -->", lambda _: between, page, flags=re.S))
+
+
+if __name__ == "__main__":
+    arguments = argparse.ArgumentParser()
+    arguments.add_argument("--seeds", type=int, default=5)
+    main(arguments.parse_args().seeds)

@@ -1,0 +1,71 @@
+"""Every block of code on every page of the documentation works, or says why it is not run."""
+
+import shutil
+
+import matplotlib as mpl
+import pytest
+
+from tests import pages
+
+mpl.use("Agg")
+
+FLIGHT = "uwbsim run scenarios/icra2023/train.toml -o train.uwb --set run.duration_s=30"
+TEST = "uwbsim run scenarios/icra2023/test1.toml -o test.uwb --set run.duration_s=20"
+FIT = "calib fit train.uwb -o calibration.json"
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory):
+    """A folder as the pages find it: the repository's files, two flights and a calibration."""
+    folder = tmp_path_factory.mktemp("pages")
+    for name in ("scenarios", "docs"):
+        (folder / name).symlink_to(pages.ROOT / name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for line in (FLIGHT, TEST, FIT):
+            pages.command(line)
+    return folder
+
+
+RUN = [page for page in pages.pages() if any(not block.mark for block in pages.blocks(page))]
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda page: str(page.relative_to(pages.DOCS)))
+def test_the_blocks_of_a_page_work(page, recordings, tmp_path, monkeypatch):
+    for name in ("scenarios", "docs"):
+        (tmp_path / name).symlink_to(pages.ROOT / name)
+    for name in ("train.uwb", "test.uwb", "calibration.json"):
+        shutil.copyfile(recordings / name, tmp_path / name)
+    if page.parent == pages.DOCS:
+        shutil.copyfile(recordings / "test.uwb", tmp_path / "flight.uwb")
+    monkeypatch.chdir(tmp_path)
+    runner = pages.Runner()
+    for block in pages.blocks(page):
+        if block.mark:
+            continue
+        try:
+            runner.run(block)
+        except Exception as error:
+            raise AssertionError(f"{page.name}, line {block.line}: {error}") from error
+
+
+def test_blocks_that_are_not_run_say_why():
+    for page in pages.pages():
+        for block in pages.blocks(page):
+            if block.mark == "not run":
+                assert len(block.reason) > 12, f"{page.name}, line {block.line}"
+            elif block.mark == "run by":
+                assert (pages.ROOT / block.reason).exists(), f"{page.name}, line {block.line}: {block.reason}"
+
+
+def test_a_page_with_other_words_than_printed_is_found():
+    pages.compare("tag 1  delay -0.43 ns\ntag 2  delay 0.1 ns\n", "tag 1 delay -0.41 ns\n")
+    pages.compare("a 1\nb 2\nc 3\n", "a 9\n...\nc 9\n")
+    with pytest.raises(AssertionError, match="the page shows"):
+        pages.compare("tag 1  delay -0.43 ns\n", "tag 1 antenna -0.43 ns\n")
+
+
+def test_every_page_is_in_the_table_of_contents():
+    listed = "\n".join(block.read_text(encoding="utf-8") for block in [pages.DOCS / "index.md"])
+    missing = [str(p.relative_to(pages.DOCS).with_suffix("")) for p in pages.pages() if p.name != "index.md"]
+    assert [name for name in missing if f"\n{name}\n" not in listed] == []
