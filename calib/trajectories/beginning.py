@@ -12,7 +12,7 @@ from calib.trajectories.range_losses import Cauchy
 from calib.trajectories.range_rows import range_rows
 from calib.trajectories.scene import Scene
 from calib.trajectories.solving import minimise
-from calib.trajectories.starting import LOOSE_M, follow, known_at_first, through
+from calib.trajectories.starting import SCALES_M, follow, known_at_first, through
 from calib.trajectories.unknowns import State, columns_of
 
 
@@ -25,4 +25,7 @@ def beginning(scene: Scene, done: Callable[[float], None]) -> State:
     columns = columns_of(scene, 0)
     start = through(scene, columns, found, stand)
     rows = range_rows(scene, columns, scene.ranges.raw_m, np.zeros((len(scene.time_s), 0)))
-    return minimise(rows, known_rows(scene, columns, start), start, Cauchy(LOOSE_M), settled=1.0).state
+    known = known_rows(scene, columns, start)
+    for scale in SCALES_M:
+        start = minimise(rows, known, start, Cauchy(scale), settled=1.0).state
+    return start

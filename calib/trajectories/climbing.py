@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from calib.estimation.losses import MIXTURE
 from calib.estimation.pair_mixture import PairMixture
 from calib.estimation.problem import Problem
 from calib.estimation.robust import QuadraticModel, scale_of
 from calib.estimation.smoothing import reml_penalty
+from calib.spread import robust_spread
 from calib.trajectories.arrow import Factored, normal_of
 from calib.trajectories.known_rows import JERK_M_S3, KnownRows, known_rows, smoothness
 from calib.trajectories.likelihood import loss_of, mixture_of
@@ -29,6 +32,15 @@ FIRST_SCALE_M: Final = 0.15
 WIDE: Final = 2.0
 """The loss on the way is wider than that of a fit with known distances: outliers are few, trajectories want all."""
 
+LEAST_SCALE_M: Final = 0.01
+MOST_USED: Final = 0.8
+FEWEST_A_PAIR: Final = 15
+"""Of fewer ranges a pair on average nobody can tell what their errors are made of."""
+
+FELT: Final = 3.0
+"""How much less than its residuals say an accelerometer is trusted: what it is off by lasts for some windows."""
+
+FORCES_M_S2: Final = (0.02, 5.0)
 PROBES: Final = 20
 JERKS_M_S3: Final = (0.2, 50.0)
 ROUNDS: Final = 2
@@ -39,6 +51,8 @@ FIRST_ROUGHNESS: Final = 1e-6
 class Climbed:
     """The top: unknowns, what the errors of ranges are made of, and all that is needed to judge it.
 
+    `mixture` is None where ranges are too few to tell; the loss is Cauchy's then.
+
     `informed` (n,) is what a range is expected to say of its residual, 1/m^2; `ridge` (b, b) holds the curve;
     `used` is the share of the ranges that trajectories and attitudes use up.
     """
@@ -48,13 +62,19 @@ class Climbed:
     rows: RangeRows
     known: KnownRows
     state: State
-    mixture: PairMixture
+    loss: RangeLoss
+    mixture: PairMixture | None
     ridge: Floats
     informed: Floats
     jerk_m_s3: float
     used: float
     steps: int
     settled: bool
+
+    @property
+    def told(self) -> str:
+        """Return the name of the loss."""
+        return "cauchy" if self.mixture is None else MIXTURE
 
 
 def climb(scene: Scene, problem: Problem, state: State, done: Callable[[float], None]) -> Climbed:
@@ -63,17 +83,20 @@ def climb(scene: Scene, problem: Problem, state: State, done: Callable[[float], 
     rows = range_rows(scene, columns, problem.error + problem.ranges.truth_m, problem.design.written_out())
     search = _Search(scene, problem, columns, rows, done)
     search.begin(state)
-    search.go(Cauchy(FIRST_SCALE_M), 1 / (2 * FIRST_SCALE_M**2))
+    loss = Cauchy(FIRST_SCALE_M)
+    search.go(loss, 1 / (2 * FIRST_SCALE_M**2))
     for _ in range(ROUNDS):
-        scale = WIDE * scale_of(search.residual())
-        search.tune(np.full(len(scene.time_s), 1 / (2 * scale**2)))
-        search.go(Cauchy(scale))
+        search.tune(search.expected(loss, None))
+        loss = Cauchy(WIDE * search.scale())
+        search.go(loss)
+    if len(scene.time_s) < FEWEST_A_PAIR * len(problem.pairs.ends):
+        return search.found(loss, None)
     for _ in range(ROUNDS):
         mixture = search.mixture()
-        search.tune(search.expected(mixture))
+        search.tune(search.expected(loss_of(mixture), mixture))
         search.go(loss_of(mixture))
     mixture = search.mixture()
-    return search.found(mixture)
+    return search.found(loss_of(mixture), mixture)
 
 
 class _Search:
@@ -99,9 +122,9 @@ class _Search:
         for penalty in self.penalties:
             self.ridge += FIRST_ROUGHNESS * count / float(np.trace(penalty)) * penalty
 
-    def residual(self) -> Floats:
-        """Return the residuals of ranges (n,)."""
-        return self.rows.residuals(self.state)
+    def scale(self) -> float:
+        """Return the scale of a loss by residuals, from which trajectories have taken a part, metres."""
+        return max(scale_of(self.rows.residuals(self.state)) / math.sqrt(1 - self.used), LEAST_SCALE_M)
 
     def go(self, loss: RangeLoss, ridge_over: float = 1.0) -> None:
         """Go to the optimum of a loss."""
@@ -120,9 +143,22 @@ class _Search:
         if self.penalties:
             near = QuadraticModel(whole.schur, np.zeros(len(whole.schur)), 1.0)
             self.ridge = reml_penalty(near, self.state.border, self.penalties)[0]
-        self.used = self._used(whole, local, informed)
+        self.used = min(self._used(whole, local, informed), MOST_USED)
         self.jerk = self._jerk(whole)
+        self.scene = self._felt()
         self.known = known_rows(self.scene, self.columns, self.origin, self.jerk)
+
+    def _felt(self) -> Scene:
+        """Return the scene with what accelerometers are off by, as their residuals have it."""
+        off = self.known.residuals(self.state)[self.known.forces]
+        if not len(off):
+            return self.scene
+        factor = FELT * robust_spread(off, 0.0)
+        sensed = {
+            body: replace(some, std_m_s2=float(np.clip(some.std_m_s2 * factor, *FORCES_M_S2)))
+            for body, some in self.scene.inertial.items()
+        }
+        return replace(self.scene, inertial=sensed)
 
     def _used(self, whole: Factored, local: csr_array[Any], informed: Floats) -> float:
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(informed), PROBES))
@@ -144,9 +180,12 @@ class _Search:
         error = self.rows.error - self.rows.distances(self.state)
         return mixture_of(self.problem, error, self.state.border[:columns], self.ridge[:columns, :columns])
 
-    def expected(self, mixture: PairMixture) -> Floats:
+    def expected(self, loss: RangeLoss, mixture: PairMixture | None) -> Floats:
         """Return what ranges are expected to say (n,): squared scores, averaged over a pair's ranges at a power."""
-        slope, _ = loss_of(mixture).slopes(self.residual())
+        residual = self.rows.residuals(self.state)
+        slope, _ = loss.slopes(residual)
+        if mixture is None:
+            return np.full(len(slope), loss.known(residual / math.sqrt(1 - self.used)))
         place = mixture.scores.places_given()
         count = np.bincount(place)
         mean = np.bincount(place, slope**2) / np.maximum(count, 1)
@@ -154,7 +193,7 @@ class _Search:
         overall = float(np.mean(slope**2))
         return np.asarray(((count * mean + 20 * overall) / (count + 20))[place])
 
-    def found(self, mixture: PairMixture) -> Climbed:
+    def found(self, loss: RangeLoss, mixture: PairMixture | None) -> Climbed:
         """Return what was found."""
         return Climbed(
             scene=self.scene,
@@ -162,9 +201,10 @@ class _Search:
             rows=self.rows,
             known=self.known,
             state=self.state,
+            loss=loss,
             mixture=mixture,
             ridge=self.ridge,
-            informed=self.expected(mixture),
+            informed=self.expected(loss, mixture),
             jerk_m_s3=self.jerk,
             used=self.used,
             steps=self.steps,

@@ -159,7 +159,7 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked) ->
     rank = problem.rank
     covariance = problem.directions @ found.solved.covariance[:rank, :rank] @ problem.directions.T
     calibration = calibration_of(
-        problem, found.solved, covariance, MIXTURE, asked.lift, asked.alpha_dbm, asked.fixed, asked.groups
+        problem, found.solved, covariance, climbed.told, asked.lift, asked.alpha_dbm, asked.fixed, asked.groups
     )
     std = calibration.delays_std_ns | dict.fromkeys(found.free_tags, math.inf)
     calibration = replace(calibration, delays_std_ns=std)
@@ -218,6 +218,7 @@ def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked
         },
         "distance_std_m": float(np.sqrt(np.mean(found.distance_std_m**2))),
         "absorbed": found.absorbed,
+        "used": climbed.used,
         "jerk_m_s3": climbed.jerk_m_s3,
         "converged": climbed.settled,
         "reference_power_dbm": asked.reference_dbm,

@@ -12,6 +12,7 @@ from calib.errors import UnanswerableError
 from calib.ranges import Ranges
 from calib.sources import Data, Source, opened
 from calib.trajectories.attitudes import Attitude, matrices
+from calib.trajectories.inertial import Readings, integrated, windows
 from calib.trajectories.scene import Places, Scene
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses, Tag
@@ -48,6 +49,7 @@ def scene_from(data: Data, usable: Usable, *, need_power: bool = True) -> Scene:
         exchanges = single_reports(source.exchanges).exchanges
         poses, tags = source.poses, list(source.tags)
         planted = _planted(source)
+        imu = dict(getattr(source, "imu", None) or {})
     if not tags:
         raise UnanswerableError(f"{name}: does not say which tag sits on which body; 'uwblink poses --tags' adds that")
     # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
@@ -63,7 +65,7 @@ def scene_from(data: Data, usable: Usable, *, need_power: bool = True) -> Scene:
         raise UnanswerableError(f"{name}: no ranges between tags whose bodies are known")
     order = np.argsort(ranges.time_ns, kind="stable")
     rows, ranges = rows[order], ranges[order]
-    return _scene(ranges, exchanges[rows], poses, tags, usable)
+    return _scene(ranges, exchanges[rows], poses, tags, imu, usable)
 
 
 def _planted(source: Source) -> Mapping[str, Any] | None:
@@ -71,7 +73,9 @@ def _planted(source: Source) -> Mapping[str, Any] | None:
     return found if isinstance(found, Mapping) else None
 
 
-def _scene(ranges: Ranges, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], usable: Usable) -> Scene:
+def _scene(
+    ranges: Ranges, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, Any], usable: Usable
+) -> Scene:
     began = int(ranges.time_ns[0])
     # A range belongs to the middle of its first two messages.
     half = np.nan_to_num(intervals(exchanges).dt41 * (TICK_S / 2), nan=0.0)
@@ -86,6 +90,9 @@ def _scene(ranges: Ranges, exchanges: Exchanges, poses: Poses, tags: Sequence[Ta
         raise UnanswerableError(f"{ranges.source}: no body moves; boards that stand still are what a survey is for")
     last = float(time[-1])
     until = last if usable.poses_until_s is None else min(usable.poses_until_s, last)
+    sensed = {body: Readings.of(imu, body, began) for body in moving}
+    attitudes = {body: _attitude(body, tracks[body], sensed[body], usable, until, ranges.source) for body in moving}
+    turned = {body: attitude for body, attitude in attitudes.items() if attitude is not None}
     return Scene(
         source=ranges.source,
         ranges=replace(ranges, truth_m=np.full(len(time), np.nan)),
@@ -94,7 +101,8 @@ def _scene(ranges: Ranges, exchanges: Exchanges, poses: Poses, tags: Sequence[Ta
         still=still if usable.anchors == "given" else dict.fromkeys(still),
         still_turned={body: tracks[body].turned for body in still},
         arms=arms,
-        attitudes={body: _attitude(tracks[body], usable) for body in moving if tracks[body].known.any()},
+        attitudes=turned,
+        inertial={body: windows(some, turned[body], last) for body, some in sensed.items() if some and body in turned},
         places=_places([tracks[body] for body in moving], until),
         distances_m=np.asarray(exchanges.truth_m, dtype=np.float64),
     )
@@ -146,7 +154,19 @@ def _places(tracks: list[_Track], until_s: float) -> Places:
     )
 
 
-def _attitude(track: _Track, usable: Usable) -> Attitude:
+def _attitude(
+    body: str, track: _Track, sensed: Readings | None, usable: Usable, until_s: float, source: str
+) -> Attitude | None:
+    """Return the attitudes of a moving body; None where nothing says any."""
+    given = _of_poses(track, usable) if track.known.any() else None
+    if usable.attitudes == "imu":
+        if sensed is None:
+            raise UnanswerableError(f"{source}: no inertial readings of body {body}; take `attitudes` from poses")
+        return integrated(sensed, given, until_s if usable.poses_until_s is not None else 0.0)
+    return given if usable.attitudes == "poses" else None
+
+
+def _of_poses(track: _Track, usable: Usable) -> Attitude:
     heading = float(np.radians(usable.heading_std_deg))
     exact = heading == 0
     return Attitude(

@@ -1,26 +1,202 @@
-"""Inertial readings of a body, summed over short windows in the world's axes by its given attitudes."""
+"""Inertial readings: attitudes by integration, and mean specific forces over short windows in the world's axes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
-from uwblink.arrays import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.trajectories.attitudes import Attitude
+from uwblink.arrays import Bools, Floats
 
 GRAVITY_M_S2: Final = 9.81
+WINDOW_S: Final = 0.1
+"""Specific forces are averaged over so long: vibrations go, and accelerations of a spline hardly change."""
+
+STRONGEST_M_S2: Final = 4.0
+"""Mean accelerations beyond this are knocks, not flight."""
+
+FORCE_STD_M_S2: Final = 0.5
+"""What a mean specific force is off by, before the data say it better."""
+
+LEVELLING: Final = 0.1
+"""Share of a tilt against the mean specific force that is taken back in a second (Mahony, Hamel, Pflimlin 2008)."""
+
+TILT_STD: Final = float(np.radians(2.0))
+TILT_WANDER: Final = float(np.radians(0.5))
+HEADING_WANDER: Final = float(np.radians(0.5))
+"""Errors of integrated attitudes: tilts, which the accelerometer holds, and how all change in a second."""
+
+BIAS_STEP_S: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inertial:
-    """Windows of an accelerometer: they begin and end at `begin_s` and `end_s` (k,).
+    """Windows of an accelerometer, which begin and end at `begin_s` and `end_s` (k,).
 
     `force_m_s2` (k, 3) is the mean specific force in the world's axes by the given attitudes, `turn` (k, 3, 3) their
-    mean; `std_m_s2` is the noise of a mean. The gyroscope is in the attitudes: `drift` (j, 3, 3) is the integral of
-    attitudes between the instants `drift_s` (j + 1,), by which a bias of it turns them.
+    mean; `std_m_s2` is what a mean is off by.
     """
 
     begin_s: Floats
     end_s: Floats
     force_m_s2: Floats
     turn: Floats
-    std_m_s2: float
+    std_m_s2: float = FORCE_STD_M_S2
+
+    def within(self, begin_s: float, end_s: float) -> Inertial:
+        """Return the windows inside a span of time."""
+        rows = (self.begin_s >= begin_s) & (self.end_s <= end_s)
+        chosen = {name: getattr(self, name)[rows] for name in ("begin_s", "end_s", "force_m_s2", "turn")}
+        return replace(self, **chosen)
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """One body's readings in order of time: seconds (n,), angular velocity (n, 3) in rad/s, specific force (n, 3)."""
+
+    time_s: Floats
+    gyro: Floats
+    force: Floats
+
+    @classmethod
+    def of(cls, table: Mapping[str, NDArray[Any]], body: str, began_ns: int) -> Readings | None:
+        """Return the readings of a body from a recording's table; None where it has too few."""
+        if not table:
+            return None
+        rows = np.flatnonzero(table["body"] == body)
+        columns = [np.column_stack([table[f"{kind}{axis}"][rows] for axis in "xyz"]) for kind in "wa"]
+        good: Bools = np.asarray(np.isfinite(np.hstack(columns)).all(axis=1))
+        rows, columns = rows[good], [column[good] for column in columns]
+        if len(rows) < 10:
+            return None
+        order = np.argsort(table["time_ns"][rows], kind="stable")
+        time = np.asarray((table["time_ns"][rows][order] - began_ns) * 1e-9, dtype=np.float64)
+        return cls(time, columns[0][order].astype(np.float64), columns[1][order].astype(np.float64))
+
+
+def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
+    """Return the windows of an accelerometer from the first range to the last."""
+    time = readings.time_s
+    inside = (time >= max(0.0, float(attitude.time_s[0]))) & (time < min(last_s, float(attitude.time_s[-1])))
+    turn = attitude.at(time[inside])
+    force = np.einsum("nij,nj->ni", turn, readings.force[inside])
+    slot = np.floor(time[inside] / WINDOW_S).astype(np.int64)
+    starts = np.flatnonzero(np.diff(slot, prepend=-1))
+    count = np.diff(starts, append=len(slot))
+    if not len(starts):
+        return Inertial(begin_s=np.zeros(0), end_s=np.zeros(0), force_m_s2=np.zeros((0, 3)), turn=np.zeros((0, 3, 3)))
+    mean_force = np.add.reduceat(force, starts) / count[:, None]
+    mean_turn = np.add.reduceat(turn, starts) / count[:, None, None]
+    kept = count >= 0.7 * np.median(count)
+    kept &= np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < STRONGEST_M_S2
+    begin = slot[starts][kept] * WINDOW_S
+    return Inertial(begin_s=begin, end_s=begin + WINDOW_S, force_m_s2=mean_force[kept], turn=mean_turn[kept])
+
+
+def integrated(readings: Readings, known: Attitude | None, until_s: float) -> Attitude:
+    """Return attitudes by the gyroscope, levelled by the accelerometer.
+
+    They are those `known` before `until_s`, which also tell the gyroscope's bias, and go on from there. Without any,
+    the heading at first is 0 and unknown.
+    """
+    early = known is not None and bool(np.any(known.time_s < until_s)) and until_s > 0
+    bias, turn = np.zeros(3), _level(readings)
+    first = 0
+    if known is not None and early:
+        bias = _gyro_bias(readings, known, until_s)
+        first = int(np.clip(np.searchsorted(readings.time_s, until_s), 1, len(readings.time_s) - 1))
+        turn = known.at(readings.time_s[first : first + 1])[0]
+    time, found = readings.time_s[first:], _carried_on(readings, first, turn, bias)
+    wander = np.array([TILT_WANDER, TILT_WANDER, HEADING_WANDER])
+    heading = np.inf
+    if known is not None and early:
+        before = known.time_s < time[0]
+        time = np.concatenate([known.time_s[before], time])
+        found = np.concatenate([known.quaternion[before], found])
+    return Attitude(time_s=time, quaternion=found, std_rad=np.array([TILT_STD, TILT_STD, heading]), wander_rad=wander)
+
+
+def _carried_on(readings: Readings, first: int, turn: Floats, bias: Floats) -> Floats:
+    """Return quaternions (n - first, 4) from a first attitude on."""
+    steps = np.diff(readings.time_s[first:], append=readings.time_s[-1])
+    rates, pulls = readings.gyro[first:] - bias, _smoothed(readings)[first:]
+    found = np.empty((len(steps), 4))
+    attitude = _quaternion(turn)
+    for k, (dt, rate, pull) in enumerate(zip(steps.tolist(), rates, pulls, strict=True)):
+        found[k] = attitude
+        up = _vertical(attitude)
+        size = float(np.sqrt(pull @ pull))
+        back = LEVELLING * np.array(_cross(pull / size, up)) if 0.8 < size / GRAVITY_M_S2 < 1.2 else np.zeros(3)
+        attitude = _multiplied(attitude, (rate + back) * min(dt, 0.1))
+    return found
+
+
+def _smoothed(readings: Readings) -> Floats:
+    """Return specific forces averaged over about a window (n, 3)."""
+    count = max(int(WINDOW_S / max(float(np.median(np.diff(readings.time_s))), 1e-4)), 1)
+    kernel = np.ones(count) / count
+    return np.column_stack([np.convolve(column, kernel, mode="same") for column in readings.force.T])
+
+
+def _level(readings: Readings) -> Floats:
+    """Return the attitude whose vertical is that of the first second's mean specific force."""
+    early = readings.time_s < readings.time_s[0] + 1.0
+    up = readings.force[early].mean(axis=0)
+    up = up / np.linalg.norm(up)
+    side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    return np.array([np.cross(side, up), side, up])
+
+
+def _gyro_bias(readings: Readings, known: Attitude, until_s: float) -> Floats:
+    """Return by how much the gyroscope reads more than known attitudes turn, rad/s."""
+    from scipy.spatial.transform import Rotation
+
+    last = min(until_s, float(known.time_s[-1]), float(readings.time_s[-1]))
+    first = max(float(known.time_s[0]), float(readings.time_s[0]))
+    edges = np.arange(first, last, BIAS_STEP_S)
+    if len(edges) < 2:
+        return np.zeros(3)
+    at = Rotation.from_matrix(known.at(edges))
+    turned = (at[:-1].inv() * at[1:]).as_rotvec() / BIAS_STEP_S
+    slot = np.searchsorted(edges, readings.time_s, side="right") - 1
+    there = [k for k in range(len(edges) - 1) if np.any(slot == k)]
+    if not there:
+        return np.zeros(3)
+    return np.asarray(np.median([readings.gyro[slot == k].mean(axis=0) - turned[k] for k in there], axis=0))
+
+
+def _quaternion(turn: Floats) -> tuple[float, float, float, float]:
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(turn).as_quat().tolist()
+    return x, y, z, w
+
+
+def _cross(a: Floats, b: tuple[float, float, float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _vertical(attitude: tuple[float, float, float, float]) -> tuple[float, float, float]:
+    """Return the world's vertical in the axes of the body: the last row of its rotation matrix."""
+    x, y, z, w = attitude
+    return 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+
+
+def _multiplied(attitude: tuple[float, float, float, float], turn: Floats) -> tuple[float, float, float, float]:
+    """Return an attitude turned further by a small rotation vector in the axes of the body."""
+    x, y, z, w = attitude
+    a, b, c = (0.5 * turn).tolist()
+    d = 1 - 0.5 * (a * a + b * b + c * c)
+    found = (
+        w * a + x * d + y * c - z * b,
+        w * b - x * c + y * d + z * a,
+        w * c + x * b - y * a + z * d,
+        w * d - x * a - y * b - z * c,
+    )
+    length = (found[0] ** 2 + found[1] ** 2 + found[2] ** 2 + found[3] ** 2) ** 0.5
+    return found[0] / length, found[1] / length, found[2] / length, found[3] / length

@@ -9,14 +9,14 @@ import numpy as np
 
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
+from calib.estimation.pair_mixture import SPREADS
 from calib.estimation.problem import Problem
-from calib.estimation.scores import inverse_of
+from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import unsure
 from calib.estimation.solver import Solved
 from calib.information import Unknown, Verdict, judge
 from calib.trajectories.arrow import Factored, normal_of
 from calib.trajectories.climbing import Climbed
-from calib.trajectories.likelihood import loss_of
 from uwblink.arrays import Floats
 
 PRIOR_NS: Final = 2.0
@@ -70,20 +70,17 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
         taken[columns:] = -np.linalg.lstsq(schur[columns:, columns:], schur[columns:, :columns], rcond=1e-13)[0]
     design = (border - local @ whole.reach) @ taken
     held = (climbed.known.border - climbed.known.local @ whole.reach) @ taken
-    slope, _ = loss_of(climbed.mixture).slopes(climbed.rows.residuals(climbed.state))
-    known = climbed.mixture.scores
-    scores = replace(known, design=known.design.like(design), score=known.design.kept(-slope))
-    precision = climbed.mixture.precision.copy()
-    precision[:columns, :columns] = climbed.ridge[:columns, :columns] + held.T @ held
-    pairs = len(problem.pairs.ends)
-    inverse = inverse_of(scores.information() + precision, pairs, 3)
+    slope, _ = climbed.loss.slopes(climbed.rows.residuals(climbed.state))
+    prior = climbed.ridge[:columns, :columns] + held.T @ held
+    scores, inverse, precision = _slopes(climbed, problem, design, -slope, prior)
     stated = stating(problem, reference)
     delays = problem.directions @ stated[: problem.rank]
     blocks, seconds = blocks_of(problem.ranges.time_ns)
     of_blocks = intervals(scores, inverse, precision, delays, problem.rank, blocks=blocks, seconds=seconds)
     found = climbed.state.border[:columns]
     shares = [_of_curve(climbed.ridge[:columns, :columns], curve) for _, curve in problem.curves()]
-    covariance = of_blocks.covariance / (1 - climbed.used) + unsure(inverse[:columns, :columns], found, shares)
+    # Residuals are smaller by what trajectories have taken of them (as HC3 has it; MacKinnon and White 1985).
+    covariance = of_blocks.covariance / (1 - climbed.used) ** 2 + unsure(inverse[:columns, :columns], found, shares)
     solved = Solved(
         parameters=stated @ found,
         covariance=stated @ covariance @ stated.T,
@@ -110,6 +107,21 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
         absorbed=_absorbed(delays @ plain @ delays.T, delays @ with_truth @ delays.T),
         distance_std_m=_spread(climbed, whole),
     )
+
+
+def _slopes(
+    climbed: Climbed, problem: Problem, design: Floats, score: Floats, prior: Floats
+) -> tuple[Scores, Floats, Floats]:
+    """Return the slopes of all ranges, the inverse of what they and a prior (m, m) say, and the whole prior."""
+    if climbed.mixture is None:
+        kept = problem.design.kept
+        scores = Scores(design=problem.design.like(design), score=kept(score), curvature=kept(climbed.informed))
+        return scores, inverse_of(scores.information() + prior), prior
+    known = climbed.mixture.scores
+    scores = replace(known, design=known.design.like(design), score=known.design.kept(score))
+    precision = climbed.mixture.precision.copy()
+    precision[: len(prior), : len(prior)] = prior
+    return scores, inverse_of(scores.information() + precision, len(problem.pairs.ends), len(SPREADS)), precision
 
 
 def _verdict(covariance: Floats, problem: Problem) -> Verdict:

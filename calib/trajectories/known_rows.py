@@ -9,16 +9,20 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from calib.trajectories.arrow import Normal, normal_of
+from calib.trajectories.inertial import GRAVITY_M_S2
 from calib.trajectories.scene import Scene
 from calib.trajectories.splines import cubic, cubic_speed, straight
 from calib.trajectories.unknowns import Columns, State
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 CALM_M_S2: Final = 5.0
 """Accelerations that a body may have without surprise; it holds a trajectory where ranges fail for a while."""
+
+SLOW_M_S: Final = 3.0
+"""Speeds that a body in a room may have without surprise."""
 
 JERK_M_S3: Final = 8.0
 """By how much accelerations change in a second, before the data say it better."""
@@ -42,16 +46,21 @@ class Block:
     border_value: Floats
     aim: Floats
     std: Floats
+    force: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class KnownRows:
-    """Rows `local @ x + border @ y - aim`, each over its standard error, and their normal equations."""
+    """Rows `local @ x + border @ y - aim`, each over its standard error, and their normal equations.
+
+    `forces` (k,) says which are of an accelerometer.
+    """
 
     local: csr_array[Any]
     border: Floats
     aim: Floats
     normal: Normal
+    forces: Bools
 
     def residuals(self, state: State) -> Floats:
         """Return the residuals (k,) over their standard errors."""
@@ -78,7 +87,8 @@ def known_rows(scene: Scene, columns: Columns, start: State, jerk_m_s3: float = 
     row, column, value = (np.concatenate([part[k] for part in parts]) for k in range(3))
     local = csr_array((value, (row, column)), shape=(begin, columns.size))
     dense = np.concatenate(border)
-    return KnownRows(local, dense, np.concatenate(aims), normal_of(local, dense, np.ones(begin)))
+    forces = np.concatenate([np.full(len(block.aim), block.force) for block in blocks])
+    return KnownRows(local, dense, np.concatenate(aims), normal_of(local, dense, np.ones(begin)), forces)
 
 
 def _blocks(scene: Scene, columns: Columns, start: State, jerk_m_s3: float) -> Iterator[Block]:
@@ -98,6 +108,9 @@ def _of_axis(scene: Scene, columns: Columns, start: State, body: int, axis: int)
     second = np.tile(np.array([1.0, -2.0, 1.0]) / columns.places.step_s**2, (len(three), 1))
     calm = CALM_M_S2 if body not in _sensed(scene) else 10 * CALM_M_S2
     yield _plain(three, second, np.zeros(len(three)), calm)
+    two = np.column_stack([column[:-1], column[1:]])
+    first = np.tile(np.array([-1.0, 1.0]) / columns.places.step_s, (len(two), 1))
+    yield _plain(two, first, np.zeros(len(two)), SLOW_M_S)
     yield _plain(column[:, None], np.ones((len(column), 1)), start.local[column], FAR_M)
     mine = scene.places.body == body
     weights = cubic(columns.places, scene.places.time_s[mine])
@@ -129,7 +142,7 @@ def _attitude(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
 def _forces(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
     """Mean accelerations are mean specific forces, turned, less the bias, and gravity: v2 - v1 = (R (f - b) + g) dt."""
     sensed = scene.inertial.get(scene.moving[body])
-    if sensed is None:
+    if sensed is None or not len(sensed.begin_s):
         return
     late, early = (cubic_speed(columns.places, time) for time in (sensed.end_s, sensed.begin_s))
     middle = straight(columns.turns, (sensed.begin_s + sensed.end_s) / 2)
@@ -144,7 +157,7 @@ def _forces(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
             column.append(columns.turn[middle.point, body, other])
             value.append(-arm[:, None] * middle.share)
         where = np.broadcast_to(columns.bias[body], (len(lasts), 3))
-        aim = sensed.force_m_s2[:, axis] - (GRAVITY[axis])
+        aim = sensed.force_m_s2[:, axis] - GRAVITY_M_S2 * (axis == 2)
         yield Block(
             np.concatenate(column, axis=1),
             np.concatenate(value, axis=1),
@@ -152,11 +165,9 @@ def _forces(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
             sensed.turn[:, axis, :],
             aim,
             np.full(len(aim), sensed.std_m_s2),
+            force=True,
         )
     yield _of_border(columns.bias[body], np.zeros(3), BIAS_M_S2, columns)
-
-
-GRAVITY: Final = (0.0, 0.0, 9.81)
 
 
 def _crossed(axis: int, vector: Floats) -> list[tuple[int, Floats]]:

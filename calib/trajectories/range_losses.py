@@ -26,6 +26,9 @@ class RangeLoss(Protocol):
     def slopes(self, residual: Floats) -> tuple[Floats, Floats]:
         """Return its slope (n,) by each residual, 1/m, and a positive curvature (n,), 1/m^2, near its own."""
 
+    def known(self, residual: Floats) -> float:
+        """Return what a range says of its residual on average, 1/m^2."""
+
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
@@ -43,6 +46,12 @@ class Cauchy:
         weight = 2 / self.scale_m**2 / (1 + u**2)
         return weight * residual, np.maximum(weight * (1 - u**2) / (1 + u**2), LEAST_CURVED * weight)
 
+    def known(self, residual: Floats) -> float:
+        """Return the mean curvature."""
+        u = residual / self.scale_m
+        weight = 2 / self.scale_m**2 / (1 + u**2)
+        return float(max(np.mean(weight * (1 - u**2) / (1 + u**2)), LEAST_CURVED * np.mean(weight)))
+
 
 @dataclass(frozen=True, slots=True)
 class Reflecting:
@@ -59,3 +68,7 @@ class Reflecting:
         found, sigma = expected(residual, self.shape), self.shape.sigma_m
         slope = (found.core * residual + found.tail * found.noise_m) / sigma**2
         return slope, (found.core + REFLECTED * found.tail) / sigma**2 + 1e-6
+
+    def known(self, residual: Floats) -> float:
+        """Return the mean squared slope."""
+        return float(np.mean(self.slopes(residual)[0] ** 2))

@@ -65,7 +65,8 @@ class Scene:
         """Return what lies within a span of time."""
         known = (self.places.time_s >= begin_s) & (self.places.time_s <= end_s)
         rows = np.flatnonzero((self.time_s >= begin_s) & (self.time_s <= end_s))
-        return replace(self.only(rows), places=self.places[known])
+        inertial = {body: sensed.within(begin_s, end_s) for body, sensed in self.inertial.items()}
+        return replace(self.only(rows), places=self.places[known], inertial=inertial)
 
     def only(self, rows: Ints) -> Scene:
         """Return the scene with some of its ranges."""

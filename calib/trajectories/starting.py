@@ -18,9 +18,9 @@ from calib.trajectories.splines import cubic
 from calib.trajectories.unknowns import Columns, State, columns_of
 from uwblink.arrays import Floats
 
-WINDOW_S: Final = 2.0
-STEP_S: Final = 1.0
-"""A window's length, and by how much it moves on."""
+WINDOW_S: Final = (2.0, 20.0)
+RANGES_A_BODY: Final = 24
+"""A window lasts until it has so many ranges a moving body, but within bounds; it moves on by a half of that."""
 
 SAMPLE_S: Final = 0.1
 FOLLOWED_M: Final = 0.1
@@ -28,6 +28,11 @@ FOLLOWED_M: Final = 0.1
 
 LOOSE_M: Final = 0.3
 """Scale of the loss while neither delays nor curve are known."""
+
+SCALES_M: Final = (3.0, 1.0, LOOSE_M)
+"""The same from where a body may be far from where it is thought to be: nearly a convex problem at first."""
+
+STEADY_M_S3: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +91,12 @@ def follow(scene: Scene, seed: Followed, stand: Floats, done: Callable[[float], 
 def _further(scene: Scene, found: Followed, stand: Floats, *, forward: bool) -> tuple[Followed, Floats]:
     edge = found.time_s[-1] if forward else found.time_s[0]
     sign = 1.0 if forward else -1.0
-    target = edge + sign * STEP_S
-    low, high = sorted((edge - sign * (WINDOW_S - STEP_S), target))
+    step = _window(scene) / 2
+    target = edge + sign * step
+    low, high = sorted((edge - sign * step, target))
     inner = (found.time_s >= low - 1e-9) & (found.time_s <= high + 1e-9)
     near = Followed(found.time_s[inner], found.position_m[inner])
-    fresh = np.arange(1, round(STEP_S / SAMPLE_S) + 1) * SAMPLE_S * sign + edge
+    fresh = np.arange(1, round(step / SAMPLE_S) + 1) * SAMPLE_S * sign + edge
     fresh = fresh[(fresh >= scene.time_s[0] - SAMPLE_S) & (fresh <= scene.time_s[-1] + SAMPLE_S)]
     guess = _carried_on(near, fresh, forward=forward)
     window = scene.between(low, high)
@@ -99,6 +105,13 @@ def _further(scene: Scene, found: Followed, stand: Floats, *, forward: bool) -> 
     else:
         placed, stand = settle(window, _joined(near, Followed(fresh, guess)), stand, anchor=near, at=fresh)
     return _joined(found, Followed(fresh, placed)), stand
+
+
+def _window(scene: Scene) -> float:
+    """Return how many seconds a window lasts."""
+    rate = len(scene.time_s) / max(float(scene.time_s[-1] - scene.time_s[0]), 1e-9)
+    seconds = RANGES_A_BODY * len(scene.moving) / rate
+    return float(np.clip(2 * round(seconds / 2), *WINDOW_S))
 
 
 def _carried_on(near: Followed, time_s: Floats, *, forward: bool) -> Floats:
@@ -135,8 +148,10 @@ def settle(
         )
     start = through(window, columns, guess, stand)
     rows = range_rows(window, columns, window.ranges.raw_m, np.zeros((len(window.time_s), 0)))
-    best = minimise(rows, known_rows(window, columns, start), start, Cauchy(LOOSE_M), most_steps=25, settled=1.0)
-    return positions(columns, best.state, at), best.state.border[columns.stand]
+    known = known_rows(window, columns, start, STEADY_M_S3)
+    for scale in SCALES_M:
+        start = minimise(rows, known, start, Cauchy(scale), most_steps=25, settled=1.0).state
+    return positions(columns, start, at), start.border[columns.stand]
 
 
 def known_at_first(scene: Scene) -> Iterator[Followed]:
