@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,13 +15,21 @@ class Attitude:
 
     Errors are turns about the world's axes: `std_rad` (3,) is how large they are at any time, infinite where that is
     not known, and `wander_rad` (3,) by how much they change within a second (a random walk). Where both are zero the
-    attitudes are taken as they are.
+    attitudes are taken as they are. `begun` says whether the first heading is known.
     """
 
     time_s: Floats
     quaternion: Floats
     std_rad: Floats
     wander_rad: Floats
+    begun: bool = True
+
+    def headed(self, heading_rad: float) -> Attitude:
+        """Return them turned about the world's vertical."""
+        s, c = np.sin(heading_rad / 2), np.cos(heading_rad / 2)
+        x, y, z, w = self.quaternion.T
+        turned = np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+        return replace(self, quaternion=turned)
 
     @property
     def exact(self) -> bool:

@@ -2,30 +2,145 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
-from calib.errors import UnanswerableError
 from calib.trajectories.known_rows import known_rows
 from calib.trajectories.range_losses import Cauchy
 from calib.trajectories.range_rows import range_rows
 from calib.trajectories.scene import Scene
 from calib.trajectories.solving import minimise
-from calib.trajectories.starting import SCALES_M, follow, known_at_first, through
+from calib.trajectories.starting import (
+    SAMPLE_S,
+    SCALES_M,
+    Followed,
+    follow,
+    known_at_first,
+    positions,
+    settle,
+    through,
+    window_s,
+)
 from calib.trajectories.unknowns import State, columns_of
+from uwblink.arrays import Floats
+
+STARTS: Final = 24
+AROUND_M: Final = 2.0
+HEADED_S: Final = 8.0
+"""A first window lasts so long at least where headings are to be found in it."""
 
 
-def beginning(scene: Scene, done: Callable[[float], None]) -> State:
-    """Return trajectories and standing bodies that fit the raw ranges, as unknowns without delays or curve."""
+def beginning(scene: Scene, done: Callable[[float], None]) -> tuple[Scene, State]:
+    """Return trajectories and standing bodies that fit the raw ranges, as unknowns without delays or curve.
+
+    The scene comes back with headings in its attitudes that were found, where they were not known.
+    """
     seed = next(known_at_first(scene), None)
+    stand = np.zeros((len(scene.sought), 3))
     if seed is None:
-        raise UnanswerableError(f"{scene.source}: nowhere are all bodies known to be; give a known stretch")
-    found, stand = follow(scene, seed, np.zeros((len(scene.sought), 3)), lambda share: done(0.8 * share))
+        scene, seed, stand = _first_window(scene)
+    elif scene.sought:
+        stand = _seen_from(scene, seed)
+    found, stand = follow(scene, seed, stand, lambda share: done(0.8 * share))
     columns = columns_of(scene, 0)
     start = through(scene, columns, found, stand)
     rows = range_rows(scene, columns, scene.ranges.raw_m, np.zeros((len(scene.time_s), 0)))
     known = known_rows(scene, columns, start)
     for scale in SCALES_M:
         start = minimise(rows, known, start, Cauchy(scale), settled=1.0).state
-    return start
+    return scene, start
+
+
+def _first_window(scene: Scene) -> tuple[Scene, Followed, Floats]:
+    """Return where bodies are in the first window, from many starts: the one that fits best."""
+    begin = float(scene.time_s[0])
+    headless = _without_heading(scene)
+    length = max(window_s(scene), HEADED_S if headless else 0.0)
+    time = np.arange(begin, begin + length + SAMPLE_S / 2, SAMPLE_S)
+    window = scene.between(begin, float(time[-1]))
+    tried = [
+        (settle(headed(window, heading), guess, stand), heading)
+        for guess, stand, heading in _guesses(window, time, headless)
+    ]
+    best, heading = min(tried, key=lambda one: one[0].cost)
+    return headed(scene, heading), Followed(time, positions(best.columns, best.state, time)), best.stand
+
+
+def _guesses(scene: Scene, time: Floats, headless: list[str]) -> Iterator[tuple[Followed, Floats, dict[str, float]]]:
+    """Yield places of moving bodies all along, of standing ones, and headings of those that have none."""
+    rng = np.random.default_rng(0)
+    known = np.array([place for place in scene.still.values() if place is not None]).reshape(-1, 3)
+    shape = _shape(scene)
+    moving = len(scene.moving)
+    for _ in range(STARTS):
+        if len(known):
+            place = rng.normal(known.mean(axis=0), known.std(axis=0) + AROUND_M / 2, (len(shape), 3))
+        else:
+            place = shape @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + rng.normal(0, 0.2, (len(shape), 3))
+        heading = dict(zip(headless, rng.uniform(-np.pi, np.pi, len(headless)).tolist(), strict=True))
+        yield Followed(time, np.tile(place[:moving], (len(time), 1, 1))), place[moving:], heading
+
+
+def _shape(scene: Scene) -> Floats:
+    """Return how bodies lie to each other (moving, then sought), by multidimensional scaling of their mean ranges.
+
+    Classical scaling (Torgerson 1952); what does not range with each other is as far apart as the shortest way.
+    """
+    bodies = [*scene.moving, *scene.sought]
+    count = len(bodies)
+    number = {tag: bodies.index(body) for tag, (body, _) in scene.arms.items() if body in bodies}
+    total, times = np.zeros((count, count)), np.zeros((count, count))
+    for a, b, r in zip(
+        scene.ranges.initiator.tolist(), scene.ranges.target.tolist(), scene.ranges.raw_m.tolist(), strict=True
+    ):
+        if a in number and b in number:
+            i, j = number[a], number[b]
+            total[[i, j], [j, i]] += r
+            times[[i, j], [j, i]] += 1
+    apart = np.where(times > 0, total / np.maximum(times, 1), 1e3)
+    np.fill_diagonal(apart, 0.0)
+    for k in range(count):
+        apart = np.minimum(apart, apart[:, [k]] + apart[[k], :])
+    apart = np.minimum(apart, 20.0)
+    centre = np.eye(count) - 1 / count
+    values, vectors = np.linalg.eigh(-0.5 * centre @ apart**2 @ centre)
+    found = vectors[:, ::-1][:, :3] * np.sqrt(np.maximum(values[::-1][:3], 0.0))
+    return np.pad(found, ((0, 0), (0, 3 - found.shape[1])))
+
+
+def _seen_from(scene: Scene, seed: Followed) -> Floats:
+    """Return where the sought bodies are, each from the start that fits its ranges best while others are known."""
+    window = scene.between(float(seed.time_s[0]), float(seed.time_s[-1]))
+    rng = np.random.default_rng(0)
+    here = seed.position_m.reshape(-1, 3)
+    sought = scene.sought
+    best, stand = np.full(len(sought), np.inf), np.zeros((len(sought), 3))
+    mine = [
+        np.isin(ids, [tag for tag, (body, _) in scene.arms.items() if body == name])
+        for name in sought
+        for ids in (window.ranges.initiator, window.ranges.target)
+    ]
+    for _ in range(STARTS // 3):
+        guess = rng.normal(here.mean(axis=0), here.std(axis=0) + AROUND_M, (len(sought), 3))
+        settled = settle(window, seed, guess)
+        off = np.log1p((settled.residuals / SCALES_M[-1]) ** 2)
+        cost = np.array([off[mine[2 * k] | mine[2 * k + 1]].sum() for k in range(len(sought))])
+        better = cost < best
+        best[better], stand[better] = cost[better], settled.stand[better]
+    return stand
+
+
+def _without_heading(scene: Scene) -> list[str]:
+    return [body for body, known in scene.attitudes.items() if not np.isfinite(known.std_rad[2]) and not known.begun]
+
+
+def headed(scene: Scene, heading: dict[str, float]) -> Scene:
+    """Return the scene with the attitudes of some bodies turned about the vertical by their headings."""
+    if not heading:
+        return scene
+    attitudes = {body: known.headed(heading.get(body, 0.0)) for body, known in scene.attitudes.items()}
+    inertial = {body: some.headed(heading.get(body, 0.0)) for body, some in scene.inertial.items()}
+    return replace(scene, attitudes=attitudes, inertial=inertial)

@@ -98,7 +98,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
         problem, scene = _problem(scene, asked)
-        start = beginning(scene, lambda share: done(FOLLOWING * share))
+        scene, start = beginning(scene, lambda share: done(FOLLOWING * share))
         climbed = climb(scene, problem, start, lambda share: done(FOLLOWING + (1 - FOLLOWING) * share))
         found = judged(climbed, problem, asked.reference)
         result = _result(climbed, problem, found, asked)

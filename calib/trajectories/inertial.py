@@ -53,6 +53,12 @@ class Inertial:
         chosen = {name: getattr(self, name)[rows] for name in ("begin_s", "end_s", "force_m_s2", "turn")}
         return replace(self, **chosen)
 
+    def headed(self, heading_rad: float) -> Inertial:
+        """Return them turned about the world's vertical."""
+        c, s = np.cos(heading_rad), np.sin(heading_rad)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return replace(self, force_m_s2=self.force_m_s2 @ turn.T, turn=turn @ self.turn)
+
 
 @dataclass(frozen=True, slots=True)
 class Readings:
@@ -112,12 +118,17 @@ def integrated(readings: Readings, known: Attitude | None, until_s: float) -> At
         turn = known.at(readings.time_s[first : first + 1])[0]
     time, found = readings.time_s[first:], _carried_on(readings, first, turn, bias)
     wander = np.array([TILT_WANDER, TILT_WANDER, HEADING_WANDER])
-    heading = np.inf
     if known is not None and early:
         before = known.time_s < time[0]
         time = np.concatenate([known.time_s[before], time])
         found = np.concatenate([known.quaternion[before], found])
-    return Attitude(time_s=time, quaternion=found, std_rad=np.array([TILT_STD, TILT_STD, heading]), wander_rad=wander)
+    return Attitude(
+        time_s=time,
+        quaternion=found,
+        std_rad=np.array([TILT_STD, TILT_STD, np.inf]),
+        wander_rad=wander,
+        begun=early,
+    )
 
 
 def _carried_on(readings: Readings, first: int, turn: Floats, bias: Floats) -> Floats:

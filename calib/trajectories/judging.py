@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -37,13 +38,15 @@ class Judged:
     """A solution as a fit with known distances would have it, and the verdict on the delays of `problem.tags`.
 
     `absorbed` says for the least known direction of delays how many times its variance grew because distances are not
-    known; `distance_std_m` (k,) are standard errors of some distances.
+    known; `distance_std_m` (k,) are standard errors of some distances,
+    `covariance_ns2` (tags, tags) is that of the delays.
     """
 
     solved: Solved
     verdict: Verdict | None
     absorbed: float
     distance_std_m: Floats
+    covariance_ns2: Floats
 
     @property
     def free_tags(self) -> list[int]:
@@ -52,9 +55,28 @@ class Judged:
 
     def open_ends(self) -> list[str]:
         """Return as a sentence what is not determined; none where everything is."""
-        if self.verdict is None or not self.free_tags:
+        free, verdict = self.free_tags, self.verdict
+        if verdict is None or not free:
             return []
-        return [f"the ranges do not determine {'; '.join(str(self.verdict).splitlines())}"]
+        tags = [int(unknown.of) for unknown in verdict.unknowns]
+        if len(free) < len(tags):
+            return [f"the ranges do not determine the delays of tags {', '.join(map(str, free))}{self._known_to(free)}"]
+        count = len(tags)
+        common = np.full((1, count), 1 / count)
+        apart = np.eye(count)[1:] - np.eye(count)[0]
+        spread, differences = (
+            1.96 * float(np.sqrt(np.max(np.diag(rows @ self.covariance_ns2 @ rows.T)))) for rows in (common, apart)
+        )
+        return [
+            f"the ranges determine no delay: what all have in common is known to ± {spread:.2f} ns (95 %), and "
+            f"differences to ± {differences:.2f} ns"
+        ]
+
+    def _known_to(self, free: list[int]) -> str:
+        verdict = self.verdict
+        tags = [] if verdict is None else [int(unknown.of) for unknown in verdict.unknowns]
+        std = [math.sqrt(self.covariance_ns2[tags.index(tag), tags.index(tag)]) for tag in free]
+        return f": known to ± {1.96 * max(std):.2f} ns (95 %) at worst"
 
 
 def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judged:
@@ -97,7 +119,13 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
     )
     rank = problem.rank
     if not rank:
-        return Judged(solved=solved, verdict=None, absorbed=1.0, distance_std_m=_spread(climbed, whole))
+        return Judged(
+            solved=solved,
+            verdict=None,
+            absorbed=1.0,
+            distance_std_m=_spread(climbed, whole),
+            covariance_ns2=np.zeros((0, 0)),
+        )
     apart = problem.directions @ solved.covariance[:rank, :rank] @ problem.directions.T
     with_truth = np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + climbed.ridge[:columns, :columns])
     plain = np.linalg.pinv(_information(design, climbed.informed) + precision[:columns, :columns])
@@ -106,6 +134,7 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
         verdict=_verdict(apart, problem),
         absorbed=_absorbed(delays @ plain @ delays.T, delays @ with_truth @ delays.T),
         distance_std_m=_spread(climbed, whole),
+        covariance_ns2=apart,
     )
 
 

@@ -56,16 +56,9 @@ def positions(columns: Columns, state: State, time_s: Floats) -> Floats:
 
 def through(scene: Scene, columns: Columns, followed: Followed, stand: Floats) -> State:
     """Return control points of trajectories that pass where bodies were found, at rest before and after."""
-    bodies = len(scene.moving)
-    count = len(followed.time_s)
-    places = Places(
-        np.tile(followed.time_s, bodies),
-        np.repeat(np.arange(bodies), count),
-        followed.position_m.transpose(1, 0, 2).reshape(-1, 3),
-        np.full(count * bodies, FOLLOWED_M),
-    )
+    places = _places_of(followed)
     start = blank(columns)
-    for body in range(bodies):
+    for body in range(len(scene.moving)):
         for axis in range(3):
             line = np.interp(columns.places.times_s, followed.time_s, followed.position_m[:, body, axis])
             start.local[columns.place[:, body, axis]] = line
@@ -91,7 +84,7 @@ def follow(scene: Scene, seed: Followed, stand: Floats, done: Callable[[float], 
 def _further(scene: Scene, found: Followed, stand: Floats, *, forward: bool) -> tuple[Followed, Floats]:
     edge = found.time_s[-1] if forward else found.time_s[0]
     sign = 1.0 if forward else -1.0
-    step = _window(scene) / 2
+    step = window_s(scene) / 2
     target = edge + sign * step
     low, high = sorted((edge - sign * step, target))
     inner = (found.time_s >= low - 1e-9) & (found.time_s <= high + 1e-9)
@@ -103,11 +96,12 @@ def _further(scene: Scene, found: Followed, stand: Floats, *, forward: bool) -> 
     if len(window.time_s) < 2:
         placed = guess
     else:
-        placed, stand = settle(window, _joined(near, Followed(fresh, guess)), stand, anchor=near, at=fresh)
+        settled = settle(window, _joined(near, Followed(fresh, guess)), stand, near)
+        placed, stand = positions(settled.columns, settled.state, fresh), settled.stand
     return _joined(found, Followed(fresh, placed)), stand
 
 
-def _window(scene: Scene) -> float:
+def window_s(scene: Scene) -> float:
     """Return how many seconds a window lasts."""
     rate = len(scene.time_s) / max(float(scene.time_s[-1] - scene.time_s[0]), 1e-9)
     seconds = RANGES_A_BODY * len(scene.moving) / rate
@@ -129,29 +123,44 @@ def _joined(first: Followed, second: Followed) -> Followed:
     return Followed(time[order], place[order])
 
 
-def settle(
-    window: Scene, guess: Followed, stand: Floats, *, anchor: Followed | None = None, at: Floats
-) -> tuple[Floats, Floats]:
-    """Return where the bodies of a window are at instants (k, bodies, 3), and the standing ones, from a guess."""
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """What a window settled to: its columns and unknowns, the residuals of its ranges (n,), and what was minimised."""
+
+    columns: Columns
+    state: State
+    residuals: Floats
+    cost: float
+
+    @property
+    def stand(self) -> Floats:
+        """Return where the standing bodies are that are sought (k, 3)."""
+        return self.state.border[self.columns.stand]
+
+
+def settle(window: Scene, guess: Followed, stand: Floats, anchor: Followed | None = None) -> Settled:
+    """Return what fits the ranges of a window best, from a guess; `anchor` is where bodies have been followed."""
     columns = columns_of(window, 0)
     if anchor is not None:
-        bodies = len(window.moving)
-        window = replace(
-            window,
-            places=window.places
-            + Places(
-                np.tile(anchor.time_s, bodies),
-                np.repeat(np.arange(bodies), len(anchor.time_s)),
-                anchor.position_m.transpose(1, 0, 2).reshape(-1, 3),
-                np.full(len(anchor.time_s) * bodies, FOLLOWED_M),
-            ),
-        )
+        window = replace(window, places=window.places + _places_of(anchor))
     start = through(window, columns, guess, stand)
     rows = range_rows(window, columns, window.ranges.raw_m, np.zeros((len(window.time_s), 0)))
     known = known_rows(window, columns, start, STEADY_M_S3)
+    cost = 0.0
     for scale in SCALES_M:
-        start = minimise(rows, known, start, Cauchy(scale), most_steps=25, settled=1.0).state
-    return positions(columns, start, at), start.border[columns.stand]
+        found = minimise(rows, known, start, Cauchy(scale), most_steps=25, settled=1.0)
+        start, cost = found.state, found.cost
+    return Settled(columns, start, rows.residuals(start), cost)
+
+
+def _places_of(followed: Followed) -> Places:
+    count, bodies = followed.position_m.shape[:2]
+    return Places(
+        np.tile(followed.time_s, bodies),
+        np.repeat(np.arange(bodies), count),
+        followed.position_m.transpose(1, 0, 2).reshape(-1, 3),
+        np.full(count * bodies, FOLLOWED_M),
+    )
 
 
 def known_at_first(scene: Scene) -> Iterator[Followed]:

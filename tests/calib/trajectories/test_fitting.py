@@ -71,3 +71,31 @@ def test_a_bad_parameter_is_named(flown):
         with pytest.raises(calib.BadInputError) as raised:
             calib.fit_from_ranges(flown, **{name: value})
         assert raised.value.parameter == name
+
+
+ANCHORS = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5]]
+
+
+def test_nothing_is_claimed_where_nothing_is_known_and_differences_are_told():
+    with pytest.raises(calib.UnanswerableError, match="what all have in common is known to") as raised:
+        calib.fit_from_ranges(flight(seconds=16.0), poses_until_s=0.0)
+    assert raised.value.undetermined == [list(DELAYS_NS)]
+
+
+def test_places_of_anchors_make_up_for_a_known_start():
+    result = calib.fit_from_ranges(flight(seconds=16.0, rate=120, anchors=ANCHORS), poses_until_s=0.0)
+    std = np.sqrt(np.diag(result.calibration.uncertainty.delays_ns2))
+    assert result.calibration.provenance["rests_on"]["known_s"] == 0
+    assert np.abs(errors_ns(result) / std[:6]).max() < 3.5
+    assert std[:6].max() < 0.1
+
+
+def test_sought_anchors_do_not_spoil_what_a_known_start_tells():
+    flown = flight(seconds=16.0, rate=120, anchors=ANCHORS, seed=2)
+    result = calib.fit_from_ranges(flown, poses_until_s=8.0, anchors="sought")
+    found = result.calibration
+    std = np.sqrt(np.diag(found.uncertainty.delays_ns2))
+    assert np.abs(errors_ns(result) / std[:6]).max() < 3.5
+    # Where an anchor is and how late it answers are nearly the same from a flight in the middle of the room.
+    assert all(np.isinf(found.delays_std_ns[tag]) for tag in (11, 12, 13, 14))
+    assert "tags 11, 12, 13, 14" in result.warnings[0]
