@@ -21,6 +21,8 @@ BY_UNIT: Final = {
     "_per_k": Limit(1e4, "no board moves so far by a kelvin"),
     "_per_v": Limit(1e4, "no board moves so far by a volt"),
     "_mps2": Limit(1e5, "nothing that flies takes that"),
+    "_dps": Limit(1e4, "nothing that flies turns so fast"),
+    "_per_sqrt_hz": Limit(1e3, "no sensor is so noisy"),
     "_mps": Limit(1e4, "nothing in air is so fast"),
     "_dbm": Limit(500.0, "between noise of nothing and a lightning"),
     "_db": Limit(500.0, "more than any two powers differ by"),

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.devices import GroupDelay, Profile
 from uwbsim.scenario.motion import Motion
+from uwbsim.scenario.sensors import Height, Imu
 from uwbsim.scenario.surroundings import Shadow
 from uwbsim.units import NS, PPM
 
@@ -35,6 +36,8 @@ class Body(Section):
         None,
         description="Supply voltage of those of its tags that have none of their own, over time.",
     )
+    imu: Imu | None = Field(None, description="Its inertial sensor, whose readings the recording has.")
+    height: Height | None = Field(None, description="Its height sensor, whose readings the recording has.")
 
 
 class Tag(Section):

@@ -30,6 +30,7 @@ from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw, stamp
 from uwbsim.units import NS_PER_S
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
 from uwbsim.world.clocks import LONGEST_RUN_S, Clocks
+from uwbsim.world.inertial import height_readings, inertial_readings
 from uwbsim.world.lookahead import SampledWorld
 from uwbsim.world.reception import Medium
 from uwbsim.world.temperature import readings
@@ -45,7 +46,8 @@ class Simulated:
     the first two messages; `poses` are those of motion capture; `tags` say which body carries which tag, and where;
     `faults` are the exchanges that failed. `overheard` are the columns of what passive tags heard, `cirs` impulse
     responses (time_ns, board, initiator, target, first path in taps, 1016 magnitudes). `meta` is the recording's
-    provenance. `temperature` are the columns of what tags with a temperature or a supply voltage read of them.
+    provenance. `temperature` are the columns of what tags with a temperature or a supply voltage read of them, `imu`
+    and `height` those of bodies' inertial and height sensors.
 
     >>> import uwbsim
     >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
@@ -74,6 +76,8 @@ class Simulated:
     truth_m: Floats
     meta: dict[str, Any]
     temperature: dict[str, NDArray[Any]] = field(default_factory=dict)
+    imu: dict[str, NDArray[Any]] = field(default_factory=dict)
+    height: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
     def planted(self) -> dict[str, Any]:
@@ -163,6 +167,8 @@ def simulate(
         truth_m=(stamped.distance_m[0] + stamped.distance_m[1]) / 2,
         meta=_provenance(scenario),
         temperature=readings(scenario),
+        imu=inertial_readings(scenario, world.trajectories),
+        height=height_readings(scenario, world.trajectories),
     )
 
 
@@ -181,6 +187,8 @@ def write(
         recording.append_faults(simulated.faults)
         recording.append_columns("overheard", simulated.overheard)
         recording.append_columns("temperature", simulated.temperature)
+        recording.append_columns("imu", simulated.imu)
+        recording.append_columns("height", simulated.height)
         recording.append_cirs(simulated.cirs)
         recording.append_frames(frames)
 
