@@ -36,7 +36,7 @@ BIAS_M_S2: Final = 0.4
 STANDS_M: Final = 100.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
     """Rows of one kind: columns (n, k) with values (n, k), columns of the border with values, aims (n,), and a std."""
 
@@ -99,7 +99,7 @@ def _blocks(scene: Scene, columns: Columns, start: State, jerk_m_s3: float) -> I
         yield from _attitude(scene, columns, body)
         yield from _forces(scene, columns, body)
     for where in columns.stand:
-        yield _of_border(where, start.border[where], STANDS_M, columns)
+        yield _of_border(where, start.border[where], STANDS_M)
 
 
 def _of_axis(scene: Scene, columns: Columns, start: State, body: int, axis: int) -> Iterator[Block]:
@@ -153,21 +153,21 @@ def _forces(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
         column = [columns.place[points, body, axis]]
         value = [share]
         # A turn t of the attitude adds t x (R f) to the force.
-        for other, arm in _crossed(axis, sensed.force_m_s2):
+        for other, arm in _crossed(axis, sensed.force_m_s2) if columns.turn[0, body, 0] >= 0 else ():
             column.append(columns.turn[middle.point, body, other])
             value.append(-arm[:, None] * middle.share)
         where = np.broadcast_to(columns.bias[body], (len(lasts), 3))
         aim = sensed.force_m_s2[:, axis] - GRAVITY_M_S2 * (axis == 2)
         yield Block(
-            np.concatenate(column, axis=1),
-            np.concatenate(value, axis=1),
-            where,
-            sensed.turn[:, axis, :],
-            aim,
-            np.full(len(aim), sensed.std_m_s2),
+            column=np.concatenate(column, axis=1),
+            value=np.concatenate(value, axis=1),
+            border=where,
+            border_value=sensed.turn[:, axis, :],
+            aim=aim,
+            std=np.full(len(aim), sensed.std_m_s2),
             force=True,
         )
-    yield _of_border(columns.bias[body], np.zeros(3), BIAS_M_S2, columns)
+    yield _of_border(columns.bias[body], np.zeros(3), BIAS_M_S2)
 
 
 def _crossed(axis: int, vector: Floats) -> list[tuple[int, Floats]]:
@@ -182,11 +182,23 @@ def _sensed(scene: Scene) -> set[int]:
 
 def _plain(column: Ints, value: Floats, aim: Floats, std: float | Floats) -> Block:
     nothing = np.zeros((len(aim), 0))
-    return Block(column, value, nothing.astype(np.int64), nothing, aim, np.broadcast_to(std, aim.shape))
+    return Block(
+        column=column,
+        value=value,
+        border=nothing.astype(np.int64),
+        border_value=nothing,
+        aim=aim,
+        std=np.broadcast_to(std, aim.shape),
+    )
 
 
-def _of_border(where: Ints, aim: Floats, std: float, columns: Columns) -> Block:
+def _of_border(where: Ints, aim: Floats, std: float) -> Block:
     nothing = np.zeros((len(where), 0))
     return Block(
-        nothing.astype(np.int64), nothing, where[:, None], np.ones((len(where), 1)), aim, np.full(len(where), std)
+        column=nothing.astype(np.int64),
+        value=nothing,
+        border=where[:, None],
+        border_value=np.ones((len(where), 1)),
+        aim=aim,
+        std=np.full(len(where), std),
     )

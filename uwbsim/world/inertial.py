@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats
 from uwbsim.random_streams import stream
-from uwbsim.scenario.model import Body, Scenario
+from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.sensors import Height, Imu
+from uwbsim.scenario.tags import Body
 from uwbsim.units import NS_PER_S
 from uwbsim.world.trajectories import Trajectory
 
