@@ -18,11 +18,11 @@ from calib.error_mixture import fit_error_mixture
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
 from calib.ranges import Ranges
 from uwblink.arrays import Floats
-from uwblink.pages.colours import BLUE, GREEN, INK, MAROON, MUTED, PALE, VERMILION
+from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE
 from uwblink.pages.figures import label, legend, mark, sheet
 from uwblink.ticks import SPEED_OF_LIGHT
 
-COLOURS: Final = {"raw": VERMILION, "delays": MAROON, "full": BLUE, "planted": GREEN}
+COLOURS: Final = {"raw": VERMILION, "delays": WINE, "full": BLUE, "planted": GREEN}
 DASHES: Final = {"raw": (0, (1.5, 1.2)), "delays": (0, (5, 1.5)), "full": "-"}
 LABELS: Final = {"raw": "raw", "delays": "delays corrected", "full": "fully corrected"}
 BINS: Final = 20

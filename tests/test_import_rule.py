@@ -56,7 +56,8 @@ FLOORS = {
         ("world",),
         ("simulation",),
         ("boards", "protocols", "twins"),
-        ("pages", "sweep"),
+        ("sweep",),
+        ("pages",),
         ("cli",),
     ),
     "calib": (

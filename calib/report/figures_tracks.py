@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from calib.evaluation.consistency import summarize
 from calib.evaluation.tracking import Localization
 from uwblink.arrays import Floats
-from uwblink.pages.colours import BLUE, INK, MAROON, MUTED, PLUM, VERMILION
+from uwblink.pages.colours import BLUE, GREY, INK, MUTED, VERMILION, WINE
 from uwblink.pages.figures import NARROW_IN, label, legend, mark
 
-COLOUR_OF: Final = {"raw": VERMILION, "calibrated": MAROON, "variance": BLUE, "robust": PLUM}
+COLOUR_OF: Final = {"raw": VERMILION, "calibrated": WINE, "variance": BLUE, "robust": GREY}
 DASHES_OF: Final[dict[str, Any]] = {
     "raw": (0, (1.5, 1.2)),
     "calibrated": (0, (5, 1.5)),

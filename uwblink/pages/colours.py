@@ -11,25 +11,25 @@ from typing import Any, Final
 
 BLUE: Final = "#0072b2"
 VERMILION: Final = "#c8500a"
-GREEN: Final = "#128a63"
-MAROON: Final = "#770000"
-NAVY: Final = "#222299"
-PLUM: Final = "#553344"
+GREEN: Final = "#004422"
+WINE: Final = "#661155"
+GREY: Final = "#666666"
+SAGE: Final = "#889988"
 INK: Final = "#1a1a1a"
 MUTED: Final = "#595959"
 GRID: Final = "#d8d8d8"
 PALE: Final = "#b4b4b4"
 
-SERIES: Final = (BLUE, VERMILION, GREEN, MAROON, NAVY, PLUM)
+SERIES: Final = (BLUE, VERMILION, GREEN, WINE, GREY, SAGE)
 """Colours of what is of one kind: tags, bodies, protocols."""
 
 DARK: Final = {
     BLUE: "#4aa8e8",
     VERMILION: "#f08a4b",
-    GREEN: "#2fbf8f",
-    MAROON: "#eeccdd",
-    NAVY: "#ddee00",
-    PLUM: "#777788",
+    GREEN: "#88ffbb",
+    WINE: "#999999",
+    GREY: "#776655",
+    SAGE: "#4466bb",
     INK: "#e8e8e8",
     MUTED: "#a8adb3",
     GRID: "#3a3f45",
@@ -57,9 +57,9 @@ class Look:
 
 
 def look(number: int) -> Look:
-    """Return the look of one of many: 6 colours, 7 markers and 4 kinds of dashes, so no two of 84 are alike."""
+    """Return the look of one of many: no two of 84 are alike, and no two of 28 where colours are not seen."""
     return Look(
         SERIES[number % len(SERIES)],
         MARKERS[number % len(MARKERS)],
-        DASHES[(number // len(SERIES) + number) % len(DASHES)],
+        DASHES[number % len(DASHES)],
     )

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from uwblink.pages.drawings import inline
 from uwblink.pages.stylesheet import CSS, JS, PARTS
+
+if TYPE_CHECKING:
+    from uwblink.pages.figures import Draw
 
 MANY: Final = 10
 """Columns from which a table is set smaller."""
@@ -34,6 +37,14 @@ def figure_html(drawings: Mapping[str, bytes], caption: str) -> str:
         f"<figure><div class='wide'>{wide}</div><div class='narrow'>{narrow}</div>"
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
+
+
+def both_widths(draw: Draw, caption: str, salt: str) -> str:
+    """Draw a figure at both widths, and return it as HTML; `salt` is a word that no other figure of the page has."""
+    from uwblink.pages.figures import WIDTHS, drawn
+
+    drawings = {name: drawn(draw, width, ["svg"], salt=f"{salt} {name}")["svg"] for name, width in WIDTHS.items()}
+    return figure_html(drawings, caption)
 
 
 def table_html(

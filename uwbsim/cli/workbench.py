@@ -226,7 +226,10 @@ def sweep(
         except KeyboardInterrupt:
             typer.echo(f"{output}: interrupted; what was done is kept, and --resume goes on with it")
             raise typer.Exit(INTERRUPTED) from None
+    from uwbsim.pages import write_sweep_page
+
+    page = write_sweep_page(loaded, output)
     typer.echo(
         f"{output}: {summary.done} runs of {loaded.total}, {summary.failed} failed, {summary.skipped} were there "
-        "already; results.csv, results.parquet"
+        f"already; results.csv, results.parquet, {page.name}"
     )

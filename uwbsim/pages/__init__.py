@@ -7,6 +7,7 @@ from uwblink.lazy import offer
 if TYPE_CHECKING:
     from uwbsim.pages.comparison_page import COLUMNS, FILES, write_comparison
     from uwbsim.pages.optimum_pictures import optimum_file, write_optima
+    from uwbsim.pages.sweep_page import write_sweep_page
     from uwbsim.pages.twin_page import TWIN_COLUMNS, write_twin
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "optimum_file",
     "write_comparison",
     "write_optima",
+    "write_sweep_page",
     "write_twin",
 ]
 
@@ -26,6 +28,7 @@ _HOMES: Final = {
     "optimum_file": "uwbsim.pages.optimum_pictures",
     "write_comparison": "uwbsim.pages.comparison_page",
     "write_optima": "uwbsim.pages.optimum_pictures",
+    "write_sweep_page": "uwbsim.pages.sweep_page",
     "write_twin": "uwbsim.pages.twin_page",
 }
 

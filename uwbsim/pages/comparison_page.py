@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from uwblink.output import write_text
+from uwblink.pages.html import both_widths, page_html, table_html
 from uwbsim.output import check_folder
 from uwbsim.pages import protocol_figures as figures
-from uwbsim.pages.scenario_figures import png
-from uwbsim.pages.scenario_page import STYLE, figure_html
 from uwbsim.protocols.comparison import Comparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.tables import write_csv, write_parquet
-
-TABLE_STYLE = """
-.wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .85rem; }
-th, td { padding: .2rem .45rem; text-align: right; border-bottom: 1px solid #8884; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } figcaption { font-size: .9rem; }
-@page { size: A4; margin: 16mm; } @media print { figure, tr { break-inside: avoid; } body { max-width: none; } }
-"""
 
 COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
     "protocol": lambda o: o.protocol,
@@ -32,9 +24,9 @@ COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
     "RMSE (cm)": lambda o: f"{100 * o.rmse_m:.2f}",
     "95 % of errors (cm)": lambda o: f"{100 * o.low_m:+.1f} … {100 * o.high_m:+.1f}",
     "messages": lambda o: str(o.messages),
-    "air (us)": lambda o: f"{1e6 * o.air_s:.0f}",
-    "duration (us)": lambda o: f"{1e6 * o.duration_s:.0f}",
-    "radio on (us)": lambda o: f"{1e6 * o.radio_on_s:.0f}",
+    "air (µs)": lambda o: f"{1e6 * o.air_s:.0f}",
+    "duration (µs)": lambda o: f"{1e6 * o.duration_s:.0f}",
+    "radio on (µs)": lambda o: f"{1e6 * o.radio_on_s:.0f}",
     "rate (1/s)": lambda o: f"{o.rate_hz:.0f}",
 }
 """What tables on the page and on the terminal show of an outcome."""
@@ -67,37 +59,55 @@ def page(found: Comparison) -> str:
     reply = {name: over_reply(scenario, row) for name, row in protocols.items()}
     distance = {n: over_state(row, states, states.distance_m, samples[n]) for n, row in protocols.items()}
     power = {n: over_state(row, states, states.power_dbm, samples[n]) for n, row in protocols.items()}
-    title = escape(f"Protocols in {scenario.run.name}")
+    over = [
+        (skew, "relative skew of the clocks (ppm)", "Error over the relative skew of the clocks.", False),
+        (
+            reply,
+            "delay of the scheduled message (µs)",
+            "Error over the delay of the scheduled message: the response of single-sided ranging, the final of "
+            "double-sided.",
+            True,
+        ),
+        (distance, "distance (m)", "Error over distance: bins of as many ranges each.", False),
+        (power, "first-path power (dBm)", "Error over first-path power, likewise.", False),
+    ]
+    wide, narrow = _halves(list(COLUMNS))
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<title>{title}</title><style>{STYLE}{TABLE_STYLE}</style></head><body><h1>{title}</h1>",
         f"<p>{outcomes[0].ranges:,} raw ranges with each protocol in the same world, with the same noise. Errors are "
-        "those of raw ranges: antenna delays, power bias and reflections are in them. Radio on: sending and listening, "
-        "of both radios together, a proxy of energy.</p>",
-        _table(list(COLUMNS), [[show(o) for show in COLUMNS.values()] for o in outcomes]),
-        _picture(figures.histograms(samples), "Errors. The outermost bins hold everything beyond them."),
+        "those of raw ranges: antenna delays, power bias and reflections are in them.</p>",
+        table_html(wide, [[COLUMNS[name](o) for name in wide] for o in outcomes]),
+        table_html(narrow, [[COLUMNS[name](o) for name in narrow] for o in outcomes]),
+        "<p class='note'>Predicted: by the protocol's formulas, without simulating. Air: sum of the frames' lengths; "
+        "duration: from the first to the last; radio on: sending and listening, of both radios together, a proxy of "
+        "energy; rate: exchanges one after the other.</p>",
+        both_widths(
+            partial(figures.histograms, samples=samples),
+            "Errors. The outermost bins hold everything beyond them.",
+            "errors",
+        ),
         "<h2>Which wins where</h2>",
         "<p>By prediction, once delays and power bias are calibrated, without reflections. One range: the least error "
         "of a single range. Per second: the least error of the mean of what fits into a second.</p>",
         _winners(list(protocols), found.winners),
         "<h2>Over what</h2><p>Points are simulated, lines predicted; the first two without delays, power bias and "
-        "reflections.</p>",
-        _picture(figures.error_over(skew, "relative skew (ppm)"), "Error over the relative skew of the clocks."),
-        _picture(
-            figures.error_over(reply, "delay of the scheduled message (us)", logarithmic=True),
-            "Error over the delay of the scheduled message: the response of single-sided ranging, the final of "
-            "double-sided.",
+        "reflections. Axes that cover decades are logarithmic, and say so; biases have a sign, so theirs is to scale "
+        f"up to ± {figures.LINEAR_CM:g} cm and logarithmic beyond.</p>",
+        *(
+            both_widths(partial(figures.error_over, curves=c, x=x, logarithmic=log), caption, f"over {x}")
+            for c, x, caption, log in over
         ),
-        _picture(figures.error_over(distance, "distance (m)"), "Error over distance."),
-        _picture(figures.error_over(power, "first-path power (dBm)"), "Error over first-path power."),
-        "</body></html>\n",
     ]
-    return "\n".join(parts)
+    return page_html(f"Protocols in {scenario.run.name}", parts)
+
+
+def _halves(names: list[str]) -> tuple[list[str], list[str]]:
+    """Return what protocols know and what they cost: the columns of two tables, each whole on a screen."""
+    cut = names.index("messages")
+    return names[:cut], ["protocol", *names[cut:]]
 
 
 def _winners(names: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
-    header = ["scheduled delay (us)", "one range", "per second", *(f"{name} (cm)" for name in names)]
+    header = ["scheduled delay (µs)", "one range", "per second", *(f"{name} (cm)" for name in names)]
     cells = [
         [
             str(row["scheduled_us"]),
@@ -107,14 +117,4 @@ def _winners(names: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> str:
         ]
         for row in rows
     ]
-    return _table(header, cells)
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<div class='wide'><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-
-
-def _picture(figure: Any, caption: str) -> str:
-    return figure_html(png(figure), caption)
+    return table_html(header, cells)

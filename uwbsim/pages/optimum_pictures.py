@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 from uwblink.output import write_bytes
+from uwblink.pages.figures import picture
 from uwbsim.output import check_folder
 from uwbsim.pages.protocol_figures import optimum_curve
-from uwbsim.pages.scenario_figures import png
 from uwbsim.protocols.reply_delay import Optimum
 
 
@@ -22,8 +23,8 @@ def write_optima(found: Iterable[Optimum], folder: Path, *, force: bool = False)
 
     Raises what `check_folder` raises.
     """
-    pictures = {optimum_file(one.protocol): png(optimum_curve(one)) for one in found}
+    pictures = {optimum_file(one.protocol): picture(partial(optimum_curve, found=one), "png") for one in found}
     check_folder(folder, pictures, force=force)
     folder.mkdir(exist_ok=True)
-    for name, picture in pictures.items():
-        write_bytes(folder / name, picture, force=force)
+    for name, data in pictures.items():
+        write_bytes(folder / name, data, force=force)

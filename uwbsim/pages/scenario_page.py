@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import base64
 import os
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Final
 
 from uwblink.output import check_output, write_bytes, write_text
+from uwblink.pages.figures import picture
+from uwblink.pages.html import both_widths, page_html
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.errors import ScenarioError
-from uwbsim.pages.scenario_figures import picture, png, room, timing
+from uwbsim.pages.scenario_figures import room, timing
 from uwbsim.pages.scenario_summary import preview
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 
 PICTURES: Final = (".png", ".svg", ".pdf")
-STYLE: Final = """
-:root { color-scheme: light dark; --ink: #1a1a1a; --page: #fff; --soft: #f3f5f7; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e8e8e8; --page: #16181b; --soft: #22262b; } }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--page); max-width: 1040px;
-  margin: 0 auto; padding: 1rem; }
-img { width: 100%; height: auto; background: #fff; border-radius: .4rem; } figure { margin: 1rem 0; }
-pre { background: var(--soft); padding: .6rem; overflow-x: auto; font-size: .85rem; }
-"""
 
 
 def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -54,7 +48,7 @@ def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bo
     scenario = as_scenario(scenario)
     suffix = path.suffix.lower()
     if suffix in PICTURES:
-        write_bytes(path, picture(room(scenario), suffix[1:], 150), force=force)
+        write_bytes(path, picture(partial(room, scenario=scenario), suffix[1:]), force=force)
     elif suffix == ".html":
         write_text(path, page(scenario), force=force)
     else:
@@ -63,22 +57,24 @@ def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bo
 
 def page(scenario: Scenario) -> str:
     """Return the scene as HTML that needs no other file; text from the scenario is escaped."""
-    title = escape(scenario.run.name)
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
-        figure_html(png(room(scenario)), "Bodies' paths (two minutes at most), tags where they start, obstacles"),
+        both_widths(
+            partial(room, scenario=scenario),
+            "Bodies' paths (two minutes at most), tags where they start, obstacles, the room's walls; to scale.",
+            "room",
+        ),
         "<h2>What will happen</h2>",
-        f"<pre>{escape(str(preview(scenario)))}</pre>",
+        f"<pre class='table'>{escape(str(preview(scenario)))}</pre>",
         "<h2>One exchange</h2>",
+        "<p>Every stamp, and what the paper calls it; pale: preamble and start of frame, full: header and data. dt41 "
+        "is the initiator's round trip, dt32 the target's reply, dt53 and dt64 the third leg as its sender and its "
+        "receiver have it.</p>",
         *(
-            figure_html(png(timing(scenario, name)), f"{row.title}: every stamp, and what the paper calls it")
+            both_widths(partial(timing, scenario=scenario, name=name), f"{row.title}.", f"timing {name}")
             for name, row in _distinct().items()
         ),
-        "</body></html>\n",
     ]
-    return "\n".join(parts)
+    return page_html(scenario.run.name, parts)
 
 
 def _distinct() -> dict[str, RangingProtocol]:
@@ -88,10 +84,3 @@ def _distinct() -> dict[str, RangingProtocol]:
         if row.messages not in [other.messages for other in found.values()]:
             found[name] = row
     return found
-
-
-def figure_html(data: bytes, caption: str) -> str:
-    """Return a PNG picture and its caption as HTML."""
-    picture = base64.b64encode(data).decode()
-    text = escape(caption, quote=True)
-    return f"<figure><img alt='{text}' src='data:image/png;base64,{picture}'><figcaption>{text}</figcaption></figure>"

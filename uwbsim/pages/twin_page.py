@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Final
 
 from uwblink.output import check_output, write_text
+from uwblink.pages.html import both_widths, page_html, table_html
 from uwbsim.pages import twin_figures as figures
-from uwbsim.pages.comparison_page import TABLE_STYLE
-from uwbsim.pages.scenario_figures import png
-from uwbsim.pages.scenario_page import STYLE, figure_html
 from uwbsim.twins import LEVEL, Compared, Twin
 
 BY_PAIR: Final = ("residual of calibrated ranges", "first-path power at initiator")
@@ -39,13 +38,9 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
 
 def page(found: Twin, compared: Sequence[Compared]) -> str:
     """Return the page; names of files are escaped."""
-    title = escape(f"The twin of {Path(found.recording).name}")
     alike = sum(one.alike for one in compared)
     pairs = [one for one in compared if one.name in BY_PAIR]
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>",
-        f"<title>{title}</title><style>{STYLE}{TABLE_STYLE}</style></head><body><h1>{title}</h1>",
         f"<p>A scenario fitted to {len(found.measured):,} exchanges of {len(found.measured.pairs)} pairs, with the "
         f"delays and the bias curve of {escape(Path(found.calibration).name)} as truth, and what it makes beside what "
         f"was measured. {alike} of {len(compared)} quantities are alike.</p>",
@@ -56,27 +51,36 @@ def page(found: Twin, compared: Sequence[Compared]) -> str:
         "largest difference of the cumulative distributions, and <i>p</i> how likely chance makes it so large "
         f"(Kolmogorov and Smirnov, with sizes as the values are worth); below {LEVEL:g} they differ. The scenario was "
         "fitted to these same exchanges, so the test is of its form, not of what it predicts.</p>",
-        _table(list(TWIN_COLUMNS), [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]),
-        figure_html(png(figures.marginals(compared)), "Distributions. The outermost bins hold what lies beyond them."),
+        table_html(list(TWIN_COLUMNS), [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]),
+        both_widths(
+            partial(figures.marginals, found=compared),
+            "Distributions. The outermost bins hold what lies beyond them.",
+            "marginals",
+        ),
         "<h2>Pair by pair</h2>",
-        figure_html(png(figures.by_pair(pairs)), "A dot a pair of five exchanges or more; on the line both agree.")
+        both_widths(
+            partial(figures.by_pair, found=pairs),
+            "A dot a pair of five exchanges or more; on the line both agree.",
+            "pairs",
+        )
         if pairs
         else "",
         "<h2>What was found</h2>",
-        _table(["what", "value"], [[name, _shown(value)] for name, value in found.found.items() if _is_number(value)]),
+        table_html(
+            ["what", "value"], [[name, _shown(value)] for name, value in found.found.items() if _is_number(value)]
+        ),
         *(_nested(found, name) for name in ("tags", "pairs")),
         "<h2>What the recording cannot tell</h2><p>This keeps its default, or was decided without the recording.</p>",
         "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in found.unknown) + "</ul>",
-        "</body></html>\n",
     ]
-    return "\n".join(parts)
+    return page_html(f"The twin of {Path(found.recording).name}", parts)
 
 
 def _nested(found: Twin, name: str) -> str:
     rows = found.found[name]
     columns = list(next(iter(rows.values())))
     cells = [[key, *(_shown(row[column]) for column in columns)] for key, row in rows.items()]
-    return _table([name[:-1], *columns], cells)
+    return table_html([name[:-1], *columns], cells)
 
 
 def _is_number(value: object) -> bool:
@@ -91,9 +95,3 @@ def _shown(value: object) -> str:
 
 def _both(measured: float, simulated: float, form: str = ".3g") -> str:
     return " / ".join("–" if math.isnan(value) else format(value, form) for value in (measured, simulated))
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<div class='wide'><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"

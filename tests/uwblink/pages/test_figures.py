@@ -1,0 +1,98 @@
+"""Figures at paper size, and drawings as parts of pages."""
+
+import json
+import re
+from html import unescape
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from tests.browser import lies_well
+from uwblink.pages.colours import BLUE, DARK, INK, look
+from uwblink.pages.drawings import VARIABLES, inline
+from uwblink.pages.figures import PAGE_IN, drawn, label, legend, mark, picture, sheet
+from uwblink.pages.html import both_widths, page_html, table_html
+
+
+def two_panels(width_in):
+    figure, panels = sheet(width_in, 2)
+    for axes in panels:
+        for k in range(12):
+            (line,) = axes.plot([1, 10, 100], [k, k + 1, k], label=f"tag {k}", **look(k).line())
+            mark(line, f"tag {k}")
+        label(axes, "time (s)", "error (cm)")
+    panels[1].set_xscale("log")
+    legend(figure)
+    return figure
+
+
+def test_panels_stand_beside_each_other_on_a_page_and_above_each_other_in_a_column():
+    wide, narrow = (sheet(width, 2)[0] for width in (7.16, 3.5))
+    assert [axes.get_subplotspec().get_geometry()[:2] for axes in (wide.axes[0], narrow.axes[0])] == [(1, 2), (2, 1)]
+
+
+def test_it_is_drawn_once_for_all_files():
+    calls = []
+
+    def draw(width_in):
+        calls.append(width_in)
+        return two_panels(width_in)
+
+    files = drawn(draw, 3.5, ["svg", "pdf", "png"])
+    assert calls == [3.5]
+    assert files["pdf"].startswith(b"%PDF")
+    assert files["png"].startswith(b"\x89PNG")
+    assert b'width="252pt"' in files["svg"]
+    assert files == drawn(two_panels, 3.5, ["svg", "pdf", "png"]), "the same bytes each time"
+
+
+def test_colours_of_a_drawing_become_those_of_the_page():
+    page = inline(drawn(two_panels, 7.16, ["svg"], salt="one")["svg"], "it's <one>")
+    assert page.startswith("<svg viewBox=")
+    assert "<one>" not in page
+    assert "it&#x27;s &lt;one&gt;" in page
+    for colour in DARK:
+        assert colour not in page
+    assert f"var({VARIABLES[BLUE]})" in page
+    assert f"var({VARIABLES[INK]})" in page
+    shared = re.findall(r'id="([^"]*)"', page)
+    other = re.findall(r'id="([^"]*)"', inline(drawn(two_panels, 7.16, ["svg"], salt="other")["svg"], ""))
+    assert not set(shared) & set(other), "ids that two drawings of a page would share"
+    assert {f"tag {k}" for k in range(12)} <= set(re.findall(r'data-name="([^"]*)"', page))
+
+
+def test_a_page_knows_what_each_panel_shows():
+    page = inline(picture(two_panels, "svg"), "")
+    left, right = json.loads(unescape(re.search("data-panels='([^']*)'", page)[1]))
+    assert left["names"] == ["time (s)", "error (cm)"]
+    assert (left["scale"], right["scale"]) == (["linear", "linear"], ["log", "linear"])
+    assert left["box"][0] < left["box"][2] <= right["box"][0] < right["box"][2] <= 72 * PAGE_IN
+    # The first tick of the left panel lies where the box and the axis say.
+    x = float(re.search(r'<use xlink:href="#m[0-9a-f]+" x="([0-9.]+)"', page)[1])
+    share = (x - left["box"][0]) / (left["box"][2] - left["box"][0])
+    at = left["x"][0] + share * (left["x"][1] - left["x"][0])
+    assert at == pytest.approx(round(at / 20) * 20, abs=0.5)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_page_lies_well(width, tmp_path):
+    header = ["pair", *(f"column {k}" for k in range(20))]
+    parts = [
+        both_widths(two_panels, "A caption. " * 12, "two"),
+        table_html(header, [["1-2", *("12345.6" for _ in range(20))]] * 3),
+        table_html(["what", "is"], [["a question " * 9, "an answer " * 9]], words=True),
+        f"<p class='bad'>{'word ' * 60}{'x' * 90}</p><pre>{'y' * 300}</pre>",
+    ]
+    lies_well(page_html("A page", parts), width, tmp_path)
+
+
+def test_a_picture_is_on_white():
+    import io
+
+    from matplotlib.image import imread
+
+    def draw(width_in):
+        return Figure(figsize=(width_in, 1))
+
+    assert np.all(imread(io.BytesIO(picture(draw, "png"))) == 1)

@@ -1,0 +1,137 @@
+"""Scenes, comparisons and sweeps as pages: what stands on them, and how it lies in a window."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import uwbsim
+from tests.browser import lies_well
+from uwblink import PROTOCOLS
+from uwblink.pages.figures import picture, style
+from uwbsim.pages.comparison_page import page as comparison_page
+from uwbsim.pages.scenario_figures import room, timing
+from uwbsim.pages.scenario_page import page as scene_page
+from uwbsim.pages.sweep_figures import Swept, figure_over_keys
+from uwbsim.pages.sweep_page import write_sweep_page
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+BENCH, OFFICE = SCENARIOS / "two_boards_on_a_bench/bench.toml", SCENARIOS / "office/office.toml"
+
+
+def words(draw):
+    return re.findall(r"<text[^>]*>([^<]*)</text>", picture(draw, "svg").decode())
+
+
+@pytest.mark.parametrize("width", [3.5, 7.16])
+def test_a_room_is_to_scale_within_its_walls(width):
+    scenario = uwbsim.load(OFFICE)
+    with style():
+        figure = room(width, scenario)
+        figure.draw_without_rendering()
+    low, high = np.array(scenario.room.min_m), np.array(scenario.room.max_m)
+    scales = []
+    for axes, (x, y) in zip(figure.axes, ((0, 1), (0, 2)), strict=True):
+        box = axes.get_window_extent()
+        scales += [box.width / np.ptp(axes.get_xlim()), box.height / np.ptp(axes.get_ylim())]
+        for limits, k in ((axes.get_xlim(), x), (axes.get_ylim(), y)):
+            assert limits[0] <= low[k]
+            assert limits[1] >= high[k]
+            assert np.ptp(limits) < 1.4 * (high - low)[k] + 0.8, "no more than the room"
+    assert scales[:2] == pytest.approx([scales[0]] * 2, rel=1e-3), "a metre is as long along both axes"
+
+
+@pytest.mark.parametrize("width", [3.5, 7.16])
+@pytest.mark.parametrize("name", ["ss", "ds", "ds-alt", "ds-sym"])
+def test_words_of_a_timing_diagram_do_not_cover_each_other(width, name):
+    with style():
+        figure = timing(width, uwbsim.load(BENCH), name)
+        figure.draw_without_rendering()
+        boxes = [(t.get_text(), t.get_window_extent()) for t in figure.axes[0].texts if t.get_text()]
+        edges = figure.bbox
+    for k, (text, box) in enumerate(boxes):
+        assert edges.x0 <= box.x0, text
+        assert box.x1 <= edges.x1, text
+        for other, its in boxes[k + 1 :]:
+            assert not box.overlaps(its), (text, other)
+
+
+@pytest.mark.parametrize("name", ["ss", "ds", "ds-alt", "ds-sym"])
+def test_a_timing_diagram_has_every_interval_with_its_length(name):
+    scenario = uwbsim.load(BENCH)
+    shown = words(lambda width: timing(width, scenario, name))
+    three = len(PROTOCOLS[name].messages) == 3
+    named = {word[:4] for word in shown if word.startswith("dt")}
+    assert named == ({"dt41", "dt32", "dt53", "dt64"} if three else {"dt41", "dt32"})
+    lengths = {float(one) for word in shown for one in re.findall(r"^dt\d\d = ([\d.]+) µs", word)}
+    reply_us = scenario.ranging.response_delay_uus * 1.0256410
+    assert any(abs(length - reply_us) < 1 for length in lengths)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_scene_lies_well(width, tmp_path):
+    lies_well(scene_page(uwbsim.load(OFFICE)), width, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def compared():
+    return comparison_page(uwbsim.compare(uwbsim.load(BENCH), list(PROTOCOLS.values()), 3000))
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_comparison_lies_well(width, compared, tmp_path):
+    lies_well(compared, width, tmp_path)
+    assert "log axis" in compared
+    assert "logarithmic beyond" in compared
+
+
+PLAN = """
+sweep = {{ scenario = "{scenario}", kind = "calibrate", seeds = 3 }}
+[vary]
+"radio.rx_noise_ps" = [50.0, 100.0, 200.0]
+{more}
+"""
+
+
+def judged(flight):
+    """A figure that grows with what is varied, and another that stays."""
+    spread = float(np.std(flight.exchanges.range_m - flight.truth_m))
+    return {"spread_m": spread, "same": 1.0, "word": "none"}
+
+
+@pytest.mark.parametrize("more", ["", "'radio.tx_noise_ps' = [0.0, 90.0]"])
+def test_a_sweep_draws_what_came_out(tmp_path, more):
+    plan = tmp_path / "plan.toml"
+    plan.write_text(PLAN.format(scenario=BENCH.as_posix(), more=more))
+    design = uwbsim.load_design(plan)
+    uwbsim.run_sweep(design, tmp_path / "out", workers=1, evaluate=judged)
+    page = write_sweep_page(design, tmp_path / "out").read_text()
+    assert re.findall("<figcaption>(.*?)</figcaption>", page) == ["spread (cm)."]
+
+    assert "rx_noise_ps" in page
+    assert f"{len(design.seeds)} seeds each" in page
+
+
+def test_bands_over_seeds_reach_from_the_least_to_the_largest():
+    values = [1.0] * 3 + [2.0] * 3
+    swept = Swept({"key": values}, ["ds"] * 6, np.array([1.0, 2.0, 9.0, 4.0, 5.0, 6.0]))
+    figure = figure_over_keys(7.16, swept, "figure")
+    band = figure.axes[0].collections[0].get_paths()[0].vertices
+    assert {(x, y) for x, y in band.tolist()} >= {(1.0, 1.0), (1.0, 9.0), (2.0, 4.0), (2.0, 6.0)}
+    assert figure.axes[0].lines[0].get_ydata().tolist() == [2.0, 5.0]
+
+
+def test_two_keys_make_a_map_of_medians_over_seeds():
+    keys: dict[str, list[object]] = {"a": [1.0, 1.0, 2.0, 2.0] * 2, "b": [10.0, 20.0] * 4}
+    swept = Swept({**keys}, ["ds"] * 8, np.array([1.0, 2.0, 3.0, 4.0, 3.0, 4.0, 5.0, 6.0]))
+    figure = figure_over_keys(7.16, swept, "figure")
+    (mesh,) = figure.axes[0].collections
+    assert mesh.get_array().tolist() == [[2.0, 4.0], [3.0, 5.0]]
+
+
+def test_words_and_many_keys_are_drawn_key_by_key():
+    keys: dict[str, list[object]] = {"a": [1.0, 2.0] * 4, "b": ["x", "y", "y", "x"] * 2, "c": list(range(8))}
+    figure = figure_over_keys(3.5, Swept({**keys}, ["ds", "ss"] * 4, np.arange(8.0)), "figure")
+    assert len(figure.axes) == 3
+    assert [t.get_text() for t in figure.axes[1].get_xticklabels()] == ["x", "y"]
