@@ -27,6 +27,9 @@ NO_STAMPS: Final = "range"
 """What stands for the protocol of a range that came without stamps."""
 
 HALVES: Final = (0.5, 0.5)
+ROWS_AT_ONCE: Final = 65_536
+"""Exchanges whose stamps are worked on together, so that what leads to ranges stays small beside them."""
+
 LONGEST_M: Final = 1e4
 LOUDEST_DBM: Final = -30.0
 FAINTEST_DBM: Final = -140.0
@@ -82,7 +85,7 @@ class Ranges:
         given = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
         if given.shape != (len(exchanges),):
             raise BadInputError(f"has shape {given.shape}, expected ({len(exchanges)},)", parameter="truth_m")
-        initiator, target = delay_weights(exchanges)
+        raw, initiator, target, middle = _of_stamps(exchanges)
         bare = without_stamps(exchanges)
         return cls(
             source=source,
@@ -90,8 +93,8 @@ class Ranges:
             initiator=exchanges.initiator,
             target=exchanges.target,
             protocol=np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
-            raw_m=raw_range(exchanges),
-            truth_m=_truth(exchanges, given, poses, tags),
+            raw_m=raw,
+            truth_m=_truth(exchanges, given, poses, tags, middle),
             weight_initiator=initiator,
             weight_target=target,
             fpp1_dbm=measured_powers(exchanges.fpp1_dbm),
@@ -261,10 +264,21 @@ def measured_powers(fpp_dbm: Floats) -> Floats:
         return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
 
 
-def _truth(exchanges: Exchanges, given_m: Floats, poses: Poses | None, tags: Sequence[Tag]) -> Floats:
+def _of_stamps(exchanges: Exchanges) -> tuple[Floats, Floats, Floats, Ints]:
+    """Return raw ranges, both weights of delays, and the middles of the first two messages in ns, each (n,)."""
+    raw, initiator, target = (np.empty(len(exchanges)) for _ in range(3))
+    middle = np.empty(len(exchanges), dtype=np.int64)
+    for begin in range(0, len(exchanges), ROWS_AT_ONCE):
+        rows = slice(begin, begin + ROWS_AT_ONCE)
+        some = exchanges[rows]
+        raw[rows], (initiator[rows], target[rows]) = raw_range(some), delay_weights(some)
+        middle[rows] = some.time_ns + np.rint(intervals(some).dt41 * (TICK_S * 5e8)).astype(np.int64)
+    return raw, initiator, target, middle
+
+
+def _truth(exchanges: Exchanges, given_m: Floats, poses: Poses | None, tags: Sequence[Tag], middle_ns: Ints) -> Floats:
     known = np.isfinite(given_m)
     if known.all() or poses is None or not len(poses):
         return given_m
     # A range belongs to the middle of its first two messages.
-    middle = exchanges.time_ns + np.rint(intervals(exchanges).dt41 * (TICK_S * 5e8)).astype(np.int64)
-    return np.where(known, given_m, distances_m(poses, list(tags), exchanges.initiator, exchanges.target, middle))
+    return np.where(known, given_m, distances_m(poses, list(tags), exchanges.initiator, exchanges.target, middle_ns))

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses, Tag
+
+ROWS_AT_ONCE: Final = 16_384
+"""Ranges worked on together, so that what leads to their distances stays in the cache."""
 
 
 def distances_m(poses: Poses, tags: list[Tag], initiator: Ints, target: Ints, time_ns: Ints) -> Floats:
@@ -15,9 +20,13 @@ def distances_m(poses: Poses, tags: list[Tag], initiator: Ints, target: Ints, ti
     quaternions. NaN where a tag has no lever arm, its body no poses, or the time lies outside them;
     a body with a single pose does not move.
     """
-    tracks = _tracks(poses, tags)
-    apart = _antennas(tracks, tags, target, time_ns) - _antennas(tracks, tags, initiator, time_ns)
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", apart, apart)))
+    tracks, found = _tracks(poses, tags), np.empty(len(time_ns))
+    for begin in range(0, len(time_ns), ROWS_AT_ONCE):
+        rows = slice(begin, begin + ROWS_AT_ONCE)
+        ends = (_antennas(tracks, tags, ids[rows], time_ns[rows]) for ids in (target, initiator))
+        apart = next(ends) - next(ends)
+        found[rows] = np.sqrt(np.einsum("ij,ij->i", apart, apart))
+    return found
 
 
 def antennas_m(poses: Poses, tags: list[Tag], ids: Ints, time_ns: Ints) -> Floats:
