@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from calib.calibration.c_header import c_header
+from calib.calibration.json_format import is_tag
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.errors import BadInputError
@@ -219,12 +221,12 @@ def read_miluv(path: Path) -> Calibration:
     """
     text = read_text(path, BadInputError, "calibration of MILUV (.json)")
     try:
-        table = json.loads(text)
-        delays = {int(tag): float(delay) for tag, delay in table["delays_ns"].items()}
+        table = json.loads(text, parse_float=_finite, parse_constant=_finite)
+        delays = {_tag(tag): float(delay) for tag, delay in table["delays_ns"].items()}
         bias, sigma = (_curve(table[key]) for key in ("bias_spline_m", "std_spline_m"))
         speed = float(table.get("c_mps", SPEED_OF_LIGHT))
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise BadInputError(f"{path}: not a MILUV calibration ({type(error).__name__}: {error})") from error
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise BadInputError(f"{path}: not a MILUV calibration ({type(error).__name__}: {error!s:.200})") from error
     rest = {key: value for key, value in table.items() if key not in ("delays_ns", "bias_spline_m", "std_spline_m")}
     order = list(table)
     return Calibration(
@@ -240,6 +242,19 @@ def read_miluv(path: Path) -> Calibration:
         power_at="reception",
         provenance={"imported_from": path.name, "miluv": {key: rest.get(key) for key in order}},
     )
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no finite number")
+    return value
+
+
+def _tag(text: str) -> int:
+    if not is_tag(text):
+        raise ValueError(f"{text[:40]!r} is no id of a tag")
+    return int(text)
 
 
 def _curve(table: dict[str, Any]) -> Curve:

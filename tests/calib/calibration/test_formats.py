@@ -183,6 +183,34 @@ def test_what_is_no_miluv_calibration(tmp_path, text):
         read_miluv(tmp_path / "m.json")
 
 
+SPLINE = '{"knots": [0, 0, 1, 1], "coeffs": [1, 2], "degree": 1}'
+MILUV = '{"delays_ns": {"1": 0.1}, "bias_spline_m": %s, "std_spline_m": %s}'
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("0.1", "NaN"),
+        ("0.1", "1e999"),
+        ("0.1", "-Infinity"),
+        ("0.1", "1" + 400 * "0"),
+        ('"1"', '"1.5"'),
+        ('"1"', '"' + 5000 * "9" + '"'),
+        ("[1, 2]", "[1, NaN]"),
+        ("[0, 0, 1, 1]", "[]"),
+        ("[0, 0, 1, 1]", "[0, 0, 1, Infinity]"),
+        ("0.1", 100_000 * "[" + 100_000 * "]"),
+    ],
+)
+def test_numbers_that_are_none_do_not_come_in_with_a_miluv_calibration(tmp_path, old, new):
+    good = MILUV % (SPLINE, SPLINE)
+    (tmp_path / "m.json").write_text(good)
+    assert read_miluv(tmp_path / "m.json").delays_ns == {1: 0.1}
+    (tmp_path / "m.json").write_text(good.replace(old, new))
+    with pytest.raises(BadInputError, match=r"m\.json: not a MILUV calibration"):
+        read_miluv(tmp_path / "m.json")
+
+
 @pytest.mark.parametrize("form", ["miluv", "ros-yaml", "c-header"])
 def test_a_form_with_one_curve_does_not_take_groups(form):
     grouped = fit(ranges(2000), groups={"a": (1, 2), "b": (3, 7)}).calibration
