@@ -138,7 +138,7 @@ class Decoder:
             if buffer.startswith(text, at):
                 return TextLine(text.decode()), at + len(text)
         rest = buffer[at : at + self._longest_start]
-        if any(start.startswith(rest) for start in self._starts) or (kind is not None and len(buffer) == at + 3):
+        if any(start.startswith(rest) for start in self._starts):
             raise NeedMore
         raise Malformed
 
