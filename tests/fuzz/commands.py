@@ -83,6 +83,7 @@ def prepare(number: int, seeds: Path, place: Path) -> list[str]:
     rng = random.Random(number)
     kind = rng.choice(KINDS)
     damaged = place / kind.file
+    shutil.copyfile(seeds / "scenario.toml", place / "scenario.toml")  # which a plan names
     if rng.random() < OPTIONS_SHARE:
         shutil.copyfile(seeds / kind.file, damaged)
         return damage_options(words_of(kind, damaged, seeds, _output(kind, place), rng), rng)

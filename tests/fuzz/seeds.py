@@ -40,6 +40,9 @@ RECORDING_COMMANDS: Final = (
     "uwblink replay {} -o {out}",
     "calib fit {} -o {out}",
     "calib fit {} -o {out} --loss cauchy",
+    "calib fit {} -o {out} --truth ranges --poses-until 1",
+    "calib survey {} --known plane -o {out}",
+    "calib compare {calibration.json} {calibration.json}",
     "calib evaluate {} -c {calibration.json}",
     "calib localize {} -c {calibration.json}",
     "calib apply {} -c {calibration.json} -o {out}",
@@ -56,6 +59,8 @@ KINDS: Final = (
             "calib evaluate {flight.uwb} -c {}",
             "calib apply {flight.uwb} -c {} -o {out}",
             "calib compare {} {calibration.json}",
+            "calib show {}",
+            "calib import miluv {} -o {out}",
             "calib localize {flight.uwb} -c {}",
             *(
                 f"calib export {{}} --to {form} -o {{out}}"
@@ -72,6 +77,16 @@ KINDS: Final = (
     Kind("table.csv.gz", BINARY, ("uwblink import csv {} -o {out}",)),
     Kind("map.toml", TEXT, ("uwblink import csv {table.csv} --map {} -o {out}",)),
     Kind("poses.tum", TEXT, ("uwblink poses {live.uwb} --from ifo001={}",)),
+    Kind(
+        "known.toml",
+        TEXT,
+        ("calib survey {flight.uwb} --known {} -o {out}", "calib survey {flight.uwb} --known {} -o {out} --json"),
+    ),
+    Kind(
+        "plan.toml",
+        TEXT,
+        ("calib plan 4 --on plane --taped 2 --tape-sigma 0.01 --size 3,4", "uwbsim sweep {} -o {out} --workers 1"),
+    ),
     Kind("tags.toml", TEXT, ("uwblink poses {live.uwb} --from ifo001={poses.tum} --tags {}",)),
 )
 
@@ -91,6 +106,8 @@ def write_seeds(folder: Path) -> None:
     shutil.copyfile(next((folder / "exported").glob("ifo001*")), folder / "poses.tum")
     (folder / "tags.toml").write_text("".join(_tag(tag) for tag in recording.tags))
     (folder / "map.toml").write_text(MAP)
+    (folder / "known.toml").write_text(KNOWN)
+    (folder / "plan.toml").write_text(PLAN)
     table = (ROOT / "docs/examples/exchanges.csv").read_bytes()
     (folder / "table.csv").write_bytes(table)
     (folder / "table.csv.gz").write_bytes(gzip.compress(table, mtime=0))
@@ -99,6 +116,34 @@ def write_seeds(folder: Path) -> None:
 def _tag(tag: uwblink.Tag) -> str:
     return f'[[tags]]\nid = {tag.tag}\nbody = "{tag.body}"\nlever_arm_m = {list(tag.lever_arm_m)}\n'
 
+
+KNOWN: Final = """known = "plane"
+
+[[distances]]
+between = [1, 3]
+distance_m = 2.0
+sigma_m = 0.01
+
+[[positions]]
+tag = 5
+position_m = [1.0, 2.0, 0.5]
+
+[[arrangements]]
+name = "first"
+start_s = 0.0
+end_s = 2.0
+"""
+
+PLAN: Final = """[sweep]
+scenario = "scenario.toml"
+protocols = ["ss", "ds"]
+ranges = 20
+seeds = 1
+
+[vary]
+"ranging.response_delay_uus" = [300, 1500]
+"radio.rx_noise_ps" = [10.0, 100.0]
+"""
 
 MAP: Final = """protocol = "ds"
 bits = 32
