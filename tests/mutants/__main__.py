@@ -56,7 +56,14 @@ ROOMS: Final = {
         ("uwblink/boards/connection.py",),
         tuple(f"tests/uwblink/boards/test_{name}.py" for name in ("connection", "connection_limits", "board")),
     ),
-    "clocks": Room(("uwbsim/world/clocks.py",), ("tests/uwbsim/world", "tests/uwbsim/simulation")),
+    "clocks": Room(
+        ("uwbsim/world/clocks.py",),
+        (
+            "tests/uwbsim/world/test_clocks.py",
+            "tests/uwbsim/world/test_allan.py",
+            "tests/uwbsim/simulation/test_protocols.py",
+        ),
+    ),
     "air": Room(
         ("uwbsim/simulation/air.py", "uwbsim/simulation/timestamps.py"),
         ("tests/uwbsim/simulation", "tests/uwbsim/protocols/test_monte_carlo.py"),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.uwbsim.simulation.test_protocols import bench
-from uwbsim.world.clocks import Clocks
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import LONGEST_RUN_S, Clocks
+from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 
 
 def clocks(skews=(12.0, -7.0), drift=0.01, duration=100.0):
@@ -102,3 +102,33 @@ def test_the_walk_goes_on_to_its_last_step_and_stands_from_there():
     read = c.read(which, steps * tenth) - c.offset[0] - steps * tenth
     np.testing.assert_allclose(np.diff(read), expected[:-1] * tenth, atol=2)
     assert c.rate(which[:1], np.array([-5 * tenth]))[0] == c.walk_rate[0, 0]
+
+
+def test_offsets_are_any_reading_of_the_counter_and_any_part_of_a_tick():
+    scenario = bench()
+    many = tuple(scenario.tags[0].model_copy(update={"id": k}) for k in range(1, 65))
+    c = Clocks.of(scenario.model_copy(update={"tags": many}))
+    ticks, parts = np.divmod(c.offset, SUBTICKS)
+    assert 0 <= ticks.min() < 2**36
+    assert 2**39 < ticks.max() < 2**40
+    assert len(np.unique(parts)) > 50
+    given = tuple(t.model_copy(update={"clock_offset_s": 1.0}) for t in scenario.tags)
+    assert (Clocks.of(scenario.model_copy(update={"tags": given})).offset // SUBTICKS).tolist() == [63_897_600_000] * 2
+
+
+@pytest.mark.parametrize(("rate", "span_s"), [("rate", 130e-6), ("exchange_rate", 0.1)])
+def test_the_rate_of_a_noisy_clock_is_what_its_reading_gains_over_a_preamble_or_an_exchange(rate, span_s):
+    c = noisy_clocks(drift_ppm_per_sqrt_s=0.0)
+    span = round(span_s * SUBTICKS_PER_SECOND)
+    time = np.random.default_rng(1).integers(SUBTICKS_PER_SECOND, 10 * SUBTICKS_PER_SECOND, 500)
+    which = np.arange(500) % 2
+    gained = (c.read(which, time) - c.read(which, time - span)) / span - 1
+    found = getattr(c, rate)(which, time)
+    # A reading is rounded to a sub-tick at either end.
+    np.testing.assert_allclose(found, gained, rtol=0, atol=1.01 / span)
+    assert np.std(found[which == 0]) > 2 / span, "there is noise in it"
+
+
+def test_runs_may_last_as_long_as_63_bits_count_subticks():
+    assert LONGEST_RUN_S == 129_600
+    assert (LONGEST_RUN_S + 3600) * SUBTICKS_PER_SECOND + 2**40 * SUBTICKS < 2**63
