@@ -89,6 +89,9 @@ campaigns: setup ## what a training flight needs, into docs/tutorials/motion-cap
 worlds: setup ## fits in worlds that share nothing with the simulator, into docs/accuracy.md (20 minutes)
 	$(BIN)/python -m benchmarks.worlds_report
 
+surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/without-motion-capture.md (10 minutes)
+	$(BIN)/python -m benchmarks.surveys
+
 doctor-table: setup ## write docs/doctor.md's table: planted faults, hits and false alarms (15 minutes)
 	$(BIN)/python -W ignore -m benchmarks.doctor
 

@@ -100,7 +100,11 @@ class Plan:
             lines.append(f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else "undetermined"))
         if math.isfinite(self.common_ns):
             lines.append(f"  what all share ± {self.common_ns:.3f} ns")
-        lines += [f"not determined: {direction.words}" for direction in self.verdict.free]
+        if self.undetermined:
+            lines += [f"not determined: {direction.words}" for direction in self.verdict.free]
+        lines.append(
+            "Where a curve over power is fitted along, what all share is known less well, and differences as well."
+        )
         for best in self.next_best:
             lines.append(f"next best: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}")
         return lines
@@ -188,13 +192,12 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
     pairs = len(list(combinations(given.tags, 2)))
     seconds = max(FEWEST_S, math.ceil(RANGES_A_PAIR * pairs / rate_hz / 10) * 10.0)
     halves = {tag: TWO_SIDED_95 * wide * float(s) for tag, s in zip(given.tags, verdict.std, strict=True)}
-    share = np.full(len(given.tags), 1 / len(given.tags))
     return Plan(
         on=given.on,
         tags=given.tags,
         arrangements=made,
         half_ns=halves,
-        common_ns=TWO_SIDED_95 * wide * verdict.std_of(share),
+        common_ns=TWO_SIDED_95 * wide * _common(verdict),
         verdict=verdict,
         next_best=tuple(_next_best(given, informations, candidates, layouts_chosen, total, wide)),
         seconds_each=seconds,
@@ -328,6 +331,14 @@ def _best_tape(given: _Given, chosen: list[Layout]) -> tuple[int, tuple[int, int
 
 def _verdict(total: Floats, tags: tuple[int, ...]) -> Verdict:
     return judge(total * M_PER_NS**2, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+
+
+def _common(verdict: Verdict) -> float:
+    """Return how well the mean of all delays is known, in ns; infinite where one of them is not."""
+    if not verdict.determined.all():
+        return math.inf
+    share = np.full(len(verdict.std), 1 / len(verdict.std))
+    return math.sqrt(float(share @ verdict.covariance @ share))
 
 
 def _freedom(given: _Given, chosen: list[Layout]) -> float:

@@ -237,9 +237,14 @@ def _said(found: Adjusted, second: SecondBest | None, verdict: Verdict) -> list[
     said = []
     if not found.settled:
         said.append("the search stopped before it settled: delays and places are not final")
-    if not verdict.whole:
+    if not verdict.determined.all():
         words = "; ".join(d.words for d in verdict.free)
         said.append(f"not determined, and left out: {words}")
+    if found.network.power is not None:
+        said.append(
+            "a constant of the curve and one of all delays are the same to ranges: what the delays share is known only "
+            "as well as the curve at its reference power; differences of delays are known better (`uncertainty`)"
+        )
     if second is not None and second.ambiguous:
         who = ", ".join(map(str, second.tags))
         said.append(

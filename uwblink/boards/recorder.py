@@ -24,7 +24,7 @@ from uwblink.boards.writer import RecordingWriter
 from uwblink.errors import BoardError, PlanError, PortError, PortLostError
 from uwblink.output import check_output
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Tag
+from uwblink.recording.schema import SHAPES, Arrangement, Fault, Tag
 from uwblink.wire.codec import Event
 from uwblink.wire.messages import IdReport, Message, RangeCommand, RangeReport, Skipped, TextLine
 
@@ -43,6 +43,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     *,
     duration_s: float = float("inf"),
     passive: bool = False,
+    arrangement: str | None = None,
+    known: str = "",
     force: bool = False,
     stop: Callable[[], bool] = lambda: False,
     watch: Callable[[Progress], None] | None = None,
@@ -53,9 +55,10 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
 
     `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are told what the file gets
     (see `uwblink.boards.listeners`), and `using` are other ports than this computer's serial ones (`VirtualPorts`).
-    `KeyboardInterrupt` ends a recording like `stop`, with everything in the file. Raises the errors of `Board.open`,
-    `PlanError` (a tag of the plan is absent, two boards have one id, a duration that is none), and `RecordingError`
-    (cannot be written, disk full); the file stays readable.
+    `arrangement` names the places of boards that stand still meanwhile, `known` to be on a "line" or a "plane"; it is
+    marked in the recording, for a survey. `KeyboardInterrupt` ends a recording like `stop`, with everything in the
+    file. Raises the errors of `Board.open`, `PlanError` (a tag of the plan is absent, two boards have one id, a
+    duration that is none), and `RecordingError` (cannot be written, disk full); the file stays readable.
 
     >>> import uwblink, uwbsim
     >>> ports = uwbsim.VirtualPorts(
@@ -78,6 +81,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     """
     if not duration_s > 0:
         raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
+    if known not in SHAPES or (known and not arrangement):
+        raise PlanError(f"known: found {known!r:.40}, allowed: line, plane, of an arrangement that has a name")
     path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
     check_output(path, force=force)
     found = identify(ports, using)
@@ -97,6 +102,9 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
                 recorder.run(duration_s, stop, tell)
             finally:
                 recorder.close()
+        if arrangement:
+            last_ns = max(using.host_ns(), recorder.progress.start_ns + 1)
+            recording.append_arrangements([Arrangement(arrangement, recorder.progress.start_ns, last_ns, known)])
     return recorder.progress
 
 

@@ -41,6 +41,12 @@ def record(
     ] = None,
     rate: Annotated[float | None, typer.Option(min=0.001, help="Exchanges a second in total (Hz).")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
+    arrangement: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Boards stand still: name how, for calib survey.")
+    ] = None,
+    known: Annotated[
+        str, typer.Option(help="How boards of an arrangement are known to stand.", **choice("line", "plane"))
+    ] = "",
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
     cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
     live: Annotated[
@@ -73,6 +79,8 @@ def record(
         chosen = replace(chosen, rate_hz=rate)
     if cir:
         chosen = replace(chosen, get_cir=True)
+    if known and not arrangement:
+        raise PlanError("--known: is said of an arrangement; give --arrangement NAME, too")
     if calibration and not live:
         raise PlanError("--calibration: corrected ranges are shown on the page of --live; give that, too")
     with interrupts() as stop, _watcher() as watch, _page(output, calibration, live_port, live) as page:
@@ -88,6 +96,8 @@ def record(
             chosen,
             duration_s=duration or float("inf"),
             passive=passive,
+            arrangement=arrangement,
+            known=known,
             force=force,
             stop=stop,
             watch=watch_all,

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
 from uwbsim.scenario.devices import Devices
-from uwbsim.scenario.motion import RandomFlight, Static, Waypoints
+from uwbsim.scenario.motion import Carried, RandomFlight, Static, Waypoints
 from uwbsim.scenario.multipath import GeometricMultipath, TwoStateMultipath
 from uwbsim.scenario.radio import Radio, Spline
 from uwbsim.scenario.ranging import Ranging
@@ -190,6 +190,8 @@ def _named_points(body: Body) -> list[tuple[str, Vector]]:
     motion = body.motion
     if isinstance(motion, Static):
         return [("position_m", motion.position_m)]
+    if isinstance(motion, Carried):
+        return [(f"places_m[{k}]", place) for k, place in enumerate(motion.places_m)]
     if isinstance(motion, RandomFlight):
         return [("box_min_m", motion.box_min_m), ("box_max_m", motion.box_max_m)]
     if isinstance(motion, Waypoints):

@@ -81,6 +81,21 @@ class Static(Section):
     yaw_deg: float = Field(0.0, description="How far it is turned about the z axis.")
 
 
+class Carried(Section):
+    """A body that stands still in one place after the other, and is carried from each to the next; then stays."""
+
+    model: Literal["carried"]
+    places_m: tuple[Vector, ...]
+    stay_s: Positive
+    carry_s: Positive = 10.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.places_m:
+            raise ValueError("places_m: found no place, give one or more")
+        return self
+
+
 class Recorded(Section):
     """A trajectory from a file: TUM, CSV, or the poses of a recording, of `body` there; filled in on reading."""
 
@@ -95,4 +110,4 @@ class Recorded(Section):
     )
 
 
-Motion = Annotated[RandomFlight | Waypoints | Figure | Static | Recorded, Field(discriminator="model")]
+Motion = Annotated[RandomFlight | Waypoints | Figure | Static | Carried | Recorded, Field(discriminator="model")]

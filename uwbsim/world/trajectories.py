@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Floats
-from uwbsim.scenario.motion import Figure, RandomFlight, Recorded, Static, Waypoints
+from uwbsim.scenario.motion import Carried, Figure, RandomFlight, Recorded, Static, Waypoints
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body for a purpose."""
@@ -55,7 +55,9 @@ def _quaternions(angles: Floats) -> Floats:
     return np.stack([w * sx + cx * x, cx * y + z * sx, cx * z - y * sx, w * cx - x * sx], axis=1)
 
 
-def sample(motion: RandomFlight | Waypoints | Figure | Static | Recorded, duration_s: float, draw: Draw) -> Trajectory:
+def sample(
+    motion: RandomFlight | Waypoints | Figure | Static | Carried | Recorded, duration_s: float, draw: Draw
+) -> Trajectory:
     """Make the trajectory of a body over [0, duration_s]; random ones draw from the streams that `draw` names.
 
     A longer duration continues the same flight.
@@ -70,6 +72,21 @@ def _static(motion: Static, _duration_s: float, _draw: Draw) -> Trajectory:
         lambda t: np.broadcast_to(point, (len(t), 3)).copy(),
         lambda t: np.broadcast_to(yaw, (len(t), 3)).copy(),
     )
+
+
+def _carried(motion: Carried, _duration_s: float, _draw: Draw) -> Trajectory:
+    places = np.array(motion.places_m)
+    cycle = motion.stay_s + motion.carry_s
+
+    def position(time_s: Floats) -> Floats:
+        leg = np.clip(np.floor(time_s / cycle).astype(np.int64), 0, len(places) - 1)
+        share = np.clip((time_s - leg * cycle - motion.stay_s) / motion.carry_s, 0, 1)
+        # From standstill to standstill.
+        smooth = share**2 * (3 - 2 * share)
+        after = np.minimum(leg + 1, len(places) - 1)
+        return np.asarray(places[leg] + smooth[:, None] * (places[after] - places[leg]))
+
+    return Trajectory(position, _level)
 
 
 def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory:
@@ -160,6 +177,7 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
 
 _MAKERS: Final[dict[type, Callable[[Any, float, Draw], Trajectory]]] = {
     Static: _static,
+    Carried: _carried,
     Waypoints: _waypoints,
     RandomFlight: _random_flight,
     Figure: _figure,

@@ -27,6 +27,25 @@ def stored(path):
         return recording.exchanges(), recording.faults(), recording.frames(), recording.meta()
 
 
+def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
+    path, ports = tmp_path / "a.uwb", VirtualPorts(bench_scenario())
+    plan = RangingPlan(rate_hz=50.0)
+    record(ports.names.values(), path, plan, duration_s=1.0, using=ports, arrangement="A", known="plane")
+    with Recording.open(path) as recording:
+        (mark,) = recording.arrangements()
+        time_ns = recording.exchanges().time_ns
+    assert (mark.name, mark.known) == ("A", "plane")
+    assert mark.start_ns <= time_ns.min()
+    assert time_ns.max() < mark.end_ns < mark.start_ns + 1.2e9
+
+
+def test_what_is_known_is_known_of_an_arrangement(tmp_path):
+    ports = VirtualPorts(bench_scenario())
+    for known, name in (("line", None), ("ring", "A")):
+        with pytest.raises(PlanError, match="known: found"):
+            record(ports.names.values(), tmp_path / "a.uwb", RangingPlan(), using=ports, arrangement=name, known=known)
+
+
 def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):
     path, ports = tmp_path / "f.uwb", VirtualPorts(bench_scenario())
     done = record(ports.names.values(), path, RangingPlan(rate_hz=100.0), duration_s=1.5, using=ports)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwbsim.random_streams import stream
-from uwbsim.scenario.motion import RandomFlight, Static, Waypoints
+from uwbsim.scenario.motion import Carried, RandomFlight, Static, Waypoints
 from uwbsim.world.trajectories import sample
 
 
@@ -27,6 +27,16 @@ def test_waypoints_are_passed_on_time():
     way = Waypoints(model="waypoints", times_s=(0, 2, 5), points_m=((0, 0, 1), (1, 2, 1), (3, 0, 2)))
     path = sample(way, 10.0, partial(stream, 1, "a")).position_m(np.array([0.0, 2.0, 5.0, 9.0]))
     np.testing.assert_allclose(path, [(0, 0, 1), (1, 2, 1), (3, 0, 2), (3, 0, 2)], atol=1e-12)
+
+
+def test_a_carried_body_stands_still_and_goes_on_smoothly():
+    motion = Carried(model="carried", places_m=((0, 0, 1), (2, 0, 1), (1, 1, 1)), stay_s=20.0, carry_s=5.0)
+    path = sample(motion, 100.0, partial(stream, 1, "a"))
+    held = path.position_m(np.array([0.0, 20.0, 25.0, 45.0, 50.0, 99.0]))
+    np.testing.assert_allclose(held, [(0, 0, 1)] * 2 + [(2, 0, 1)] * 2 + [(1, 1, 1)] * 2, atol=1e-12)
+    np.testing.assert_allclose(path.position_m(np.array([22.5])), [(1, 0, 1)], atol=1e-12)
+    time = np.linspace(0, 100, 10_001)
+    assert np.linalg.norm(np.diff(path.position_m(time), axis=0), axis=1).max() * 100 < 2 / 5 * 1.51
 
 
 def test_lever_arm_turns_with_the_body():
