@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import typer
-from rich.markup import escape
 
 COMMA: Final = ","
 """What separates names in one word."""
@@ -50,7 +49,16 @@ def _paths(value: Any) -> list[Path]:
 def epilog(*examples: str) -> str | None:
     """Return examples as an epilog, a line each; None without any."""
     heads = ["Example:" if len(examples) == 1 else "Examples:"]
-    return "\n".join([*heads, *(f"  {escape(one)}" for one in examples)]) if examples else None
+    return "\n".join([*heads, *(f"  {plain(one)}" for one in examples)]) if examples else None
+
+
+def plain(text: str) -> str:
+    """Return a text in which nothing is markup: rich escapes it, and is loaded only where there is a bracket."""
+    if "[" not in text:
+        return text
+    from rich.markup import escape
+
+    return escape(text)
 
 
 def choice(*names: str, more: Callable[[], Iterable[str]] | None = None) -> dict[str, Any]:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 from typer.core import TyperGroup
 
-from uwblink.cli.guide import apart, epilog
+from uwblink.cli.guide import apart, epilog, plain
 from uwblink.cli.shared import Force
 from uwblink.cli.waiting import waiting
 
@@ -47,7 +46,7 @@ def _command(row: Importer) -> Any:
 
 def _made(name: str, text: str, function: Callable[..., None], example: str) -> Any:
     app = typer.Typer(add_completion=False)
-    app.command(name, help=escape(text), epilog=epilog(example))(apart(function))
+    app.command(name, help=plain(text), epilog=epilog(example))(apart(function))
     return typer.main.get_command(app)
 
 

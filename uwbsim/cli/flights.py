@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.markup import escape
 
 from uwblink.cli.guide import add
 from uwblink.cli.shared import interrupts, print_json
@@ -89,6 +88,7 @@ def scenarios(
         print_json(found)
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table.grid("name", "what it is", padding=(0, 2, 0, 0))
