@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
@@ -80,24 +82,33 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
 def write_tum(found: list[Localization], folder: Path, *, force: bool = False) -> None:
     """Write the trajectory of each body and filter, and the true one, into a folder, which is made if it is missing."""
     folder.mkdir(parents=True, exist_ok=True)
-    for one in found:
+    for name, one in zip(_names(f"{one.source}-{one.body}" for one in found), found, strict=True):
         texts = {stage: as_tum(track) for stage, track in one.tracks.items()}
         texts["truth"] = as_tum(one.tracks["raw"], truth=True)
         for stage, text in texts.items():
-            name = "".join(c if c.isalnum() or c in "-_" else "_" for c in f"{one.source}-{one.body}-{stage}")
-            write_text(folder / f"{name}.tum", text, force=force)
+            write_text(folder / f"{name}-{stage}.tum", text, force=force)
+
+
+def _names(texts: Iterable[str]) -> list[str]:
+    """Return names of files for texts: those of recordings of one name in two folders are numbered."""
+    found: list[str] = []
+    for text in texts:
+        plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in text)
+        numbered = (f"{plain}_{k}" for k in count(2))
+        found.append(plain if plain not in found else next(name for name in numbered if name not in found))
+    return found
 
 
 def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
     """Return a line a body: what it was localized by, and how far off it was where that is known."""
-    lines = [f"{'by ranges to fixed anchors':34s}{'RMSE (m)':>10s}{'median':>9s}{'95 %':>9s}{'own std':>9s}  restarts"]
+    lines = [f"{'by ranges to fixed anchors':33s}{'RMSE (m)':>10s}{'median':>9s}{'95 %':>9s}{'own std':>9s}  restarts"]
     for one in found:
         off = np.linalg.norm(one.estimate_m - one.truth_m, axis=1)
         off = off[np.isfinite(off)]
         figures = (one.rmse_m, *np.quantile(off, (0.5, 0.95))) if len(off) else (np.nan,) * 3
         cells = "".join(f"{'-':>9s}" if value != value else f"{value:9.3f}" for value in figures)
         own = float(np.sqrt(np.mean(one.std_m**2)))
-        lines.append(f"{one.source + ' ' + one.body:34s} {cells}{own:9.3f}  {len(one.restarts_s)}")
+        lines.append(f"{one.source + ' ' + one.body:33s} {cells}{own:9.3f}  {len(one.restarts_s)}")
     noise = settings.noise
     moves = (
         f"accelerometer {noise.force:g} m/s^2 and gyro {noise.gyro:g} rad/s a root of Hz"
@@ -128,8 +139,7 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
 def write_onboard_tum(found: list[OnboardTrack], folder: Path, *, force: bool = False) -> None:
     """Write the trajectory of each body with its attitudes, and the true one where there is one, into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for one in found:
-        name = "".join(c if c.isalnum() or c in "-_" else "_" for c in f"{one.source}-{one.body}-{one.model}")
+    for name, one in zip(_names(f"{one.source}-{one.body}-{one.model}" for one in found), found, strict=True):
         write_text(folder / f"{name}.tum", _tum(one.time_ns, one.estimate_m, one.attitude), force=force)
         known = np.isfinite(one.truth_m).all(axis=1) & np.isfinite(one.true_attitude).all(axis=1)
         if known.any():

@@ -15,6 +15,7 @@ from calib.evaluation.consistency import summarize
 from calib.evaluation.localization import fixed_std, localize
 from calib.evaluation.localization_display import as_tum, localization_json, localization_text, write_tum
 from calib.evaluation.tracking import Settings
+from calib.samples import sample_flight
 from calib.sources import Flight, load_flight
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate, write
@@ -195,3 +196,13 @@ def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_
     assert len(list(tmp_path.glob("*.tum"))) == 3 * 4
     truth = next(tmp_path.glob("*robot*truth.tum"), None) or next(tmp_path.glob("*truth.tum"))
     assert truth.read_text().splitlines()[0].startswith("# time")
+
+
+def test_recordings_of_one_name_keep_their_own_trajectories(tmp_path):
+    flights = [sample_flight(60, seed=seed) for seed in (1, 2)]
+    known = fit(sample_flight()).calibration
+    found = [one for flight in flights for one in localize(flight, known)]
+    write_tum(found, tmp_path)
+    raw = sorted(path.name for path in tmp_path.glob("*-raw.tum"))
+    assert raw == sorted(f"memory-robot{k}{end}-raw.tum" for k in (1, 2, 3) for end in ("", "_2"))
+    assert (tmp_path / raw[0]).read_text() != (tmp_path / raw[1]).read_text()
