@@ -13,6 +13,7 @@ import typer
 from calib.cli.arguments import AsJson, DelaysOnly, Fix, Force, NewCalibration
 from calib.cli.flags import with_flags
 from uwblink.cli.guide import add
+from uwblink.cli.waiting import waiting
 
 if TYPE_CHECKING:
     import calib
@@ -74,14 +75,15 @@ def survey(
     if anchors:
         check_output(anchors, force=force)
     try:
-        result = calib.survey(
-            recordings,
-            known=known,
-            fixed_ns=fixed_ns(fix or ()),
-            pair_error_m=pair_error,
-            delays_only=delays_only,
-            regardless=regardless,
-        )
+        with waiting("surveying"):
+            result = calib.survey(
+                recordings,
+                known=known,
+                fixed_ns=fixed_ns(fix or ()),
+                pair_error_m=pair_error,
+                delays_only=delays_only,
+                regardless=regardless,
+            )
         if anchors:
             result.save_anchors(anchors, arrangement=arrangement, force=force)
     except calib.UnanswerableError as error:
@@ -149,18 +151,19 @@ def plan(
     """Say how to calibrate without true distances: what to do step by step, and how well delays will be known."""
     import calib
 
-    found = calib.plan(
-        _boards(boards),
-        on="" if on == "space" else on,
-        arrangements=arrangements,
-        size_m=None if size is None else _numbers(size, "size_m"),
-        taped=taped,
-        tape_sigma_m=tape_sigma,
-        anchors=[int(tag) for tag in _numbers(anchors, "anchors")],
-        anchor_sigma_m=anchor_sigma,
-        pair_error_m=pair_error,
-        rate_hz=rate,
-    )
+    with waiting("planning"):
+        found = calib.plan(
+            _boards(boards),
+            on="" if on == "space" else on,
+            arrangements=arrangements,
+            size_m=None if size is None else _numbers(size, "size_m"),
+            taped=taped,
+            tape_sigma_m=tape_sigma,
+            anchors=[int(tag) for tag in _numbers(anchors, "anchors")],
+            anchor_sigma_m=anchor_sigma,
+            pair_error_m=pair_error,
+            rate_hz=rate,
+        )
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
         return

@@ -12,7 +12,7 @@ import typer
 COMMA: Final = ","
 """What separates names in one word."""
 
-WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot")
+WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot", "anchors")
 """Parameters of commands that name what is written; all other paths are read."""
 
 WIDEST: Final = 20
