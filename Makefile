@@ -68,7 +68,7 @@ picture: setup ## draw the README's picture
 bench: setup ## measure speed and memory; prints the first table of docs/speed.md
 	$(BIN)/python -m benchmarks
 
-bench-large: setup ## measure a calibration of 3.8 million exchanges (a minute, 3 GB)
+bench-large: setup ## measure a calibration of 3.8 million exchanges (two minutes, 2 GB)
 	$(BIN)/python -m benchmarks.large
 
 bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
