@@ -32,6 +32,7 @@ test: setup ## run the whole test suite, on two cores
 
 docs: setup ## build the documentation site into docs/_build/html; warnings are errors (a minute)
 	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs docs/_build/html
+	$(BIN)/python -m docs.site.narrow
 	@echo "open docs/_build/html/index.html"
 
 coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
@@ -61,6 +62,9 @@ lint: setup ## check style (ruff) and types (mypy)
 format: setup ## rewrite the code in the house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+notebooks: setup ## run the notebooks and store what they print and draw
+	$(BIN)/python -m docs.site.notebooks
 
 picture: setup ## draw the README's picture
 	$(BIN)/python -m benchmarks.picture

@@ -70,6 +70,7 @@ nb_merge_streams = True
 
 copybutton_exclude = ".linenos, .gp"
 highlight_language = "none"
+smartquotes = False  # two dashes begin an option
 
 html_theme = "furo"
 html_title = f"uwbcal {release}"

@@ -29,7 +29,7 @@ def test_the_script_simulates_fits_corrects_and_judges(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert (tmp_path / "bias.png").stat().st_size > 5000
-    assert (tmp_path / "calibration.json").exists()
+    assert (tmp_path / "first.json").exists()
     one = re.search(rf"3.21 m corrected: {NUMBER} m, standard deviation {NUMBER} m", done.stdout)
     (first, *_) = re.search(r"^\[ *(\S+) +(\S+) +(\S+) *\]$", done.stdout, flags=re.MULTILINE).groups()
     # The first of the array has the same range, and both powers where the one has its first: some millimetres apart.

@@ -1,9 +1,11 @@
 """Every block of code on every page of the documentation works, or says why it is not run."""
 
+import json
 import shutil
 
 import matplotlib as mpl
 import pytest
+from matplotlib import pyplot
 
 from tests import pages
 
@@ -47,6 +49,17 @@ def test_the_blocks_of_a_page_work(page, recordings, tmp_path, monkeypatch):
             runner.run(block)
         except Exception as error:
             raise AssertionError(f"{page.name}, line {block.line}: {error}") from error
+
+
+@pytest.mark.parametrize("notebook", sorted(pages.DOCS.glob("notebooks/*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_runs_and_stands_with_its_outputs(notebook, monkeypatch):
+    monkeypatch.chdir(notebook.parent)
+    runner = pages.Runner()
+    cells = [cell for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+    for cell in cells:
+        runner.run(pages.Block("python", "".join(cell["source"]), 1, "", ""))
+    assert all(cell["outputs"] for cell in cells[2:]), "make notebooks"
+    pyplot.close("all")
 
 
 def test_blocks_that_are_not_run_say_why():

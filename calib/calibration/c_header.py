@@ -59,8 +59,8 @@ static int uwb_lifted(double *fpp1_dbm, double *fpp2_dbm, double *lifted)
 /* Correct a range in metres by the powers of both ends in dBm (0 or NaN: not measured). Returns 0; 1 where the power is
    beyond the fitted ones; 2 where no power was measured (only the delays are corrected, sigma is NaN); -1 for a tag
    that has no delay (nothing is written). sigma_m may be NULL. */
-static int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, int initiator, int target,
-                       double *corrected_m, double *sigma_m)
+static inline int uwb_correct(double range_m, double fpp1_dbm, double fpp2_dbm, int initiator, int target,
+                              double *corrected_m, double *sigma_m)
 {
     double first = 0.0, second = 0.0, lifted, bias;
     int k, found = 0;
@@ -87,7 +87,7 @@ _ERRORS: Final = """
 /* What errors to expect of corrected ranges of two tags, reflections included: their standard deviation about their
    mean, that mean (reflections make ranges long), in metres, and the share of them that are reflected. Returns 0; 2
    where no power was measured (all are NaN). */
-static int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, int target, double *sigma_total_m,
+static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, int target, double *sigma_total_m,
                       double *mean_error_m, double *tail_share)
 {
     double lifted, part = 0.0, noise, detour, away, square;

@@ -11,9 +11,9 @@ test = uwbsim.simulate(uwbsim.load("scenarios/icra2023/test1.toml", {"run.durati
 result = calib.fit(train)
 print(result)
 result.plot_bias().figure.savefig("bias.png")
-result.save("calibration.json", force=True)
+result.save("first.json", force=True)
 
-calibration = calib.load_calibration("calibration.json")
+calibration = calib.load_calibration("first.json")
 one = calibration.correct(3.21, fpp1_dbm=-84.5, fpp2_dbm=-86.0, initiator=1, target=3)
 print(f"3.21 m corrected: {one.range_m:.3f} m, standard deviation {one.sigma_m:.3f} m")
 ranges, powers = np.array([3.21, 4.05, 2.87]), np.array([-84.5, -90.1, -83.0])
