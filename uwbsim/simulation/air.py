@@ -4,7 +4,8 @@ The loop decides what happens and in which order. It runs on nominal delays, wit
 exact instants, on which nothing in it depends; those are computed afterwards in batches (`timestamps`).
 
 A frame is noted when it is decided to send it and judged when it has ended, so that every frame which overlaps it is
-known by then: one event a message.
+known by then: one event a message. An exchange whose messages are all heard, and which is over before any other host
+can begin, is one event.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 import simpy
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.rows import RangingProtocol
 from uwbsim.scenario.airtime import TURNAROUND_S, after_marker_s, before_marker_s, message_bytes
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
@@ -33,21 +35,47 @@ Powers = Callable[[int, int], Floats]
 """Returns the power (dBm) at every tag from a sender, at a true time in sub-ticks."""
 
 
+FOREVER: Final = 1 << 62
+
+
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One planned exchange: when, who, and what the radios will make of each message.
+    """One planned exchange: who, and what the radios will make of each message.
 
     `heard[k]` says whether message k is above the receiver's sensitivity, `delay[k]` is the sub-ticks from the stamp
-    it waits for until message k leaves, `number` its place in the plan, `pause` what the initiator waits first.
+    it waits for until message k leaves, `number` its place in the plan.
     """
 
     number: int
-    start: int
     initiator: int
     target: int
     heard: tuple[bool, ...]
     delay: tuple[int, ...]
-    pause: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """A plan of n exchanges as columns: when, who, and what the radios will make of each message.
+
+    `pause` is what the initiator waits first, `heard` and `delay` (messages, n) are those of a `Slot`.
+    """
+
+    start: list[int]
+    initiator: list[int]
+    target: list[int]
+    pause: list[int]
+    heard: Bools
+    delay: Ints
+
+    def slot(self, number: int) -> Slot:
+        """Return one exchange."""
+        return Slot(
+            number,
+            self.initiator[number],
+            self.target[number],
+            tuple(self.heard[:, number].tolist()),
+            tuple(self.delay[:, number].tolist()),
+        )
 
 
 @dataclass(slots=True)
@@ -79,13 +107,16 @@ class Rules:
 class Air:
     """The medium and the radios on it, while the slots of a plan are played."""
 
-    def __init__(self, protocol: RangingProtocol, slots: int, tags: int, powers: Powers, rules: Rules) -> None:
+    def __init__(
+        self, protocol: RangingProtocol, slots: Slots, tags: int, hosts: int, powers: Powers, rules: Rules
+    ) -> None:
         """Begin at time zero with no frame on the air.
 
-        `slots` is the number of planned exchanges, `tags` that of radios; `powers` gives what each hears of a sender.
+        `tags` is the number of radios and `hosts` that of those who command them; `powers` gives what each radio hears
+        of a sender.
         """
         self.env = simpy.Environment()
-        self._messages = protocol.messages
+        self._messages, self._slots = protocol.messages, slots
         self._powers, self._rules = powers, rules
         self._before = _subticks(before_marker_s(rules.preamble_symbols))
         self._after = [_subticks(after_marker_s(n)) for n in message_bytes(protocol)]
@@ -93,20 +124,57 @@ class Air:
         self._turnaround = _subticks(TURNAROUND_S)
         self._frames: list[_Frame] = []
         self._busy_until = [0] * tags
-        self.outcomes = Outcomes([-1] * slots, [-1] * slots, [""] * slots)
+        self._soonest = [0] * hosts
+        self._lengths = self._undisturbed()
+        self.outcomes = Outcomes([-1] * len(slots.start), [-1] * len(slots.start), [""] * len(slots.start))
 
-    def play(self, slots: Sequence[Slot], report: Callable[[int], None] | None = None) -> Steps:
+    def play(self, host: int, numbers: Sequence[int], report: Callable[[int], None] | None = None) -> Steps:
         """Play the slots of one host, one after the other."""
-        env = self.env
-        for count, slot in enumerate(slots):
-            if slot.start > env.now:
-                yield env.timeout(slot.start - int(env.now))
-            if slot.pause:
-                yield env.timeout(slot.pause)
-            yield from self._exchange(slot)
-            yield env.timeout(self._turnaround)
+        env, slots, soonest = self.env, self._slots, self._soonest
+        for count, number in enumerate(numbers):
+            begin = max(soonest[host], slots.start[number])
+            soonest[host] = begin
+            if begin > env.now:
+                yield env.timeout(begin - int(env.now))
+            soonest[host] = FOREVER
+            if self._alone(number, begin):
+                end = self._succeed(number, begin)
+            else:
+                soonest[host] = 0
+                if slots.pause[number]:
+                    yield env.timeout(slots.pause[number])
+                yield from self._exchange(slots.slot(number))
+                end = int(env.now)
+            soonest[host] = end + self._turnaround
             if report and not count % 500:
                 report(count)
+        soonest[host] = FOREVER
+
+    def _undisturbed(self) -> list[int]:
+        """Return how long each exchange takes if nothing disturbs it, n; -1 for those that are to be looked at."""
+        slots, after = self._slots, np.array(self._after)[:, None]
+        waits = slots.delay[1:] - self._before - after[:-1]
+        plain = slots.heard.all(axis=0) & (np.array(slots.pause) == 0) & (waits <= self._patience).all(axis=0)
+        length = self._before + slots.delay[1:].sum(axis=0) + self._after[-1]
+        lengths: list[int] = np.where(plain, length, -1).tolist()
+        return lengths
+
+    def _alone(self, number: int, begin: int) -> bool:
+        """Whether an exchange that begins now is over before anything else can happen."""
+        length, busy = self._lengths[number], self._busy_until
+        return (
+            length >= 0
+            and min(self._soonest) > begin + length
+            and busy[self._slots.initiator[number]] <= begin
+            and busy[self._slots.target[number]] <= begin
+        )
+
+    def _succeed(self, number: int, begin: int) -> int:
+        """Note an exchange that nothing disturbs; return when its last frame has ended."""
+        self.outcomes.start[number] = begin + self._before
+        end = begin + self._lengths[number]
+        self._busy_until[self._slots.initiator[number]] = self._busy_until[self._slots.target[number]] = end
+        return end
 
     def _exchange(self, slot: Slot) -> Steps:
         """Send the messages of an exchange in turn; stop, after the wait for it, at one that is not received."""
@@ -178,15 +246,16 @@ class Air:
 
 def run(
     protocol: RangingProtocol,
-    hosts: Sequence[Sequence[Slot]],
+    slots: Slots,
+    hosts: Sequence[Sequence[int]],
     tags: int,
     powers: Powers,
     rules: Rules,
     progress: Callable[[float], None] | None = None,
 ) -> Outcomes:
-    """Play the slots of all hosts, each host's in order; returns what became of every slot."""
-    total = sum(map(len, hosts))
-    air = Air(protocol, total, tags, powers, rules)
+    """Play a plan, whose slots by their numbers are each host's in order; returns what became of every slot."""
+    total = len(slots.start)
+    air = Air(protocol, slots, tags, len(hosts), powers, rules)
     counts = [0] * len(hosts)
 
     def reporter(host: int) -> Callable[[int], None] | None:
@@ -199,7 +268,7 @@ def run(
 
         return report
 
-    processes = [air.env.process(air.play(slots, reporter(h))) for h, slots in enumerate(hosts)]
+    processes = [air.env.process(air.play(h, numbers, reporter(h))) for h, numbers in enumerate(hosts)]
     air.env.run(until=air.env.all_of(processes))
     return air.outcomes
 

@@ -147,8 +147,8 @@ def simulate(
     plan = schedule(scenario)
     draws = draw(scenario, len(plan.start), len(protocol.messages))
     if contention:
-        hosts, powers = _hosts(run, plan, draws), _powers(run.world)
-        outcomes = air.run(protocol, hosts, len(scenario.tags), powers, _rules(scenario), progress)
+        slots, powers = _slots(run, plan, draws), _powers(run.world)
+        outcomes = air.run(protocol, slots, plan.hosts(), len(scenario.tags), powers, _rules(scenario), progress)
     else:
         outcomes = _undisturbed(run, plan, draws)
     lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)
@@ -211,27 +211,19 @@ def _described(flight: Simulated) -> str:
     return "\n".join(lines)
 
 
-def _hosts(run: _Run, plan: Schedule, draws: Draws) -> list[list[air.Slot]]:
-    """Give the event loop what it needs, as plain integers, a list a host: it does no arithmetic of its own."""
-    scenario, messages = run.scenario, run.protocol.messages
-    heard = _heard(run, plan, draws)
-    scheduled = scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
+def _slots(run: _Run, plan: Schedule, draws: Draws) -> air.Slots:
+    """Give the event loop what it needs, as plain integers: it does no arithmetic of its own."""
+    scheduled = run.scenario.ranging.response_delay_uus * UUS_TICKS * SUBTICKS
     at_once = np.rint(draws.reply_s * SUBTICKS_PER_SECOND).astype(np.int64)
-    delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in messages]
-    columns = zip(
-        range(len(plan.start)),
+    delay = [at_once if m.timing == "at once" else np.full_like(at_once, scheduled) for m in run.protocol.messages]
+    return air.Slots(
         plan.start.tolist(),
         plan.initiator.tolist(),
         plan.target.tolist(),
-        zip(*heard.tolist(), strict=True),
-        zip(*(d.tolist() for d in delay), strict=True),
         _pauses(run, plan),
-        strict=True,
+        _heard(run, plan, draws),
+        np.array(delay),
     )
-    hosts: dict[int, list[air.Slot]] = {}
-    for host, row in zip(plan.host.tolist(), columns, strict=True):
-        hosts.setdefault(host, []).append(air.Slot(*row))
-    return list(hosts.values())
 
 
 def _undisturbed(run: _Run, plan: Schedule, draws: Draws) -> air.Outcomes:

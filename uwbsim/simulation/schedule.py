@@ -27,6 +27,10 @@ class Schedule:
     target: Ints
     host: Ints
 
+    def hosts(self) -> list[list[int]]:
+        """Return the numbers of the exchanges that each host plays, in order."""
+        return [np.flatnonzero(self.host == host).tolist() for host in np.unique(self.host)]
+
 
 def schedule(scenario: Scenario) -> Schedule:
     """Return the exchanges that a scenario plans."""

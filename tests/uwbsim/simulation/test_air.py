@@ -1,15 +1,20 @@
 """The air: durations, collisions, capture, busy boards, and waits."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.scenario.airtime import before_marker_s, exchange_air_s, frame_s
+from uwbsim.scenario.loading import load
 from uwbsim.simulation import air
+from uwbsim.simulation.run import simulate
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 US = SUBTICKS_PER_SECOND // 1_000_000
 DS = PROTOCOLS["ds"]
+TRAIN = Path(__file__).parents[3] / "scenarios" / "icra2023" / "train.toml"
 
 
 @pytest.mark.parametrize(("length", "us"), [(11, 177.37), (8, 174.29), (28, 194.81), (100, 280.96)])
@@ -23,13 +28,18 @@ def test_an_exchange_keeps_the_air_busy_for_its_three_frames():
 
 
 def slot(number, at_us, initiator, target, heard=(True, True, True), reply_us=305, final_us=1538):
-    return air.Slot(number, at_us * US, initiator, target, heard, (0, reply_us * US, final_us * US))
+    return number, at_us * US, initiator, target, heard, (0, reply_us * US, final_us * US)
 
 
 def played(hosts, powers=None, capture_db=6.0):
     table = np.full((8, 8), -80.0) if powers is None else powers
     rules = air.Rules(sensitivity_dbm=-100.0, capture_db=capture_db, preamble_symbols=128)
-    return air.run(DS, hosts, 8, lambda sender, _time: table[sender], rules)
+    rows = sorted(row for host in hosts for row in host)
+    assert [row[0] for row in rows] == list(range(len(rows)))
+    _, start, initiator, target, heard, delay = zip(*rows, strict=True)
+    slots = air.Slots([*start], [*initiator], [*target], [0] * len(rows), np.array(heard).T, np.array(delay).T)
+    numbers = [[row[0] for row in host] for host in hosts]
+    return air.run(DS, slots, numbers, 8, lambda sender, _time: table[sender], rules)
 
 
 def test_alone_every_exchange_succeeds_and_starts_when_it_should():
@@ -91,3 +101,32 @@ def test_an_initiator_that_is_being_ranged_with_waits_until_it_is_free():
     outcome = played([[slot(0, 0, 0, 1)], [slot(1, 600, 1, 2)]], powers)
     assert outcome.lost == [-1, -1]
     assert outcome.start[1] / US > 305 + 1538
+
+
+@pytest.mark.parametrize(
+    ("plan", "rate_hz", "sync_error_ms"), [("aloha", 40.0, 0.0), ("aloha", 150.0, 0.0), ("tdma", 120.0, 6.0)]
+)
+def test_what_is_one_event_ends_as_message_by_message(monkeypatch, plan, rate_hz, sync_error_ms):
+    settings = {
+        "run.duration_s": 20.0,
+        "ranging.plan": plan,
+        "ranging.rate_hz": rate_hz,
+        "ranging.sync_error_ms": sync_error_ms,
+        "radio.sensitivity_dbm": -92.0,
+    }
+    scenario = load(TRAIN, settings)
+    quick, single = simulate(scenario), 0
+    plain = air.Air._alone
+
+    def counted(self, number, begin):
+        nonlocal single
+        single += plain(self, number, begin)
+        return False
+
+    monkeypatch.setattr(air.Air, "_alone", counted)
+    slow = simulate(scenario)
+    assert quick.faults == slow.faults
+    assert single > 0.2 * len(slow.exchanges)
+    assert len(slow.faults) > 0.02 * len(slow.exchanges), "there is something to disturb exchanges"
+    np.testing.assert_array_equal(quick.exchanges.time_ns, slow.exchanges.time_ns)
+    np.testing.assert_array_equal(quick.exchanges.rx3, slow.exchanges.rx3)
