@@ -11,7 +11,6 @@ MOST = 6
 
 # Records of more fields that may be made by position, each with its reason.
 BY_POSITION = {
-    "Slot": "one a planned exchange, made from a row of columns in the order of its fields, some ten thousand a run",
     "RangeReport": "a wire message: its fields are the parts of a line, in the order of the line",
     "Overheard": "a wire message: its fields are the parts of a line, in the order of the line",
 }

@@ -27,18 +27,23 @@ def test_an_exchange_keeps_the_air_busy_for_its_three_frames():
     assert exchange_air_s(DS, 128) * 1e6 == pytest.approx(177.37 + 174.29 + 194.81, abs=0.02)
 
 
-def slot(number, at_us, initiator, target, heard=(True, True, True), reply_us=305, final_us=1538):
-    return number, at_us * US, initiator, target, heard, (0, reply_us * US, final_us * US)
+def slot(number, at_us, initiator, target, heard=(True, True, True), reply_us=305, final_us=1538, pause_us=0):
+    return number, at_us * US, initiator, target, pause_us * US, heard, (0, reply_us * US, final_us * US)
+
+
+def columns(hosts):
+    """Return the slots of hosts as the event loop takes them, and the numbers of each host's."""
+    rows = sorted(row for host in hosts for row in host)
+    assert [row[0] for row in rows] == list(range(len(rows)))
+    _, start, initiator, target, pause, heard, delay = zip(*rows, strict=True)
+    slots = air.Slots([*start], [*initiator], [*target], [*pause], np.array(heard).T, np.array(delay).T)
+    return slots, [[row[0] for row in host] for host in hosts]
 
 
 def played(hosts, powers=None, capture_db=6.0):
     table = np.full((8, 8), -80.0) if powers is None else powers
     rules = air.Rules(sensitivity_dbm=-100.0, capture_db=capture_db, preamble_symbols=128)
-    rows = sorted(row for host in hosts for row in host)
-    assert [row[0] for row in rows] == list(range(len(rows)))
-    _, start, initiator, target, heard, delay = zip(*rows, strict=True)
-    slots = air.Slots([*start], [*initiator], [*target], [0] * len(rows), np.array(heard).T, np.array(delay).T)
-    numbers = [[row[0] for row in host] for host in hosts]
+    slots, numbers = columns(hosts)
     return air.run(DS, slots, numbers, 8, lambda sender, _time: table[sender], rules)
 
 

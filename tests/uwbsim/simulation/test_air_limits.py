@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.uwbsim.simulation.test_air import DS, US, played, slot
+from tests.uwbsim.simulation.test_air import DS, US, columns, played, slot
 from tests.uwbsim.simulation.test_protocols import bench
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s
@@ -13,7 +13,7 @@ from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 
 def paused(number, at_us, pause_us):
-    return air.Slot(number, at_us * US, 0, 1, (True,) * 3, (0, 305 * US, 1538 * US), pause_us * US)
+    return slot(number, at_us, 0, 1, pause_us=pause_us)
 
 
 def test_a_pause_is_waited_before_the_poll_and_a_slot_not_before_its_time():
@@ -53,7 +53,8 @@ def test_progress_is_told_for_every_500th_slot_as_a_share_of_all_hosts():
     powers = np.full((8, 8), -120.0)
     powers[:2, :2] = powers[4:6, 4:6] = -80.0
     rules = air.Rules(sensitivity_dbm=-100.0, capture_db=6.0, preamble_symbols=128)
-    outcome = air.run(DS, hosts, 8, lambda sender, _: powers[sender], rules, told.append)
+    slots, numbers = columns(hosts)
+    outcome = air.run(DS, slots, numbers, 8, lambda sender, _: powers[sender], rules, told.append)
     assert set(outcome.lost) == {-1}
     assert told == [0.0, 0.0, 500 / 502]
 
