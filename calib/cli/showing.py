@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -35,5 +36,19 @@ def show(
             typer.echo(
                 f"  {name.replace('_', ' ')}: {', '.join(map(str, value)) if isinstance(value, list) else value}"
             )
+    for line in _rests_on(known.provenance.get("rests_on")):
+        typer.echo(f"  {line}")
     for warning in known.provenance.get("warnings", []):
         typer.echo(f"warning: {with_flags(str(warning))}")
+
+
+def _rests_on(rests: object) -> Iterator[str]:
+    """Yield what a survey rests on: arrangements by what was known of them, and what was known beside."""
+    if not isinstance(rests, dict):
+        return
+    rows = [row for row in rests.get("arrangements", []) if isinstance(row, dict)]
+    for shape in dict.fromkeys(str(row.get("known", "")) for row in rows):
+        names = ", ".join(str(row.get("name")) for row in rows if row.get("known", "") == shape)
+        yield f"rests on arrangements {names}{f', on a {shape}' if shape else ''}"
+    distances, positions = rests.get("known_distances", 0), rests.get("known_positions", 0)
+    yield f"rests on {distances} known distances and {positions} known positions"

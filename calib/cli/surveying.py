@@ -55,6 +55,9 @@ def survey(
         Path | None, typer.Option(help="Where boards stood, to write: \\[[anchors]] (.toml) or for ROS (.yaml).")
     ] = None,
     arrangement: Annotated[str | None, typer.Option(help="The arrangement that --anchors writes.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Picture of where boards stood, to write (.svg, .png or .pdf).")
+    ] = None,
     fix: Fix = None,
     pair_error: Annotated[
         float | None, typer.Option(help="Constant error of a pair in an arrangement (m); by default estimated.")
@@ -69,11 +72,12 @@ def survey(
     """Calibrate without true distances: boards that stand still, in arrangements of which little is known."""
     import calib
     from calib.cli.options import fixed_ns
-    from uwblink.output import check_output
+    from uwblink.output import check_apart, check_output
 
-    check_output(output, force=force)
-    if anchors:
-        check_output(anchors, force=force)
+    for path in filter(None, (output, anchors, plot)):
+        check_output(path, force=force)
+    read = [*recordings, *([Path(known)] if known.endswith(".toml") else [])]
+    check_apart({"output": output, "anchors": anchors, "plot": plot}, read)
     try:
         with waiting("surveying"):
             result = calib.survey(
@@ -86,6 +90,8 @@ def survey(
             )
         if anchors:
             result.save_anchors(anchors, arrangement=arrangement, force=force)
+        if plot:
+            result.save_picture(plot, force=force)
     except calib.UnanswerableError as error:
         if as_json:
             typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
@@ -99,6 +105,8 @@ def survey(
         typer.echo(line)
     if anchors:
         typer.echo(f"{anchors}: boards of {result.arrangement(arrangement).name}")
+    if plot:
+        typer.echo(f"{plot}: where boards stood, with ellipses of 95 %")
     for warning in result.warnings:
         typer.echo(f"warning: {with_flags(warning)}", err=True)
 

@@ -15,9 +15,12 @@ from calib.errors import BadInputError
 from calib.information import Verdict
 from calib.surveys.minima import SecondBest
 from uwblink.arrays import Floats
-from uwblink.output import write_text
+from uwblink.output import write_bytes, write_text
 
 FORMATS = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml"}
+
+
+PICTURES = (".svg", ".png", ".pdf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +112,18 @@ class SurveyResult:
             raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .toml or .yaml", parameter="anchors")
         lines = _toml if form == "toml" else _yaml
         write_text(place, "\n".join(lines(self.arrangement(arrangement))) + "\n", force=force)
+
+    def save_picture(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Draw where boards stood, with the ellipses that hold them with 95 %, as .svg, .png or .pdf.
+
+        Raises `BadInputError` for another suffix.
+        """
+        from calib.surveys.figures import board_picture
+
+        place = Path(path)
+        if place.suffix.lower() not in PICTURES:
+            raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .svg, .png or .pdf", parameter="plot")
+        write_bytes(place, board_picture(self.arrangements, place.suffix.lower()[1:]), force=force)
 
     def arrangement(self, name: str | None = None) -> SurveyedArrangement:
         """Return an arrangement by name, the only one where none is given; raises `BadInputError`."""

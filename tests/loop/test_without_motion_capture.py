@@ -52,6 +52,7 @@ def test_the_tutorial_finds_what_was_planted(done):
     assert np.all(np.abs(apart.mean()) < 4 * np.array(list(known.delays_std_ns.values())))
     assert [one["name"] for one in known.provenance["rests_on"]["arrangements"]] == [str(k) for k in range(1, 9)]
     assert "arrangement 8, on a line" in said["survey"]
+    assert "rests on arrangements 1, 2, 3, 4, 5, 6, 7, 8, on a line" in said["show"]
     assert "from the geometry of boards that stood still" in said["show"]
 
 

@@ -297,6 +297,15 @@ def test_anchors_for_ros_carry_the_covariance(recording, tmp_path):
         result.save_anchors(tmp_path / "b.txt", arrangement="A")
 
 
+def test_a_picture_has_a_panel_each_and_a_number_each(recording, tmp_path):
+    result = calib.survey(recording[:3])
+    result.save_picture(tmp_path / "places.svg")
+    drawn = (tmp_path / "places.svg").read_text()
+    assert drawn.count('id="axes_') == 3
+    with pytest.raises(BadInputError, match=r"expected .svg, .png or .pdf"):
+        result.save_picture(tmp_path / "places.gif")
+
+
 def test_the_command_says_what_is_not_determined_and_writes_nothing(recording, tmp_path):
     words = ["survey", recording[0], "-o", str(tmp_path / "c.json"), "--json", "--known", "plane"]
     done = CliRunner().invoke(app, words)
