@@ -1,0 +1,112 @@
+"""What the figures of a calibration draw: the centre that a curve follows, and axes that one stray does not flatten."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from calib.estimation.fitting import fit
+from calib.figures import bias_over_power, binned, cumulative, delays, histogram, sigma_over_power, within_fence
+from tests.calib.synthetic import bias_m, ranges
+from uwblink.pages.figures import style
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit(ranges(12_000, tail=0.2))
+
+
+def axes_of(draw):
+    with style():
+        figure = Figure(figsize=(7.16, 3), layout="constrained")
+        axes = draw(figure.subplots())
+        figure.draw_without_rendering()
+    return axes
+
+
+def labelled(axes, text):
+    return next(line for line in axes.lines if line.get_label() == text)
+
+
+def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
+    # Planted: a core of 5 cm about nothing, a fifth of it lengthened by 40 cm in the mean.
+    rng = np.random.default_rng(5)
+    error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
+    found = binned(rng.uniform(0, 1.5, 40_000), error, "mixture", 20)
+    # Of 2000 in a bin the centre is known to 1.5 mm, and its spread, told with the tail's, to 2 mm.
+    assert np.abs(found.centre_m).max() < 0.006
+    assert np.abs(found.centre_m.mean()) < 0.001
+    assert found.std_m == pytest.approx(0.05, abs=0.008)
+    assert found.median_m.mean() == pytest.approx(0.0145, abs=0.003)
+    assert binned(np.arange(40_000.0), error, "l2", 4).centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
+
+
+def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
+    axes = axes_of(
+        lambda a: bias_over_power(fitted.ranges, fitted.calibration.apply(fitted.ranges), fitted.calibration, a)
+    )
+    points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
+    at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
+    # 600 a bin: the centre of a core of 5 cm beside a fifth of reflections is known to 3 mm; medians lie 1.5 cm above.
+    assert np.abs(points.get_ydata() - at).max() < 1.2
+    assert np.sqrt(np.mean((points.get_ydata() - at) ** 2)) < 0.5
+    medians = labelled(axes, "medians, reflections included")
+    assert np.mean(medians.get_ydata() - at) > 1.0
+    planted = 100 * bias_m(points.get_xdata())
+    away = points.get_ydata() - planted
+    assert np.abs(away - away.mean()).max() < 1.2, "and both follow what was planted"
+
+
+def test_the_sigma_curve_goes_through_its_points(fitted):
+    axes = axes_of(
+        lambda a: sigma_over_power(fitted.ranges, fitted.calibration.apply(fitted.ranges), fitted.calibration, a)
+    )
+    points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
+    at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
+    assert np.mean(points.get_ydata() / at) == pytest.approx(1, abs=0.06)
+
+
+def test_powers_in_dbm_stand_above_the_same_places(fitted):
+    axes = axes_of(
+        lambda a: bias_over_power(fitted.ranges, fitted.calibration.apply(fitted.ranges), fitted.calibration, a)
+    )
+    (top,) = axes.child_axes
+    for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
+        assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
+
+
+def test_one_stray_delay_does_not_flatten_the_others(fitted):
+    known = fitted.calibration
+    wild = replace(
+        known,
+        delays_ns={**known.delays_ns, 9: 1000.0},
+        delays_std_ns={**known.delays_std_ns, 9: 300.0, 1: 40.0},
+    )
+    axes = axes_of(lambda a: delays(wild, axes=a))
+    assert np.ptp(axes.get_ylim()) < 3
+    assert "+1000.0 ns" in [text.get_text() for text in axes.texts]
+    assert within_fence(np.array([0.1, 0.2, 0.15, 1000.0])).tolist() == [True, True, True, False]
+    assert within_fence(np.array([0.1, 1000.0])).all(), "of two nobody knows which is the stray"
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 300.0])
+def test_a_histogram_shows_corrected_errors_whatever_raw_ones_are(fitted, offset_m):
+    some, known = fitted.ranges, fitted.calibration
+    applied = known.apply(some)
+    applied = replace(applied, raw_m=applied.raw_m + offset_m)
+    axes = axes_of(lambda a: histogram(some, applied, a))
+    assert np.ptp(axes.get_xlim()) < 400
+    heights = {one.get_label(): one.get_data() for one in axes.patches}
+    assert sum(heights["fully corrected"].values) == pytest.approx(100), "the last bins hold what lies beyond"
+    assert sum(heights["raw"].values) == pytest.approx(100)
+
+
+def test_the_distribution_says_how_many_errors_are_smaller(fitted):
+    some = fitted.ranges
+    applied = fitted.calibration.apply(some)
+    axes = axes_of(lambda a: cumulative(some, applied, a))
+    line = labelled(axes, "fully corrected")
+    size = 100 * np.abs(applied.corrected_m - some.truth_m)
+    for x, y in zip(line.get_xdata()[::20], line.get_ydata()[::20], strict=True):
+        assert 100 * np.mean(size <= x) == pytest.approx(y, abs=0.1)
