@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import io
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from uwblink.pages.figures import PAGE_IN
 
 if TYPE_CHECKING:
     from fpdf import FPDF
+    from pypdf import PageObject
 
 MM_OF_INCH: Final = 25.4
 PAPER_MM: Final = (210.0, 297.0)
@@ -29,6 +31,9 @@ LINE_MM: Final = 5.0
 NUMBER_MM: Final = 12.0
 """Height of a line of the contents, and width of its page number."""
 
+NARROW_MM: Final = 20.0
+"""Up to this width a column is not made narrower."""
+
 PADDING_MM: Final = 2.4
 """Beside the text of a cell."""
 
@@ -39,6 +44,9 @@ FILLS: Final = {
     "doubt": (255, 244, 224),
     "bad": (253, 234, 234),
 }
+DRAWN: Final = re.compile(rb"/([\w.-]+) Do\b")
+"""Images, markers and forms that a page draws."""
+
 FAMILY: Final = "DejaVu"
 EPOCH: Final = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
 """Written as the date of creation, so that the same data give the same bytes; the title says when it was made."""
@@ -56,9 +64,13 @@ class _Placed:
     contents: list[tuple[int, float]] = field(default_factory=list)
 
 
-def to_pdf(document: Document, pictures: Mapping[str, bytes]) -> bytes:
-    """Return the document as PDF; `pictures` are its figures by name, PDF files of a page's width."""
-    sizes = {name: _size_mm(data) for name, data in pictures.items()}
+def to_pdf(document: Document, printed: bytes, pages: Mapping[str, int]) -> bytes:
+    """Return the document as PDF; its figures are `pages` of a PDF, `printed`, by name, of a page's width."""
+    from pypdf import PdfReader
+
+    reader = PdfReader(io.BytesIO(printed)) if pages else None
+    pictures = {name: reader.pages[number] for name, number in pages.items()} if reader else {}
+    sizes = {name: _size_mm(page) for name, page in pictures.items()}
     text, placed = _set(document, sizes)
     return _with_figures(text, pictures, placed)
 
@@ -207,6 +219,16 @@ def _parts(page: FPDF, table: Table) -> list[Table]:
     return [*parts, _columns(table, columns)]
 
 
+def _narrowed(widths: list[float], room_mm: float) -> list[float]:
+    """Return widths that fit: where they do not, wide columns give way, whose lines break, and narrow ones stay."""
+    narrow = [w <= NARROW_MM for w in widths]
+    wide = sum(w for w, stays in zip(widths, narrow, strict=True) if not stays)
+    left = room_mm - (sum(widths) - wide)
+    if sum(widths) <= room_mm or left <= 0:
+        return widths
+    return [w if stays else w * left / wide for w, stays in zip(widths, narrow, strict=True)]
+
+
 def _columns(table: Table, kept: list[int]) -> Table:
     """Return some columns of a table."""
     over = [name for name, span in table.above for _ in range(span)]
@@ -221,8 +243,9 @@ def _table(page: FPDF, table: Table) -> None:
     from fpdf.enums import TableBordersLayout
     from fpdf.fonts import FontFace
 
-    widths = _widths(page, table)
+    widths = _narrowed(_widths(page, table), page.epw)
     width = min(page.epw, sum(widths))
+    page.set_fill_color(255, 255, 255)
     page.set_font(FAMILY, "", SMALL)
     with page.table(
         col_widths=tuple(widths),
@@ -246,44 +269,67 @@ def _table(page: FPDF, table: Table) -> None:
     page.ln(2)
 
 
-def _size_mm(pdf: bytes) -> tuple[float, float]:
+def single_pages(printed: bytes) -> list[bytes]:
+    """Return each page of a PDF as a PDF of its own, with nothing in it that it does not draw."""
+    from pypdf import PdfReader, PdfWriter
+    from pypdf.generic import DictionaryObject, NameObject
+
+    found = []
+    for page in PdfReader(io.BytesIO(printed)).pages:
+        shared: Any = page["/Resources"].get_object()
+        used = {f"/{name.decode()}" for name in DRAWN.findall(page.get_contents().get_data())}  # type: ignore[union-attr]  # a figure has contents
+        own = DictionaryObject(shared)
+        forms: Any = shared.get("/XObject", DictionaryObject()).get_object()
+        own[NameObject("/XObject")] = DictionaryObject({name: form for name, form in forms.items() if name in used})
+        page[NameObject("/Resources")] = own
+        writer, data = PdfWriter(), io.BytesIO()
+        writer.add_page(page)
+        writer.write(data)
+        found.append(data.getvalue())
+    return found
+
+
+def _size_mm(page: PageObject) -> tuple[float, float]:
     """Return width and height of a figure."""
-    from pypdf import PdfReader
-
-    box = PdfReader(io.BytesIO(pdf)).pages[0].mediabox
-    return float(box.width) / 72 * MM_OF_INCH, float(box.height) / 72 * MM_OF_INCH
+    return float(page.mediabox.width) / 72 * MM_OF_INCH, float(page.mediabox.height) / 72 * MM_OF_INCH
 
 
-def _with_figures(text: FPDF, pictures: Mapping[str, bytes], placed: _Placed) -> bytes:
+def _with_figures(text: FPDF, pictures: Mapping[str, PageObject], placed: _Placed) -> bytes:
     """Put figures where there is room for them: as forms, so that they stay drawings with text."""
     from pypdf import PdfReader, PdfWriter
-    from pypdf.generic import DictionaryObject, NameObject, StreamObject
+    from pypdf.generic import DictionaryObject, NameObject
 
     writer = PdfWriter(clone_from=PdfReader(io.BytesIO(bytes(text.output()))))
     drawn: dict[int, list[tuple[str, float, float]]] = {}
     for number, (name, page, left, bottom) in enumerate(placed.figures):
-        source = PdfReader(io.BytesIO(pictures[name])).pages[0]
-        form = StreamObject()
-        form.set_data(source.get_contents().get_data())  # type: ignore[union-attr]  # a figure has contents
-        form.update(
-            {
-                NameObject("/Type"): NameObject("/XObject"),
-                NameObject("/Subtype"): NameObject("/Form"),
-                NameObject("/BBox"): source.mediabox,
-                NameObject("/Resources"): source["/Resources"].clone(writer),
-            }
-        )
-        if "/Group" in source:
-            form[NameObject("/Group")] = source["/Group"].clone(writer)
         resources: Any = writer.pages[page]["/Resources"].get_object()
         held = resources.setdefault(NameObject("/XObject"), DictionaryObject()).get_object()
-        held[NameObject(f"/Fig{number}")] = writer._add_object(form.flate_encode())
+        held[NameObject(f"/Fig{number}")] = writer._add_object(_form(pictures[name], writer))
         drawn.setdefault(page, []).append((f"Fig{number}", left, bottom))
     for page, some in drawn.items():
         _append(writer.pages[page], some)
     data = io.BytesIO()
     writer.write(data)
     return data.getvalue()
+
+
+def _form(source: PageObject, writer: Any) -> Any:
+    """Return a page as a form: what can be drawn on another page."""
+    from pypdf.generic import NameObject, StreamObject
+
+    form = StreamObject()
+    form.set_data(source.get_contents().get_data())  # type: ignore[union-attr]  # a figure has contents
+    form.update(
+        {
+            NameObject("/Type"): NameObject("/XObject"),
+            NameObject("/Subtype"): NameObject("/Form"),
+            NameObject("/BBox"): source.mediabox,
+            NameObject("/Resources"): source["/Resources"].clone(writer),
+        }
+    )
+    if "/Group" in source:
+        form[NameObject("/Group")] = source["/Group"].clone(writer)
+    return form.flate_encode()
 
 
 def _append(page: Any, figures: list[tuple[str, float, float]]) -> None:

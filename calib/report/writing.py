@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 from calib.errors import BadInputError
-from calib.report.blocks import Document, Picture
+from calib.report.blocks import Document
 from calib.report.html import to_html
 from uwblink.output import check_output, write_bytes, write_text
-from uwblink.pages.figures import WIDTHS, drawn
+from uwblink.pages.figures import WIDTHS, Printed, drawn
 
 PAPER_KINDS: Final = ("pdf", "svg")
 
@@ -18,7 +18,8 @@ PAPER_KINDS: Final = ("pdf", "svg")
 def html_of(document: Document) -> str:
     """Return a document as the text of one HTML page that needs no other file."""
     drawings = {
-        p.name: {name: one["svg"] for name, one in _drawn(p, ["svg"], ["svg"]).items()} for p in document.pictures()
+        p.name: {name: drawn(p.draw, width, ["svg"], salt=f"{p.name} {name}")["svg"] for name, width in WIDTHS.items()}
+        for p in document.pictures()
     }
     return to_html(document, drawings)
 
@@ -61,38 +62,47 @@ def write_document(
     page = None if output is None or is_pdf(output) else output
     of_page = [kind for kind, so in (("svg", page or figures), ("pdf", papers or figures)) if so]
     of_column = ["svg", "pdf"] if figures else (["svg"] if page else [])
-    made: dict[str, dict[str, dict[str, bytes]]] = {}
-    for picture in document.pictures():
-        progress(f"drawing {picture.name}")
-        made[picture.name] = _drawn(picture, of_page, of_column)
+    made: dict[str, dict[str, bytes]] = {}
+    places: dict[tuple[str, str], int] = {}
+    with Printed() as printed:
+        for picture in document.pictures():
+            progress(f"drawing {picture.name}")
+            made[picture.name] = {}
+            for width, kinds in (("page", of_page), ("column", of_column)):
+                if not kinds:
+                    continue
+                to_print = printed if "pdf" in kinds else None
+                salt = f"{picture.name} {width}"
+                made[picture.name][width] = drawn(picture.draw, WIDTHS[width], ["svg"], salt, to_print)["svg"]
+                places[picture.name, width] = printed.count - 1
     if papers:
         from calib.report.pdf import to_pdf
 
         progress("setting the PDF")
-        data = to_pdf(document, {name: widths["page"]["pdf"] for name, widths in made.items()})
+        data = to_pdf(document, printed.file(), {name: places[name, "page"] for name in made})
         for path in papers:
             write_bytes(path, data, force=force)
     if figures:
-        _write_figures(figures, made, force=force)
+        _write_figures(figures, made, printed.file(), places, force=force)
     if page:
         progress("writing the page")
-        drawings = {name: {w: kinds["svg"] for w, kinds in widths.items()} for name, widths in made.items()}
-        write_text(page, to_html(document, drawings), force=force)
+        write_text(page, to_html(document, made), force=force)
 
 
-def _drawn(picture: Picture, of_page: list[str], of_column: list[str]) -> dict[str, dict[str, bytes]]:
-    """Draw a figure at both widths, as far as anything is wanted of them; files by width and kind."""
-    wanted = {"page": of_page, "column": of_column}
-    return {
-        name: drawn(picture.draw, WIDTHS[name], kinds, salt=f"{picture.name} {name}")
-        for name, kinds in wanted.items()
-        if kinds
-    }
+def _write_figures(
+    folder: Path,
+    made: Mapping[str, Mapping[str, bytes]],
+    printed: bytes,
+    places: Mapping[tuple[str, str], int],
+    *,
+    force: bool,
+) -> None:
+    """Write each figure at each width as drawing and as PDF."""
+    from calib.report.pdf import single_pages
 
-
-def _write_figures(folder: Path, made: dict[str, dict[str, dict[str, bytes]]], *, force: bool) -> None:
+    pages = single_pages(printed)
     folder.mkdir(parents=True, exist_ok=True)
     for name, widths in made.items():
-        for width, kinds in widths.items():
-            for kind in PAPER_KINDS:
-                write_bytes(folder / f"{name}-{width}.{kind}", kinds[kind], force=force)
+        for width, svg in widths.items():
+            write_bytes(folder / f"{name}-{width}.svg", svg, force=force)
+            write_bytes(folder / f"{name}-{width}.pdf", pages[places[name, width]], force=force)

@@ -6,10 +6,11 @@ import io
 import json
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from uwblink.pages.colours import GRID, INK, MUTED
@@ -111,14 +112,47 @@ def legend(figure: Figure, axes: Axes | None = None, *, texts: Sequence[str] = (
     )
 
 
-def drawn(draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> dict[str, bytes]:
-    """Draw once and return the files of it: "svg", "pdf" and "png".
+class Printed:
+    """Figures as pages of one PDF, which has its fonts once; a context manager, in which pages are added."""
+
+    def __init__(self) -> None:
+        """Begin without pages."""
+        self._data = io.BytesIO()
+        self._pages: Any = PdfPages(self._data, metadata=METADATA["pdf"])
+        self.count = 0
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Write the fonts."""
+        with style():
+            self._pages.close()
+
+    def add(self, figure: Figure) -> int:
+        """Add a figure that is laid out; return the number of its page, from 0."""
+        self._pages.savefig(figure, dpi=RASTER_DPI, facecolor="none")
+        self.count += 1
+        return self.count - 1
+
+    def file(self) -> bytes:
+        """Return the PDF, once it is left; without pages it is none."""
+        return self._data.getvalue()
+
+
+def drawn(
+    draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "", printed: Printed | None = None
+) -> dict[str, bytes]:
+    """Draw once and return the files of it: "svg", "pdf" and "png"; it is added to those that are `printed`.
 
     `salt` tells apart what drawings on one page call their parts. What each panel shows, and where, is in the
     drawing's metadata as JSON, for pages that read off values under a pointer.
     """
     with style(**{"svg.hashsalt": salt or "uwbcal"}):
         figure = _laid_out(draw(width_in))
+        if printed is not None:
+            printed.add(figure)
         return {kind: _file(figure, kind) for kind in kinds}
 
 

@@ -16,6 +16,7 @@ from calib.cli.reporting import spread
 from calib.estimation.fitting import fit
 from calib.report.report import render
 from tests import processes
+from tests.browser import lies_well
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 
@@ -192,6 +193,7 @@ def test_a_browser_shows_it(campaign, tmp_path, width):
          f"--screenshot={picture}", (campaign / "r.html").as_uri()],
         check=True, capture_output=True, timeout=60,
     )  # fmt: skip
+    lies_well((campaign / "r.html").read_text(), width, tmp_path)
     pixels = imread(picture)
     assert pixels.shape[:2] == (2400, width)
     # Text and figures from top to bottom: no band of the page is blank.
