@@ -316,7 +316,7 @@ def over_time(recordings: list[Ranges], calibration: Calibration) -> list[Block]
             Picture(
                 f"over-time-{k + 1}",
                 partial(figures_errors.over_time, ranges=recording, applied=applied),
-                f"{recording.source}: calibrated errors, and the lines between which 95 % should lie without reflections."
+                f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
                 + (
                     f" Of {pairs} pairs the {figures_errors.MOST_PAIRS} whose errors spread most; others are left out."
                     if pairs > figures_errors.MOST_PAIRS
