@@ -164,7 +164,8 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
     rows = basis(np.quantile(problem.lifted, np.linspace(0.02, 0.98, 25)), problem.knots)
     rows = np.tile(rows - rows.mean(axis=0), len(problem.groups)) / len(problem.groups)
     more = float(np.sqrt(np.mean((rows @ taken[columns] * slope) ** 2)))
-    band = float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", rows, found.covariance[columns, columns], rows))))
+    variance = float(np.mean(np.einsum("ij,jk,ik->i", rows, found.covariance[columns, columns], rows)))
+    band = float(np.sqrt(max(variance, 0.0)))
     if more < max(CONFOUNDED_M, 2 * band):
         return []
     return [

@@ -11,7 +11,9 @@ from calib.calibration.comparison import compare
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.errors import BadInputError, UnanswerableError
+from calib.estimation import solver
 from calib.estimation.fitting import fit
+from calib.estimation.pair_mixture import fit_pair_mixture
 from calib.estimation.problem import build_problem
 from calib.estimation.robust import quadratic_model, robust_fit
 from calib.estimation.smoothing import reml_penalty
@@ -247,3 +249,25 @@ def test_single_sided_ranges_and_missing_ones_are_warned_of():
     found = fit(replace(r, protocol=np.full(len(r), "ss"), excluded={"no true distance": 1000}))
     assert any("single-sided" in warning for warning in found.warnings)
     assert any("25 % of the exchanges were left out: no true distance" in warning for warning in found.warnings)
+
+
+def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
+    found_by = fit_pair_mixture
+
+    def lost(*words):
+        found = found_by(*words)
+        moved = found.parameters.copy()
+        # 5 ns are 75 cm in all ranges of a tag: farther from the robust start than reflections move a median.
+        moved[0] += 5.0
+        return replace(found, parameters=moved)
+
+    monkeypatch.setattr(solver, "fit_pair_mixture", lost)
+    r = ranges(2000)
+    assert fit(r).calibration.loss == "cauchy"
+    asked_for = fit(r, loss="mixture")
+    assert not asked_for.success
+    assert any("before it settled" in warning for warning in asked_for.warnings)
+
+
+def test_a_likelihood_that_stays_near_is_believed():
+    assert fit(ranges(2000)).calibration.loss == "mixture"
