@@ -66,7 +66,7 @@ ROOMS: Final = {
     ),
     "air": Room(
         ("uwbsim/simulation/air.py", "uwbsim/simulation/timestamps.py"),
-        ("tests/uwbsim/simulation", "tests/uwbsim/protocols/test_monte_carlo.py"),
+        ("tests/uwbsim/simulation",),
     ),
     "fit": Room(
         (
@@ -75,7 +75,10 @@ ROOMS: Final = {
             "calib/estimation/identifiability.py",
             "calib/estimation/sigma_curve.py",
         ),
-        ("tests/calib/estimation",),
+        tuple(
+            f"tests/calib/estimation/test_{name}.py"
+            for name in ("solver", "solver_parts", "identifiability", "robust", "smoothing", "result")
+        ),
     ),
 }
 

@@ -5,9 +5,12 @@ import pytest
 
 from tests.uwbsim.simulation.test_air import DS, US, columns, played, slot
 from tests.uwbsim.simulation.test_protocols import bench
+from uwblink.ticks import TICK_S, elapsed
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import after_marker_s, before_marker_s
+from uwbsim.scenario.model import Scenario
 from uwbsim.simulation import air
+from uwbsim.simulation.run import simulate
 from uwbsim.simulation.timestamps import draw, draw_reply_s
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
@@ -59,8 +62,14 @@ def test_progress_is_told_for_every_500th_slot_as_a_share_of_all_hosts():
     assert told == [0.0, 0.0, 500 / 502]
 
 
+def with_replies(reply):
+    document = bench().model_dump(mode="json")
+    document["ranging"]["reply"] = reply
+    return Scenario.model_validate(document)
+
+
 def test_replies_are_drawn_from_two_modes_a_shoulder_and_a_tail():
-    micro = draw_reply_s(bench().model_copy(update={"ranging": MODELLED}), stream(1, "reply"), 400_000) * 1e6
+    micro = draw_reply_s(with_replies({"model": "boards"}), stream(1, "reply"), 400_000) * 1e6
     # 400 000 draws know a share to 0.0008.
     for below_us, share in ((304.1, 0.207), (305.9, 0.635), (308.3, 0.885), (310.0, 0.9096), (348.25, 0.955)):
         assert np.mean(micro < below_us) == pytest.approx(share, abs=0.003), below_us
@@ -69,9 +78,6 @@ def test_replies_are_drawn_from_two_modes_a_shoulder_and_a_tail():
     assert np.std(micro[(micro > 303.5) & (micro < 304.7)]) == pytest.approx(0.28, abs=0.03)
     shoulder = micro[(micro > 308.5) & (micro < 310.0)]
     assert len(shoulder) / len(micro) == pytest.approx(0.05 * 0.38, abs=0.002)
-
-
-MODELLED = bench().ranging.model_copy(update={"reply": bench().ranging.reply.model_copy(update={"model": "firmware"})})
 
 
 def test_detours_have_the_share_and_the_mean_of_the_scenario_and_noise_is_standard():
@@ -92,3 +98,43 @@ def test_detours_have_the_share_and_the_mean_of_the_scenario_and_noise_is_standa
     quiet = draw(bench(), 100, 3)
     assert not quiet.excess_m.any()
     assert set(quiet.reply_s.tolist()) == {305e-6}
+
+
+def test_a_target_keeps_to_its_exchange_though_nobody_hears_its_answer():
+    outcome = played([[slot(0, 0, 0, 1, (True, False, True))], [slot(1, 900, 2, 1)]])
+    assert outcome.reason == [air.WEAK, air.BUSY]
+
+
+def test_a_board_that_sends_hears_nothing():
+    powers = np.full((8, 8), -120.0)
+    powers[:3, :3] = -80.0
+    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 50, 1, 2)]], powers)
+    assert outcome.reason[0] == air.BUSY
+
+
+def test_behind_one_that_is_too_weak_another_frame_collides_all_the_same():
+    powers = np.full((8, 8), -80.0)
+    powers[2, 1] = -120.0
+    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 40, 2, 3)], [slot(2, 60, 4, 5)]], powers)
+    assert outcome.reason[0] == air.COLLIDED
+
+
+def test_an_initiator_that_is_busy_waits_until_its_exchange_ends_at_any_hour():
+    outcome = played([[slot(0, 50_000, 0, 1)], [slot(1, 50_600, 1, 2)]])
+    assert outcome.lost == [-1, -1]
+    free_us = 305 + 1538 + after_marker_s(28) * 1e6 + before_marker_s(128) * 1e6
+    assert (outcome.start[1] - outcome.start[0]) / US == pytest.approx(free_us, abs=0.5)
+
+
+def test_an_answer_leaves_at_the_first_grid_point_after_its_latency():
+    e = simulate(bench("ds", reply_us=305.0)).exchanges
+    late = elapsed(e.tx2, e.rx1) - round(305e-6 / TICK_S)
+    assert late.min() >= 0
+    assert late.max() < 512
+
+
+def test_replies_by_quantiles_have_those_quantiles():
+    scenario = with_replies({"model": "quantiles", "delays_us": [300.0, 310.0, 400.0]})
+    found = draw_reply_s(scenario, stream(1, "reply"), 100_000) * 1e6
+    for share, us in ((0.25, 305.0), (0.5, 310.0), (0.75, 355.0)):
+        assert np.quantile(found, share) == pytest.approx(us, abs=0.5)
