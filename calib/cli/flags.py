@@ -7,6 +7,7 @@ from typing import Final
 from uwblink.cli import shared
 
 FLAGS: Final = {
+    "boards": "COUNT",
     "fixed_ns": "--fix",
     "groups": "--group",
     "scale_ns": "--scale",

@@ -162,7 +162,7 @@ def plan(
     with waiting("planning"):
         found = calib.plan(
             _boards(boards),
-            on="" if on == "space" else on,
+            on=on,
             arrangements=arrangements,
             size_m=None if size is None else _numbers(size, "size_m"),
             taped=taped,

@@ -28,7 +28,7 @@ RANGES_A_PAIR: Final = 60
 FEWEST_S: Final = 30.0
 TWO_SIDED_95: Final = 1.959963984540054
 NAMES: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-PLACES: Final = {"line": "the string", "plane": "the table", "": "the room"}
+SHAPE_OF: Final = {"line": "line", "plane": "plane", "space": ""}
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
 ) -> Plan:
     """Return how to calibrate boards without true distances: which arrangements to make, and what comes of them.
 
-    `boards` is how many there are, or their ids; `on` is "line" (a string), "plane" (a table) or "" (a room), of
+    `boards` is how many there are, or their ids; `on` is "line" (a string), "plane" (a table) or "space" (a room), of
     `size_m` (up to three lengths). `taped` distances will be measured, to `tape_sigma_m`; `anchors` are boards that
     stay where they are, at places known to `anchor_sigma_m`. Each of `arrangements` (by default as many as are worth
     it, at most 12) is the best of sixty random ones after those before it. `pair_error_m` is the constant error that a
@@ -221,8 +221,9 @@ def _given(  # noqa: PLR0913 - what `plan` takes, checked
     tags = tuple(range(1, boards + 1)) if isinstance(boards, int) else tuple(int(tag) for tag in boards)
     if not 2 <= len(tags) <= 30 or len(set(tags)) < len(tags):
         raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
-    if on not in DIMENSIONS:
-        raise BadInputError(f"found {on!r:.40}, allowed: line, plane", parameter="on")
+    if on not in SHAPE_OF:
+        raise BadInputError(f"found {on!r:.40}, allowed: {', '.join(SHAPE_OF)}", parameter="on")
+    on = SHAPE_OF[on]
     for name, value in (
         ("tape_sigma_m", tape_sigma_m),
         ("anchor_sigma_m", anchor_sigma_m),
@@ -255,7 +256,7 @@ def _given(  # noqa: PLR0913 - what `plan` takes, checked
 def _size(on: str, size_m: Sequence[float] | None, boards: int) -> tuple[float, float, float]:
     lengths = list(SIZES_M[on][: DIMENSIONS[on]] if size_m is None else size_m)
     if len(lengths) != DIMENSIONS[on] or not all(math.isfinite(v) and v > 0 for v in lengths):
-        text = f"found {lengths}, expected {DIMENSIONS[on]} lengths in metres"
+        text = f"found {lengths}, expected as many lengths in metres as it has dimensions, {DIMENSIONS[on]}"
         raise BadInputError(text, parameter="size_m")
     if size_m is None and on == "line":
         lengths = [max(lengths[0], 0.8 * (boards - 1))]

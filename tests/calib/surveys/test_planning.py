@@ -44,7 +44,7 @@ def test_a_plan_promises_what_counting_says(boards, on, count, each, common):
 
 
 def test_one_arrangement_of_eight_in_space_says_nothing_useful():
-    found = calib.plan(8, on="", arrangements=1)
+    found = calib.plan(8, on="space", arrangements=1)
     assert len(found.undetermined) >= 7
     assert found.next_best[0].what.startswith("an arrangement with 1 at (")
     assert found.next_best[0].mean_ns < found.next_best[0].instead_of_ns
@@ -66,7 +66,7 @@ def test_a_taped_distance_brings_what_it_is_said_to_bring():
 
 
 def test_anchors_at_known_places_settle_a_room_at_once():
-    found = calib.plan(6, on="", arrangements=2, anchors=[1, 2, 3, 4])
+    found = calib.plan(6, on="space", arrangements=2, anchors=[1, 2, 3, 4])
     assert found.undetermined == ()
     assert max(found.half_ns.values()) < 0.4
 
