@@ -51,8 +51,7 @@ def remarks(evaluation: Evaluation) -> Iterator[str]:
     group = evaluation.overall
     yield (
         f"95 % of the calibrated errors lie between {100 * group.full.low_m:+.1f} and {100 * group.full.high_m:+.1f} cm"
-        f"; chi-square at 95 % rejects {100 * group.rejected:.1f} % (raw ranges with their own variance: "
-        f"{100 * group.rejected_raw:.1f} %)"
+        f"; {100 * group.rejected:.1f} % lie beyond what sigma explains at 95 % (5 % without reflections)"
     )
     covered = ", ".join(f"{100 * share:.1f} % for {name} %" for name, share in group.coverage.items())
     yield f"sigma covers {covered}"

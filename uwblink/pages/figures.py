@@ -26,6 +26,9 @@ TEXT_PT: Final = 8.0
 NARROW_IN: Final = 5.0
 """Below this width panels stand above each other."""
 
+LINE_IN: Final = 0.165
+"""Height of a line of a legend."""
+
 RASTER_DPI: Final = 220
 """Of clouds of points, which are pictures inside a drawing."""
 
@@ -103,6 +106,9 @@ def legend(figure: Figure, axes: Axes | None = None, *, texts: Sequence[str] = (
         return
     width = 0.55 + 0.066 * max(len(labels[k]) for k in kept)
     columns = max(1, min(len(kept), int((figure.get_figwidth() - 0.2) / width)))
+    # Lines of a legend beyond two do not take from the panels.
+    lines = -(-len(kept) // columns)
+    figure.set_figheight(figure.get_figheight() + LINE_IN * max(0, lines - 2))
     figure.legend(
         [handles[k] for k in kept],
         [labels[k] for k in kept],

@@ -12,7 +12,7 @@ from uwblink.pages.stylesheet import CSS, JS, PARTS
 if TYPE_CHECKING:
     from uwblink.pages.figures import Draw
 
-MANY: Final = 10
+MANY: Final = 8
 """Columns from which a table is set smaller."""
 
 

@@ -60,7 +60,7 @@ def by_pair(width_in: float, found: Sequence[Compared], fewest: int = 5) -> Figu
             points = np.array([[pair[f"{what}_measured"], pair[f"{what}_simulated"]] for pair in pairs]).reshape(-1, 2)
             _diagonal(axes, points[np.isfinite(points).all(axis=1)])
             unit = "autocorrelation" if what == "lag1" else one.unit
-            axes.set_title(f"{one.name}: {name}", loc="left")
+            axes.set_title(f"{one.name}:\n{name}", loc="left")
             axes.set_xlabel(f"measured ({unit})")
             axes.set_ylabel("simulated")
     return figure

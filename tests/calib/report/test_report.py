@@ -99,7 +99,7 @@ def test_the_campaign_has_every_section_in_order(campaign):
     ]  # fmt: skip
     assert "heard by others" in page
     assert "these flights are simulated, so metres do not compare" in page
-    assert page.count("class='many'") == 1, "the table by pair and stage is set smaller"
+    assert page.count("class='many'") == 2, "tables of recordings and by pair and stage are set smaller"
     assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert re.search("[Ff]it for use", page[: page.index("<nav")]), "the verdict stands first"
     assert "uwbcal " in page[: page.index("<nav")]
