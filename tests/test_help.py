@@ -65,6 +65,9 @@ def test_help_fits_80_columns_and_loses_no_word(words, command, capsys):
     assert max(map(len, text.splitlines())) <= 80
     seen = re.sub(r"[│╭╮╰╯─]", " ", text)
     for told in [command.help, *(getattr(p, "help", None) for p in command.params)]:
+        assert Text.from_markup(told or "").plain == (told or "").replace("\\[", "["), (
+            "brackets that rich takes for markup"
+        )
         missing = [word for word in words_of(told or "") if word not in seen]
         assert missing == [], told
     assert not re.search(r"\\\[", text)

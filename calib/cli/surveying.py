@@ -52,7 +52,7 @@ def survey(
         ),
     ] = "",
     anchors: Annotated[
-        Path | None, typer.Option(help="Where boards stood, to write: \\[[anchors]] (.toml) or for ROS (.yaml).")
+        Path | None, typer.Option(help="Where boards stood, to write: \\[\\[anchors]] (.toml) or for ROS (.yaml).")
     ] = None,
     arrangement: Annotated[str | None, typer.Option(help="The arrangement that --anchors writes.")] = None,
     plot: Annotated[
