@@ -159,7 +159,7 @@ def test_completion_installs_itself(tmp_path):
         "SHELL": "/bin/bash",
         "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1",
     }
-    install = [BIN / "calib", "--install-completion", "bash"]
+    install = [str(BIN / "calib"), "--install-completion", "bash"]
     done = subprocess.run(install, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "calib" in (tmp_path / ".bashrc").read_text()
