@@ -3,6 +3,7 @@
 from typing import Final
 
 LONGEST: Final = (
+    "tests/test_pages.py",
     "tests/test_readme.py",
     "tests/loop/test_wire.py",
     "tests/calib/report/test_report.py",

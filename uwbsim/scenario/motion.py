@@ -84,10 +84,10 @@ class Static(Section):
 class Carried(Section):
     """A body that stands still in one place after the other, and is carried from each to the next; then stays."""
 
-    model: Literal["carried"]
-    places_m: tuple[Vector, ...]
-    stay_s: Positive
-    carry_s: Positive = 10.0
+    model: Literal["carried"] = Field(description="Put in one place after the other.")
+    places_m: tuple[Vector, ...] = Field(description="The places, one or more, in the order of its stays.")
+    stay_s: Positive = Field(description="How long it stands in each place.")
+    carry_s: Positive = Field(10.0, description="How long it is carried from a place to the next.")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
