@@ -157,6 +157,9 @@ def test_boards_print_single_sided_ranges_of_whole_ticks_and_cut_all_of_them():
 
 def test_a_row_without_any_stamp_has_the_range_that_was_reported():
     stamps: Any = {"tx1": [0, 0, 0, 0], "rx1": [0, 5, 0, 0], "tx2": [0, 1005, 0, 2000], "rx2": [0, 3000, 3000, 5000]}
+    for name in stamps:  # any of the four will do
+        alone: Any = {n: [int(n == name)] for n in stamps}
+        assert not without_stamps(Exchanges.from_arrays(1, 2, **alone, range_m=[9.0]))[0]
     e = Exchanges.from_arrays(1, 2, **stamps, range_m=[7.5, 9.0, 9.0, 9.0])
     assert without_stamps(e).tolist() == [True, False, False, False]
     expected = [7.5, *(np.array([1000.0, 1500.0, 1500.0]) * METRES_PER_TICK)]
