@@ -84,6 +84,9 @@ bench-stream: setup ## measure how late streamed ranges are (15 s)
 bench-import: setup ## measure how long tables and poses take to come in (2 minutes, 1 GB)
 	$(BIN)/python -m benchmarks.importing
 
+trajectories: setup ## fits without known distances over 50 seeds a world, into docs/fit-from-ranges.md (30 minutes)
+	$(BIN)/python -m benchmarks.trajectories --write
+
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy
 

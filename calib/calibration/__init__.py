@@ -6,15 +6,18 @@ from uwblink.lazy import offer
 
 if TYPE_CHECKING:
     from calib.calibration.formats import programmed, read_miluv
+    from calib.calibration.foundations import rests_on
 
 __all__ = [
     "programmed",
     "read_miluv",
+    "rests_on",
 ]
 
 _HOMES: Final = {
     "programmed": "calib.calibration.formats",
     "read_miluv": "calib.calibration.formats",
+    "rests_on": "calib.calibration.foundations",
 }
 
 if not TYPE_CHECKING:

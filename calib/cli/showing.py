@@ -24,6 +24,7 @@ def show(
 ) -> None:
     """Print a calibration: delays, curves, what it was fitted to, and what its fit could not know."""
     import calib
+    from calib.calibration import rests_on
 
     known = calib.load_calibration(calibration)
     if as_json:
@@ -36,7 +37,8 @@ def show(
             typer.echo(
                 f"  {name.replace('_', ' ')}: {', '.join(map(str, value)) if isinstance(value, list) else value}"
             )
-    for line in _rests_on(known.provenance.get("rests_on")):
+    told = rests_on(known.provenance)
+    for line in [f"distances: {told}"] if told else _rests_on(known.provenance.get("rests_on")):
         typer.echo(f"  {line}")
     for warning in known.provenance.get("warnings", []):
         typer.echo(f"warning: {with_flags(str(warning))}")

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from typing import Final
 
+from calib.calibration.foundations import rests_on
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.report import sections
@@ -76,6 +77,7 @@ def warnings(sentences: list[str]) -> list[Block]:
 def provenance(calibration: Calibration, origin: Origin) -> list[Block]:
     """Return where a report and its calibration come from."""
     made = [["report", origin.made], ["version", origin.version], ["command", origin.command]]
+    made.append(["distances", rests_on(calibration.provenance)])
     rows = [row for row in made if row[1]] + [[path, f"SHA-256 {digest}"] for path, digest in origin.files.items()]
     return [
         Heading("Provenance"),

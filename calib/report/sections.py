@@ -89,7 +89,8 @@ def determined(ranges: Ranges, calibration: Calibration, fit: FitResult) -> list
     pairs = pair_rows(ranges)
     if free:
         groups = "; ".join(", ".join(map(str, group)) for group in free)
-        verdict = f"No: the delays of tags {groups} can shift against each other without a trace in any range."
+        trace = f"the delays of tags {groups} can shift against each other without a trace in any range"
+        verdict = f"No: {calibration.provenance.get('left_open', trace)}."
     else:
         verdict = f"Yes: the {len(pairs)} pairs of {len(ranges.tags())} tags settle every delay."
     counts = [len(np.flatnonzero(rows)) for rows in pairs.values()]

@@ -176,7 +176,8 @@ def _settled(judged: Judged) -> list[Criterion]:
     question = "Are the antenna delays known well enough?"
     if free:
         groups = "; ".join(", ".join(map(str, group)) for group in free)
-        told = f"the delays of tags {groups} can shift against each other without a trace in any range"
+        trace = f"the delays of tags {groups} can shift against each other without a trace in any range"
+        told = str(known.provenance.get("left_open", trace))
         return [Criterion(question, asked, told, BAD, told)]
     if not measured:
         return [Criterion(question, asked, "the calibration states no intervals", DOUBT, "delays have no intervals")]

@@ -28,6 +28,9 @@ from calib.trajectories.unknowns import State, columns_of
 from uwblink.arrays import Floats
 
 STARTS: Final = 24
+ENOUGH: Final = 400
+"""Ranges of a first window that are looked at."""
+
 AROUND_M: Final = 2.0
 HEADED_S: Final = 8.0
 """A first window lasts so long at least where headings are to be found in it."""
@@ -61,6 +64,7 @@ def _first_window(scene: Scene) -> tuple[Scene, Followed, Floats]:
     length = max(window_s(scene), HEADED_S if headless else 0.0)
     time = np.arange(begin, begin + length + SAMPLE_S / 2, SAMPLE_S)
     window = scene.between(begin, float(time[-1]))
+    window = window.only(np.arange(0, len(window.time_s), max(len(window.time_s) // ENOUGH, 1)))
     tried = [
         (settle(headed(window, heading), guess, stand), heading)
         for guess, stand, heading in _guesses(window, time, headless)

@@ -197,7 +197,9 @@ def _refuse_undetermined(found: Judged, problem: Problem, scene: Scene) -> None:
 
 def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked) -> dict[str, Any]:
     scene, ranges, known = climbed.scene, problem.ranges, climbed.scene.places.time_s
-    more: dict[str, Any] = {"undetermined": [found.free_tags]} if found.free_tags else {}
+    more: dict[str, Any] = {}
+    if found.free_tags:
+        more |= {"undetermined": [found.free_tags], "left_open": found.open_ends()[0]}
     if asked.fixed:
         more["fixed_ns"] = {str(tag): delay for tag, delay in sorted(asked.fixed.items())}
     return more | {

@@ -25,10 +25,13 @@ PRIOR_NS: Final = 2.0
 
 GUESS_NS: Final = 0.2
 LOOSEST: Final = 0.5
-"""A direction of delays counts as determined if it is known to half of so much.
+"""A direction of delays counts as determined if it is known to half of so much (3 cm of range), by standard error.
 
-Calibrated by simulation (docs/fit-from-ranges.md).
+Calibrated by simulation (docs/fit-from-ranges.md): intervals beyond were seen not to hold.
 """
+
+GROWTH: Final = 3.0
+"""Few ranges leave delays less known than that even where distances are given; then so many times as much will do."""
 
 LOOKED_AT: Final = 400
 
@@ -131,7 +134,7 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
     plain = np.linalg.pinv(_information(design, climbed.informed) + precision[:columns, :columns])
     return Judged(
         solved=solved,
-        verdict=_verdict(apart, problem),
+        verdict=_verdict(apart, delays @ with_truth @ delays.T, problem),
         absorbed=_absorbed(delays @ plain @ delays.T, delays @ with_truth @ delays.T),
         distance_std_m=_spread(climbed, whole),
         covariance_ns2=apart,
@@ -153,10 +156,12 @@ def _slopes(
     return scores, inverse_of(scores.information() + precision, len(problem.pairs.ends), len(SPREADS)), precision
 
 
-def _verdict(covariance: Floats, problem: Problem) -> Verdict:
+def _verdict(covariance: Floats, with_truth: Floats, problem: Problem) -> Verdict:
+    guess = np.maximum(GUESS_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
     information = (information + information.T) / 2
-    return judge(information, [Unknown("delay", str(tag), GUESS_NS) for tag in problem.tags], loosest=LOOSEST)
+    unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(problem.tags, guess.tolist(), strict=True)]
+    return judge(information, unknowns, loosest=LOOSEST)
 
 
 def _information(design: Floats, informed: Floats) -> Floats:

@@ -54,8 +54,19 @@ def bias(lifted):
     return 0.05 * np.sin(3 * lifted)
 
 
-def flight(seconds=24.0, rate=80, noise_m=0.04, reflected=0.08, seed=1, wander_deg=0.0, anchors=None, curve=bias):
-    """A flight whose poses have exact places and headings that are off by a sine of `wander_deg`.
+def flight(  # noqa: PLR0913 - what a flight may differ in
+    seconds=24.0,
+    rate=80,
+    noise_m=0.04,
+    reflected=0.08,
+    seed=1,
+    wander_deg=0.0,
+    anchors=None,
+    curve=bias,
+    tilt_deg=0.0,
+    place_noise_m=0.0,
+):
+    """A flight whose poses have noise in places, and headings and tilts that are off by sines of so many degrees.
 
     `anchors` (k, 3) stand as tags 11 and on, with delays of their own, and range with each tag in turn.
     """
@@ -115,7 +126,12 @@ def flight(seconds=24.0, rate=80, noise_m=0.04, reflected=0.08, seed=1, wander_d
         off = np.radians(wander_deg) * np.sin(2 * np.pi * when / 17.0 + body)
         yaw = heading(body, when - half) + off
         upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
-        poses_of.append((np.full(len(when), f"robot{body}"), place(body, when - half), upright, when))
+        tilt = np.radians(tilt_deg) * np.sin(2 * np.pi * when / (11.0 + body) + body)
+        # Tilted about the world's x axis: the quaternion of the tilt times that of the heading.
+        s, c = np.sin(tilt / 2), np.cos(tilt / 2)
+        upright = np.column_stack([s * upright[:, 3], -s * upright[:, 2], c * upright[:, 2], c * upright[:, 3]])
+        seen = place(body, when - half) + place_noise_m * rng.normal(size=(len(when), 3))
+        poses_of.append((np.full(len(when), f"robot{body}"), seen, upright, when))
     for tag, here in stand.items():
         two = np.array([0.0, seconds])
         poses_of.append((np.full(2, f"anchor{tag}"), np.tile(here, (2, 1)), np.tile([0, 0, 0, 1.0], (2, 1)), two))
