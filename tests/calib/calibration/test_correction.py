@@ -28,7 +28,8 @@ def full_recording(path):
         recording.append_frames([FrameRow(7, "1", "in", b"\x00\xff raw"), FrameRow(8, "1", "out", b"C05")])
         recording.append_cirs([CirRow(9, 1, 1, 2, 741.25, tuple(range(1016)))])
         recording.append_overheard([{name: float(k) for k, name in enumerate(TABLES["overheard"])}])
-        for table in ("imu", "height", "powers", "temperature"):  # and not "corrected", which is what is made
+        # And not "corrected", which is what is made.
+        for table in ("imu", "height", "powers", "temperature", "arrangements", "distances"):
             kinds = {"BIGINT": np.array([11]), "VARCHAR": np.array(["b1"]), "DOUBLE": np.array([0.5])}
             kinds |= {"USMALLINT": np.array([3])}
             recording.append_columns(table, {name: kinds[kind] for name, kind in TABLES[table].items()})
