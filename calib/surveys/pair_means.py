@@ -66,7 +66,7 @@ def pair_means(ranges: Ranges, arrangement: Ints) -> tuple[PairMeans, int]:
     keys = np.column_stack([arrangement, low, high])[good]
     found, inverse = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
-    groups = np.split(np.flatnonzero(good)[order], np.cumsum(np.bincount(inverse, minlength=len(found)))[:-1])
+    groups = np.split(np.flatnonzero(good)[order], np.cumsum(np.bincount(inverse, minlength=len(found))))[: len(found)]
     kept = [(key, rows) for key, rows in zip(found, groups, strict=True) if len(rows) >= FEWEST]
     lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, LIFT, ALPHA_DBM)
     table = np.array([_row(ranges, key, rows, lifted) for key, rows in kept], dtype=float).reshape(-1, 10)
