@@ -20,6 +20,8 @@ PLACE_M: Final = 0.01
 """Standard deviation of each coordinate of a position where none is stated."""
 
 LARGEST_ID: Final = 254
+LATEST_S: Final = 1e9
+"""Of seconds within a recording: thirty years either way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +106,8 @@ def _arrangements(file: TomlReader) -> tuple[dict[str, str], dict[str, tuple[flo
             raise BadInputError(f"{file.path}: {where}start_s: give both start_s and end_s, or neither")
         if "start_s" in row:
             start, end = row["start_s"], row["end_s"]
-            file.check(f"{where}start_s", start, is_number(start), "a number of seconds")
-            file.check(f"{where}end_s", end, is_number(end) and end > start, f"a number above start_s, {start}")
+            file.check(f"{where}start_s", start, _is_time(start), "a number of seconds")
+            file.check(f"{where}end_s", end, _is_time(end) and end > start, f"a number above start_s, {start}")
             spans[name] = (float(start), float(end))
     return shapes, spans
 
@@ -182,3 +184,7 @@ def _check_tags(ids: tuple[int, ...], name: str, tags: dict[str, set[int]], what
     if not any(set(ids) <= there for there in wanted.values()):
         where = f"arrangement {name}" if name else "any arrangement"
         raise BadInputError(f"{what}, which do not range in {where}", parameter="known")
+
+
+def _is_time(value: Any) -> bool:
+    return is_number(value) and abs(value) <= LATEST_S
