@@ -91,10 +91,10 @@ def test_a_report_that_is_interrupted_says_so_and_leaves_no_half(tmp_path, delay
 
 
 def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
-    row = "{0}.25,{1},9,{0},{2},3000000,4000000,5000000,6000000,-80.5,-81.5\n"
+    row = "{0}.25,{1},9,{2:.3f},-80.5,-81.5\n"
     with (tmp_path / "t.csv").open("w") as file:
-        file.write("time_s,from_id,to_id,tx1,rx1,tx2,rx2,tx3,rx3,fpp1,fpp2\n")
-        file.writelines(row.format(k, k % 5, k + 500) for k in range(400_000))
+        file.write("time_s,from_id,to_id,range_m,fpp1,fpp2\n")
+        file.writelines(row.format(k, k % 5, 3 + k % 7) for k in range(1_200_000))
     process = started("uwblink", "import", "csv", str(tmp_path / "t.csv"), "-o", str(tmp_path / "t.uwb"))
     wait_for(lambda: is_working(process), process)
     time.sleep(0.2)
