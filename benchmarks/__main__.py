@@ -46,7 +46,7 @@ def main() -> None:
         row("its peak memory", "500 MB", f"{megabytes:.0f} MB")
         row(
             "fit of its exchanges, in process, after loading",
-            "100 ms",
+            "150 ms",
             f"{fitting(recording) * 1e3:.0f} ms",
         )
         calibration = Path(folder) / "calibration.json"
