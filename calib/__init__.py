@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from calib.calibration.comparison import compare
     from calib.calibration.correction import apply
     from calib.calibration.formats import export
-    from calib.calibration.model import Calibration, CorrectedRanges, load_calibration
+    from calib.calibration.model import Calibration, load_calibration
+    from calib.calibration.parts import CorrectedRanges
     from calib.doctor.examine import examine
     from calib.errors import BadInputError, CalibError, UnanswerableError
     from calib.estimation.fitting import fit
@@ -75,7 +76,7 @@ _HOMES: Final = {
     "BadInputError": "calib.errors",
     "CalibError": "calib.errors",
     "Calibration": "calib.calibration.model",
-    "CorrectedRanges": "calib.calibration.model",
+    "CorrectedRanges": "calib.calibration.parts",
     "FitResult": "calib.estimation.result",
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",

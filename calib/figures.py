@@ -13,7 +13,8 @@ import numpy as np
 from matplotlib.axes import Axes as Axes
 from matplotlib.figure import Figure
 
-from calib.calibration.model import Calibration, CorrectedRanges
+from calib.calibration.model import Calibration
+from calib.calibration.parts import CorrectedRanges
 from calib.error_mixture import fit_error_mixture
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
 from calib.ranges import Ranges

@@ -11,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.calibration.model import Calibration, CorrectedRanges, require_calibration
+from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.parts import CorrectedRanges
 from calib.errors import BadInputError
 from calib.ranges import Ranges
 from uwblink.exporters import check_export, export_recording

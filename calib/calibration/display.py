@@ -12,7 +12,8 @@ import numpy as np
 from calib.calibration.pair_offsets import named
 
 if TYPE_CHECKING:
-    from calib.calibration.model import Calibration, TagGroup
+    from calib.calibration.model import Calibration
+    from calib.calibration.parts import TagGroup
 
 TWO_SIDED_95: Final = 1.959963984540054
 MOST_TAGS: Final = 40

@@ -20,8 +20,9 @@ from threadpoolctl import threadpool_limits
 
 import uwblink
 from calib.calibration.json_format import Matrix
-from calib.calibration.model import Calibration, TagGroup, Uncertainty
+from calib.calibration.model import Calibration
 from calib.calibration.pair_offsets import PairOffset
+from calib.calibration.parts import TagGroup, Uncertainty
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve
 from calib.calibration.power_curves import lift as lift_power
 from calib.error_mixture import fit_error_mixture

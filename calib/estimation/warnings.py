@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.model import CorrectedRanges
+from calib.calibration.parts import CorrectedRanges
 from calib.ranges import STATIC, Ranges
 
 MANY_MISSING: Final = 0.05

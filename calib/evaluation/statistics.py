@@ -8,7 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.calibration.model import Calibration, CorrectedRanges, require_calibration
+from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.display import as_html, as_text
 from calib.ranges import Ranges
 from calib.sources import Data, load_ranges

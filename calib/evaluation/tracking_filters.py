@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.model import Calibration, CorrectedRanges
+from calib.calibration.model import Calibration
+from calib.calibration.parts import CorrectedRanges
 from calib.errors import UnanswerableError
 from calib.evaluation.multilateration import multilaterate
 from calib.evaluation.range_updates import Heard, RangeErrors, gated, weighed

@@ -10,7 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Unpack
 
-from calib.calibration.model import Calibration, CorrectedRanges
+from calib.calibration.model import Calibration
+from calib.calibration.parts import CorrectedRanges
 from calib.doctor.base import Finding
 from calib.doctor.examine import examine
 from calib.errors import UnanswerableError

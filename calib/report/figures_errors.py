@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.calibration.model import CorrectedRanges
+from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.statistics import pair_rows
 from calib.figures import cumulative, histogram
 from calib.ranges import Ranges

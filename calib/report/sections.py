@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from calib.calibration.display import pair_rows as offset_rows
-from calib.calibration.model import Calibration, CorrectedRanges
+from calib.calibration.model import Calibration
+from calib.calibration.parts import CorrectedRanges
 from calib.error_mixture import fit_error_mixture
 from calib.estimation.passive_listeners import OverheardDelay
 from calib.estimation.result import FitResult

@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.calibration.model import Calibration, CorrectedRanges
+from calib.calibration.model import Calibration
+from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.statistics import Evaluation
 from calib.evaluation.tracking import Localization
 from calib.figures import TWO_SIDED_95

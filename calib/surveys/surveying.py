@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 
 import uwblink
 from calib.calibration.json_format import Matrix
-from calib.calibration.model import Calibration, Uncertainty
+from calib.calibration.model import Calibration
+from calib.calibration.parts import Uncertainty
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, flat_curve
 from calib.errors import BadInputError, UnanswerableError
 from calib.information import Unknown, Verdict, judge, reduced
