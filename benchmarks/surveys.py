@@ -17,7 +17,7 @@ import numpy as np
 
 import calib
 from benchmarks.standing import DIMENSIONS, standing_boards
-from calib.surveys.candidates import Layout, delay_information
+from calib.planning.candidates import Layout, delay_information
 
 PAGE = Path(__file__).parents[1] / "docs" / "without-motion-capture.md"
 PLACE = re.compile(r"(<!-- surveys:begin[^>]*-->\n).*?(<!-- surveys:end -->)", re.DOTALL)

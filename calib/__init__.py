@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from calib.evaluation.localization import localize
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
+    from calib.planning.arranging import plan
+    from calib.planning.result import Plan
     from calib.ranges import Ranges
     from calib.report.campaign import run_campaign
     from calib.report.layout import register_report_section
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     from calib.samples import sample_flight
     from calib.sources import load_ranges
     from calib.surveys.knowledge import Knowledge, KnownPosition
-    from calib.surveys.planning import Plan, plan
     from calib.surveys.result import SurveyResult
     from calib.surveys.samples import sample_arrangements
     from calib.surveys.surveying import survey
@@ -81,7 +82,7 @@ _HOMES: Final = {
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",
     "OnboardSettings": "calib.evaluation.onboard",
-    "Plan": "calib.surveys.planning",
+    "Plan": "calib.planning.result",
     "Ranges": "calib.ranges",
     "SurveyResult": "calib.surveys.result",
     "UnanswerableError": "calib.errors",
@@ -97,7 +98,7 @@ _HOMES: Final = {
     "load_ranges": "calib.sources",
     "localize": "calib.evaluation.localization",
     "localize_onboard": "calib.evaluation.onboard",
-    "plan": "calib.surveys.planning",
+    "plan": "calib.planning.arranging",
     "register_loss": "calib.estimation.losses",
     "register_report_section": "calib.report.layout",
     "run_campaign": "calib.report.campaign",

@@ -68,7 +68,7 @@ FLOORS = {
         ("figures",),
         ("estimation", "surveys"),
         ("doctor", "trajectories"),
-        ("report",),
+        ("planning", "report"),
         ("cli",),
     ),
 }

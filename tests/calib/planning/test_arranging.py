@@ -11,7 +11,7 @@ import calib
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
 from calib.errors import BadInputError
-from calib.surveys.candidates import Layout, delay_information, on_line
+from calib.planning.candidates import Layout, delay_information, on_line
 
 C_M_PER_NS = 0.299702547
 

@@ -1,0 +1,109 @@
+"""A plan: a procedure in steps, the interval that each delay will have, and what one more measurement would bring."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from calib.information import Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedArrangement:
+    """One arrangement: its name, where about the boards stand (metres, by tag), and distances to tape, by pairs."""
+
+    name: str
+    place_m: Mapping[int, tuple[float, float, float]]
+    taped: tuple[tuple[int, int], ...]
+
+    def order(self) -> tuple[int, ...]:
+        """Return the tags in the order in which they lie along x."""
+        return tuple(sorted(self.place_m, key=lambda tag: self.place_m[tag]))
+
+
+@dataclass(frozen=True, slots=True)
+class NextBest:
+    """What one more measurement would bring: what it is, and the mean half interval (ns) it leaves, of how much.
+
+    Of a delay that nothing determines 1.5 ns are taken for known.
+    """
+
+    what: str
+    mean_ns: float
+    instead_of_ns: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """A procedure in steps, and the interval (ns, half of 95 %) that each delay will have; infinite where none.
+
+    `verdict` says what the arrangements determine; `common_ns` is the half interval of what all delays share, to which
+    every absolute distance owes as much; `next_best` are the next arrangement and the next taped distance. With
+    `known_beside`, distances or places are known that a survey must be told.
+
+    >>> import calib
+    >>> plan = calib.plan(4, on="line", arrangements=6)
+    >>> len(plan.arrangements), plan.undetermined
+    (6, ())
+    >>> print(plan.arrangements[0].order())
+    (1, 2, 3, 4)
+    """
+
+    on: str
+    tags: tuple[int, ...]
+    arrangements: tuple[PlannedArrangement, ...]
+    half_ns: Mapping[int, float]
+    common_ns: float
+    verdict: Verdict
+    next_best: tuple[NextBest, ...]
+    seconds_each: float
+    pair_error_m: float
+    known_beside: bool
+    steps: tuple[str, ...]
+
+    @property
+    def undetermined(self) -> tuple[int, ...]:
+        """The tags whose delay the arrangements leave open."""
+        return tuple(int(tag) for tag in self.verdict.named("delay"))
+
+    def __str__(self) -> str:
+        """Return the steps, the pictures and the intervals."""
+        return "\n".join([*self.steps, "", *self._intervals()])
+
+    def _intervals(self) -> list[str]:
+        lines = [f"Promised, if the constant error of a pair is {100 * self.pair_error_m:.1f} cm:"]
+        for tag in self.tags:
+            half = self.half_ns[tag]
+            lines.append(f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else "undetermined"))
+        if math.isfinite(self.common_ns):
+            lines.append(f"  what all share ± {self.common_ns:.3f} ns")
+        if self.undetermined:
+            lines += [f"not determined: {direction.words}" for direction in self.verdict.free]
+        lines.append(
+            "Where a curve over power is fitted along, what all share is known less well, and differences as well."
+        )
+        for best in self.next_best:
+            lines.append(f"next best: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}")
+        return lines
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as JSON takes it; null where nothing is determined."""
+        known = {str(tag): half if math.isfinite(half) else None for tag, half in self.half_ns.items()}
+        return {
+            "on": self.on,
+            "seconds_each": self.seconds_each,
+            "pair_error_m": self.pair_error_m,
+            "half_interval_ns": known,
+            "common_ns": self.common_ns if math.isfinite(self.common_ns) else None,
+            "undetermined": list(self.undetermined),
+            "arrangements": [
+                {"name": a.name, "place_m": {str(t): list(p) for t, p in a.place_m.items()}, "taped": list(a.taped)}
+                for a in self.arrangements
+            ],
+            "next_best": [
+                {"what": b.what, "mean_ns": b.mean_ns, "instead_of_ns": b.instead_of_ns} for b in self.next_best
+            ],
+            "steps": list(self.steps),
+        }
