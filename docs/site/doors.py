@@ -45,7 +45,22 @@ def _by_names(text: str | None) -> str | None:
 
 
 def _module(name: str, members: str = "") -> str:
-    return f"```{{eval-rst}}\n.. automodule:: {name}\n   :members: {members}\n   :imported-members:\n```"
+    parts = _of_parts(name)
+    apart = f"   :exclude-members: {', '.join(parts)}\n" if parts else ""
+    whole = [f".. autoclass:: {name}.{part}\n   :members:\n   :inherited-members:\n" for part in parts]
+    module = f".. automodule:: {name}\n   :members: {members}\n   :imported-members:\n{apart}"
+    return "```{eval-rst}\n" + "\n".join([module, *whole]) + "```"
+
+
+def _of_parts(name: str) -> list[str]:
+    """Return the classes of a module that consist of others, whose methods are theirs: a recording's, by table."""
+    module = import_module(name)
+    return [word for word in module.__all__ if len(_own_bases(getattr(module, word))) > 1]
+
+
+def _own_bases(thing: Any) -> list[type]:
+    bases = thing.__bases__ if inspect.isclass(thing) else ()
+    return [base for base in bases if base.__module__.split(".")[0] in PACKAGES and not issubclass(base, Exception)]
 
 
 def _class(cls: type) -> str:
@@ -100,7 +115,8 @@ def _functions(thing: Any) -> Iterator[Any]:
         return
     if dataclasses.is_dataclass(thing):
         yield thing
-    for name, member in vars(thing).items():
+    members = [*vars(thing).items(), *(item for base in _own_bases(thing) for item in vars(base).items())]
+    for name, member in members:
         if not name.startswith("_") or name == "__init__":
             yield from (one for one in (getattr(member, "fget", member),) if inspect.isfunction(one))
 

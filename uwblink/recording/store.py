@@ -17,13 +17,10 @@ from numpy.typing import NDArray
 from uwblink.errors import RecordingError, RecordingInUseError
 from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
+from uwblink.recording.soundness import check_length, damaged, first_line, is_locked
 
 if TYPE_CHECKING:
     import duckdb
-
-HEADER_BYTES: Final = 3 * 4096
-BLOCK_BYTES: Final = 16_384
-"""Smallest block of a DuckDB file; every larger one is a multiple of it."""
 
 ROWS_AT_A_TIME: Final = 100_000
 """Rows that a copy holds in memory at once; of impulse responses, which are the largest, 0.2 GB."""
@@ -65,7 +62,7 @@ class Store:
             for setting in _LOCKED:
                 store.execute(f"SET {setting}")
         except duckdb.Error as error:
-            raise RecordingError(f"{path}: cannot be written ({_first_line(error)})") from error
+            raise RecordingError(f"{path}: cannot be written ({first_line(error)})") from error
         store._create_missing()
         return store
 
@@ -74,7 +71,7 @@ class Store:
         """Open a file for reading, or to `update` it; raises `RecordingError` for what is none, or is in use."""
         import duckdb
 
-        _check_length(path)
+        check_length(path)
         config: dict[str, Any] = dict(setting.split(" = ") for setting in _LOCKED)
         size = path.stat().st_size
         try:
@@ -85,9 +82,9 @@ class Store:
             if is_locked(path, update=update):
                 use = "has it open" if update else "is writing it"
                 raise RecordingInUseError(f"{path}: another process {use}; wait until that ends") from error
-            raise _damaged(path, error) from error
+            raise damaged(path, error) from error
         except duckdb.Error as error:
-            raise _damaged(path, error) from error
+            raise damaged(path, error) from error
         try:
             check_intake(store.rows, path, size)
             store.check_columns()
@@ -125,7 +122,7 @@ class Store:
                 self._second.execute("DETACH uwblink_snapshot")
         except duckdb.Error as error:
             place.unlink(missing_ok=True)
-            raise RecordingError(f"{place}: cannot be written ({_first_line(error)})") from error
+            raise RecordingError(f"{place}: cannot be written ({first_line(error)})") from error
 
     def execute(self, statement: str, values: list[Any] | None = None) -> None:
         """Execute a statement of SQL; raises `RecordingError` where the file cannot be written."""
@@ -142,7 +139,7 @@ class Store:
         import duckdb
 
         disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
-        reason = f"{_first_line(error)}){'; is the disk full?' if disk else '.'}"
+        reason = f"{first_line(error)}){'; is the disk full?' if disk else '.'}"
         if self._hidden:
             return RecordingError(f"{self.path}: cannot be written ({reason} Nothing was written")
         return RecordingError(f"{self.path}: cannot be written any more ({reason} What was written before is kept")
@@ -191,7 +188,7 @@ class Store:
             yield
         except (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException) as error:
             raise RecordingError(
-                f"{self.path}: table {table}: values that do not fit ({_first_line(error)}); "
+                f"{self.path}: table {table}: values that do not fit ({first_line(error)}); "
                 f"its columns are {', '.join(f'{name} {kind}' for name, kind in TABLES[table].items())}"
             ) from error
 
@@ -213,7 +210,7 @@ class Store:
             try:
                 yield
             except duckdb.Error as error:
-                why = f"took longer than {self._longest_read_s:.0f} s" if late.is_set() else _first_line(error)
+                why = f"took longer than {self._longest_read_s:.0f} s" if late.is_set() else first_line(error)
                 raise RecordingError(f"{self.path}: cannot be read, truncated or damaged ({why})") from error
 
     def take(self, source: Store, table: str) -> None:
@@ -270,33 +267,3 @@ class Store:
             missing = sorted(columns.keys() - found.get(table, set()) - ADDED_LATER.get(table, frozenset()))
             if missing:
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
-
-
-def is_locked(path: Path, *, update: bool) -> bool:
-    """Whether another process holds the lock that DuckDB takes on a file it writes, or reads."""
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system, where opening the file says it
-        return False
-    try:
-        with path.open("r+b" if update else "rb") as file:
-            fcntl.lockf(file, (fcntl.LOCK_EX if update else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError):
-        return True
-    except OSError:
-        return False
-    return False
-
-
-def _damaged(path: Path, error: Exception) -> RecordingError:
-    return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({_first_line(error)})")
-
-
-def _check_length(path: Path) -> None:
-    """A DuckDB file is headers and whole blocks; one that was cut is not, and may still open."""
-    if path.stat().st_size % BLOCK_BYTES != HEADER_BYTES % BLOCK_BYTES:
-        raise RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one (its length is odd)")
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]

@@ -1,0 +1,45 @@
+"""What a file is before DuckDB reads it: in use by another process, or cut off, or no recording at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from uwblink.errors import RecordingError
+from uwblink.recording.schema import SUFFIX
+
+HEADER_BYTES: Final = 3 * 4096
+BLOCK_BYTES: Final = 16_384
+"""Smallest block of a DuckDB file; every larger one is a multiple of it."""
+
+
+def is_locked(path: Path, *, update: bool) -> bool:
+    """Whether another process holds the lock that DuckDB takes on a file it writes, or reads."""
+    try:
+        import fcntl
+    except ImportError:  # not a POSIX system, where opening the file says it
+        return False
+    try:
+        with path.open("r+b" if update else "rb") as file:
+            fcntl.lockf(file, (fcntl.LOCK_EX if update else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def damaged(path: Path, error: Exception) -> RecordingError:
+    """Return what to raise for a file that DuckDB cannot open."""
+    return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({first_line(error)})")
+
+
+def check_length(path: Path) -> None:
+    """Raise `RecordingError` for a file that was cut: DuckDB's are headers and whole blocks, and may still open."""
+    if path.stat().st_size % BLOCK_BYTES != HEADER_BYTES % BLOCK_BYTES:
+        raise RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one (its length is odd)")
+
+
+def first_line(error: Exception) -> str:
+    """Return what an error says first; the rest is for who wrote the query."""
+    return str(error).splitlines()[0]
