@@ -31,8 +31,8 @@ def units(view: RecordingView) -> Iterator[Finding]:
     if longest < 60e-6 and longest * per_ns > 150e-6 and len(np.unique(view.exchanges.tx1 % 512)) > 8:
         yield Finding(
             "unit slip",
-            f"the longest leg of an exchange lasts {longest * 1e6:.1f} us, too short for a frame; "
-            f"read as nanoseconds it would be {longest * per_ns * 1e6:.0f} us",
+            f"the longest leg of an exchange lasts {longest * 1e6:.1f} µs, too short for a frame; "
+            f"read as nanoseconds it would be {longest * per_ns * 1e6:.0f} µs",
             'the stamps are nanoseconds, not ticks: import again with [units] stamps = "ns"',
             0.95,
         )

@@ -68,7 +68,7 @@ def told(left: LeftSkew) -> str:
     """Return as a sentence what clock skew may have left in single-sided ranges."""
     bound = (
         f"clocks that are 20 ppm off each leave up to {_length(left.bound_m)} "
-        f"(c/2 x 40 ppm x {1e6 * left.reply_s:.0f} us of reply)"
+        f"(c/2 x 40 ppm x {1e6 * left.reply_s:.0f} µs of reply)"
     )
     if not np.isfinite(left.told_m):
         return (

@@ -187,7 +187,7 @@ def set_delay(
 
     with Board.open(port) as board:
         board.set_response_delay(delay_uus)
-    typer.echo(f"{port}: response delay {delay_uus} ({delay_uus * 512 / 499.2 + 0.25641:.1f} us), until power is lost")
+    typer.echo(f"{port}: response delay {delay_uus} ({delay_uus * 512 / 499.2 + 0.25641:.1f} µs), until power is lost")
 
 
 def passive(

@@ -195,7 +195,7 @@ def optimum(
     typer.echo(f"{'protocol':10s}{'best delay':>12s}{'one range':>12s}{'takes':>10s}{'mean of 1 s':>14s}")
     for one in found:
         typer.echo(
-            f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} us{100 * one.rms_m:9.2f} cm{1e6 * one.duration_s:7.0f} us"
+            f"{one.protocol:10s}{1e6 * one.delay_s:9.0f} µs{100 * one.rms_m:9.2f} cm{1e6 * one.duration_s:7.0f} µs"
             f"{100 * one.second_rms_m:11.4f} cm" + ("  (the edge of what boards take)" if one.on_edge else "")
         )
 

@@ -48,8 +48,8 @@ class Optimum:
         """Return one line."""
         edge = " (the edge of what boards take)" if self.on_edge else ""
         return (
-            f"{self.protocol}: best delay {1e6 * self.delay_s:.0f} us{edge}, one range {100 * self.rms_m:.2f} cm in "
-            f"{1e6 * self.duration_s:.0f} us, mean of a second {1e3 * self.second_rms_m:.3f} mm"
+            f"{self.protocol}: best delay {1e6 * self.delay_s:.0f} µs{edge}, one range {100 * self.rms_m:.2f} cm in "
+            f"{1e6 * self.duration_s:.0f} µs, mean of a second {1e3 * self.second_rms_m:.3f} mm"
         )
 
     def to_dict(self) -> dict[str, Any]:

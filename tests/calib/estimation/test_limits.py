@@ -182,7 +182,7 @@ def test_skew_of_single_sided_ranges_is_bounded_by_their_reply():
     # c/2 x 40 ppm x 300.5 us, by hand.
     assert left.bound_m == pytest.approx(0.5 * 299_702_547 * 40e-6 * 300.5e-6, rel=1e-3)
     assert math.isnan(left.told_m)
-    assert "1.8 m (c/2 x 40 ppm x 300 us of reply)" in told(calib.fit(plain, delays_only=True), "without carrier")
+    assert "1.8 m (c/2 x 40 ppm x 300 µs of reply)" in told(calib.fit(plain, delays_only=True), "without carrier")
     read = replace(plain, skew2_ppm=np.full(count, 2.0))
     assert calib.load_ranges(read).left_skew.told_m == pytest.approx(0.5 * 299_702_547 * 2e-6 * 300.5e-6, rel=1e-3)
     assert "read as protocol ss-cfo" in told(calib.fit(read, delays_only=True), "clock skew in them")
