@@ -15,7 +15,9 @@ import pytest
 import uwblink
 from tests.boards import bench_scenario, served
 from uwblink.boards.corrections import load_correction
+from uwblink.boards.listeners import Turn
 from uwblink.boards.live_page import LivePage
+from uwblink.boards.progress import PairState, Progress
 from uwblink.errors import PlanError, PortError
 from uwblink.recording.schema import Fault
 from uwblink.wire.messages import RangeReport
@@ -75,7 +77,7 @@ def test_the_page_shows_rates_success_ranges_power_faults_disk_and_queue(tmp_pat
     with LivePage(tmp_path / "f.uwb", correct=lambda _, report: {"corrected_m": report.range_m - 0.125}) as page:
         done, (headers, text) = recorded(tmp_path, page, lambda: fetch(page))
     assert headers["Content-Type"] == "text/html; charset=utf-8"
-    rows = re.findall(r"<tr><td>(\d) &rarr; (\d)</td>(.*?)</tr>", text)
+    rows = re.findall(r"<tr><td>(\d)&nbsp;&rarr;&nbsp;(\d)</td>(.*?)</tr>", text)
     assert {(int(a), int(b)) for a, b, _ in rows} == set(done.pairs)
     for *_, cells in rows:
         rate, success, distance, corrected, power, picture = re.findall(r"<td>(.*?)</td>", cells)
@@ -87,6 +89,32 @@ def test_the_page_shows_rates_success_ranges_power_faults_disk_and_queue(tmp_pat
         assert len(re.findall(r"[\d.]+,[\d.]+", picture)) > 100
     assert re.search(r"file [\d.]+ MB, disk [\d.]+ GB free; queue: \d+ pieces, last commit [\d.]+ s ago", text)
     assert "faults: none" in text or "failed exchange" in text
+
+
+def test_the_picture_is_the_last_minute_whenever_the_counts_come(tmp_path):
+    """The recorder hands its counts over only after a while, and host time is large."""
+    began_ns = 1_790_000_000_000_000_000
+    with LivePage(tmp_path / "f.uwb") as page:
+        for k in range(90):
+            if k == 5:
+                progress = Progress(start_ns=began_ns, pairs={(1, 2): PairState()})
+                page.watch(progress)
+            report = RangeReport(2, 3.0 + 0.01 * k, 1, 2, 3, 4, 5, 6, -85.0, -86.0, 0.0, 0.0)
+            turn = Turn(began_ns + k * 1_000_000_000, (1, 2), report)
+            page.on_turn(turn)
+            if k >= 5:
+                progress.on_turn(turn)
+        progress.time_s = 95.0
+        text = page.body()
+    drawn = re.findall(r"([\d.]+),([\d.]+)", re.search(r'points="([^"]*)"', text)[1])
+    across, down = ([float(place[k]) for place in drawn] for k in (0, 1))
+    # 61 ranges of a minute, a second apart, over 254 of 260 units; longer and longer, so higher and higher.
+    assert len(drawn) == 61
+    assert across == pytest.approx([3 + 254 * k / 60 for k in range(61)], abs=0.06)
+    assert down == pytest.approx([41 - 38 * k / 60 for k in range(61)], abs=0.06)
+    assert "range from 3.290 to 3.890 m" in text
+    assert "class='silent'" in text, "the last range came six seconds ago"
+    assert "corrected" not in text, "there is no calibration"
 
 
 def test_what_boards_say_cannot_become_part_of_the_page(tmp_path):
