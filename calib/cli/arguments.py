@@ -160,3 +160,21 @@ Anchors = Annotated[
         **choice("given", "sought"),
     ),
 ]
+Distances = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--distance",
+        metavar="TAG-TAG=METRES",
+        rich_help_panel=UNKNOWN,
+        help="Distance of two antennas by a tape, as in 11-12=3.06, good to 1 cm or as said, 3.06+-0.005; of tags that "
+        "move, while they stood still: 1-3=1.52@2..8 (seconds, or the name of an arrangement). May be repeated.",
+    ),
+]
+Heights = Annotated[
+    str | None,
+    typer.Option(
+        rich_help_panel=UNKNOWN,
+        help="Readings of height sensors in the recording: used (the default) or ignored.",
+        **choice("used", "ignored"),
+    ),
+]

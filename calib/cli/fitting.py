@@ -18,10 +18,12 @@ from calib.cli.arguments import (
     Constants,
     DelaysFrom,
     DelaysOnly,
+    Distances,
     Fix,
     Force,
     GroupFile,
     HeadingStd,
+    Heights,
     Lift,
     Loss,
     MinimumNorm,
@@ -80,6 +82,8 @@ def fit(
     attitudes: Attitudes = None,
     heading_std: HeadingStd = None,
     anchors: Anchors = None,
+    distance: Distances = None,
+    heights: Heights = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -102,7 +106,17 @@ def fit(
         delays_from=delays_from,
         constants=constants,
     )
-    unknown = trajectory_options(truth, poses_until, attitudes, heading_std, anchors)
+    unknown = trajectory_options(
+        truth,
+        {
+            "poses_until_s": poses_until,
+            "attitudes": attitudes,
+            "heading_std_deg": heading_std,
+            "anchors": anchors,
+            "distances": distance,
+            "heights": heights,
+        },
+    )
     check_output(output, force=force)
     try:
         if unknown is None:

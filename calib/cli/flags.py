@@ -8,6 +8,7 @@ from uwblink.cli import shared
 
 FLAGS: Final = {
     "boards": "COUNT",
+    "distances": "--distance",
     "fixed_ns": "--fix",
     "groups": "--group",
     "scale_ns": "--scale",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,10 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from calib.errors import BadInputError
+from uwblink import KnownDistance
 
 if TYPE_CHECKING:
     import calib
     from calib.estimation import FitSettings
+
+NUMBER: Final = r"\s*(\d+(?:\.\d*)?|\.\d+)\s*"
+TAPED: Final = re.compile(rf"\s*(\d+)\s*-\s*(\d+)\s*={NUMBER}(?:(?:\+-|±){NUMBER})?(?:@(.+))?$")
+TAPE_M: Final = 0.01
+"""What a tape is good to where nobody says."""
 
 TRUTHS: Final = ("recorded", "ranges")
 SHARED: Final = ("fixed_ns", "groups", "lift", "reference_power_dbm", "delays_only", "minimum_norm")
@@ -28,24 +35,30 @@ ALONE: Final = {
 """Settings of the other fit, and what they are when nobody asks for them."""
 
 
-def trajectory_options(
-    truth: str, poses_until_s: float | None, attitudes: str | None, heading_std_deg: float | None, anchors: str | None
-) -> dict[str, Any] | None:
+def trajectory_options(truth: str, settings: dict[str, Any]) -> dict[str, Any] | None:
     """Return the settings that only a fit without known distances takes; None for a fit with them."""
     if truth not in TRUTHS:
         raise BadInputError(f"found {truth!r}, allowed: {', '.join(TRUTHS)}", parameter="truth")
-    given = {
-        "poses_until_s": poses_until_s,
-        "attitudes": attitudes,
-        "heading_std_deg": heading_std_deg,
-        "anchors": anchors,
-    }
-    given = {name: value for name, value in given.items() if value is not None}
+    given = {name: value for name, value in settings.items() if value is not None}
+    if "distances" in given:
+        given["distances"] = [taped(text) for text in given["distances"]]
     if truth == "ranges":
         return given
     for name in given:
         raise BadInputError("goes with a fit whose `truth` is ranges", parameter=name)
     return None
+
+
+def taped(text: str) -> KnownDistance:
+    """Return the distance that a text TAG-TAG=METRES says; raises `BadInputError` for what cannot be read."""
+    found = TAPED.match(text)
+    if found is None:
+        raise BadInputError(
+            f"found {text!r:.60}, expected TAG-TAG=METRES, as in 11-12=3.06, 11-12=3.06+-0.005 or 1-3=1.52@2..8",
+            parameter="distances",
+        )
+    first, second, distance, sigma, when = found.groups()
+    return KnownDistance(int(first), int(second), float(distance), float(sigma or TAPE_M), (when or "").strip())
 
 
 def fitted_from_ranges(

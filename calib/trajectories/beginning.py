@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from calib.trajectories.starting import (
     SAMPLE_S,
     SCALES_M,
     Followed,
+    Settled,
     follow,
     known_at_first,
     positions,
@@ -35,16 +36,33 @@ AROUND_M: Final = 2.0
 HEADED_S: Final = 8.0
 """A first window lasts so long at least where headings are to be found in it."""
 
+AS_LIKELY: Final = 6.0
+"""Solutions of a first window are taken for alike whose log likelihoods differ by less."""
 
-def beginning(scene: Scene, done: Callable[[float], None]) -> tuple[Scene, State]:
-    """Return trajectories and standing bodies that fit the raw ranges, as unknowns without delays or curve.
+ELSEWHERE_M: Final = 0.5
+APART_M: Final = 0.1
+"""Places among given anchors, and distances, that differ by more in the median are other ones."""
 
-    The scene comes back with headings in its attitudes that were found, where they were not known.
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """Trajectories and standing bodies that fit the raw ranges, as unknowns without delays or curve.
+
+    The `scene` has headings in its attitudes that were found, where they were not known. `rival` says in a sentence
+    whether something else fits as well; it is empty where nothing does.
     """
+
+    scene: Scene
+    state: State
+    rival: str = ""
+
+
+def beginning(scene: Scene, done: Callable[[float], None]) -> Beginning:
+    """Return where the search begins."""
     seed = next(known_at_first(scene), None)
-    stand = np.zeros((len(scene.sought), 3))
+    stand, rival = np.zeros((len(scene.sought), 3)), ""
     if seed is None:
-        scene, seed, stand = _first_window(scene)
+        scene, seed, stand, rival = _first_window(scene)
     elif scene.sought:
         stand = _seen_from(scene, seed)
     found, stand = follow(scene, seed, stand, lambda share: done(0.8 * share))
@@ -54,11 +72,11 @@ def beginning(scene: Scene, done: Callable[[float], None]) -> tuple[Scene, State
     known = known_rows(scene, columns, start)
     for scale in SCALES_M:
         start = minimise(rows, known, start, Cauchy(scale), settled=1.0).state
-    return scene, start
+    return Beginning(scene, start, rival)
 
 
-def _first_window(scene: Scene) -> tuple[Scene, Followed, Floats]:
-    """Return where bodies are in the first window, from many starts: the one that fits best."""
+def _first_window(scene: Scene) -> tuple[Scene, Followed, Floats, str]:
+    """Return where bodies are in the first window, from many starts: the one that fits best, and what rivals it."""
     begin = float(scene.time_s[0])
     headless = _without_heading(scene)
     length = max(window_s(scene), HEADED_S if headless else 0.0)
@@ -70,7 +88,27 @@ def _first_window(scene: Scene) -> tuple[Scene, Followed, Floats]:
         for guess, stand, heading in _guesses(window, time, headless)
     ]
     best, heading = min(tried, key=lambda one: one[0].cost)
-    return headed(scene, heading), Followed(time, positions(best.columns, best.state, time)), best.stand
+    rival = _rival(scene, best, [one for one, _ in tried], time)
+    return headed(scene, heading), Followed(time, positions(best.columns, best.state, time)), best.stand, rival
+
+
+def _rival(scene: Scene, best: Settled, tried: list[Settled], time: Floats) -> str:
+    """Return in a sentence what else fits a first window (seconds (k,)) as well; nothing if nothing does."""
+    close = sorted((one for one in tried if one.cost - best.cost < AS_LIKELY), key=lambda one: one.cost)
+    given = any(place is not None for place in scene.still.values())
+    for one in close:
+        if not given and float(np.median(np.abs(one.residuals - best.residuals))) < APART_M:
+            continue
+        here, there = (positions(some.columns, some.state, time) for some in (best, one))
+        away = np.median(np.linalg.norm(there - here, axis=2), axis=0)
+        if given and away.max() < ELSEWHERE_M:
+            continue
+        what = f"{scene.moving[int(np.argmax(away))]} {away.max():.1f} m elsewhere" if given else "other distances"
+        return (
+            f"a second solution, with {what}, fits the first {time[-1] - time[0]:.0f} s as well: delays are those of "
+            "one of them; anchors out of one plane, heights or a known start tell which"
+        )
+    return ""
 
 
 def _guesses(scene: Scene, time: Floats, headless: list[str]) -> Iterator[tuple[Followed, Floats, dict[str, float]]]:

@@ -139,7 +139,7 @@ class _Search:
         """Choose how smooth curve and trajectories are by what the data say."""
         _, local, border = self.rows.linear(self.state)
         of_ranges = normal_of(local, border, informed)
-        whole = Factored(of_ranges + self.known.normal)
+        whole = Factored(of_ranges + self.known.linear(self.state).normal)
         if self.penalties:
             near = QuadraticModel(whole.schur, np.zeros(len(whole.schur)), 1.0)
             self.ridge = reml_penalty(near, self.state.border, self.penalties)[0]
@@ -149,16 +149,17 @@ class _Search:
         self.known = known_rows(self.scene, self.columns, self.origin, self.jerk)
 
     def _felt(self) -> Scene:
-        """Return the scene with what accelerometers are off by, as their residuals have it."""
-        off = self.known.residuals(self.state)[self.known.forces]
+        """Return the scene with what accelerometers and height sensors are off by, as their residuals have it."""
+        heights = self.scene.heights.weighed(self.known.of("height", self.state))
+        off = self.known.of("force", self.state)
         if not len(off):
-            return self.scene
+            return replace(self.scene, heights=heights)
         factor = FELT * robust_spread(off, 0.0)
         sensed = {
             body: replace(some, std_m_s2=float(np.clip(some.std_m_s2 * factor, *FORCES_M_S2)))
             for body, some in self.scene.inertial.items()
         }
-        return replace(self.scene, inertial=sensed)
+        return replace(self.scene, inertial=sensed, heights=heights)
 
     def _used(self, whole: Factored, local: csr_array[Any], informed: Floats) -> float:
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(informed), PROBES))

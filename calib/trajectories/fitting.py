@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Final
@@ -28,9 +28,11 @@ from calib.trajectories.climbing import Climbed, climb
 from calib.trajectories.given import Usable, scene_from
 from calib.trajectories.judging import Judged, judged
 from calib.trajectories.scene import Scene
+from uwblink.recording.schema import KnownDistance
 
 ATTITUDES: Final = ("poses", "imu", "none")
 ANCHORS: Final = ("given", "sought")
+HEIGHTS: Final = ("used", "ignored")
 SIGMAS: Final = 3.0
 FOLLOWING: Final = 0.3
 """Share of the work that is done when trajectories have been followed, for a bar of progress."""
@@ -43,6 +45,8 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     attitudes: str = "poses",
     heading_std_deg: float = 3.0,
     anchors: str = "given",
+    distances: Iterable[KnownDistance] = (),
+    heights: str = "used",
     fixed_ns: Mapping[int, float] | None = None,
     groups: Mapping[str, tuple[int, ...]] | None = None,
     lift: str = "mean-of-lifted",
@@ -59,6 +63,10 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     delays and curve. `attitudes` come from the "poses", all along; from the "imu", from the poses' attitude at first;
     or there are "none". Headings may be wrong by `heading_std_deg`, and wander; 0 takes attitudes as they are.
     Bodies whose poses stay in one place are anchors: their places are "given", or "sought" with all else.
+
+    `distances` were measured otherwise, beside those that the recording states: between anchors, or between moving
+    bodies while they stood still, in an arrangement of the recording or a span of seconds since the first range
+    ("2..8"). `heights` of the recording's sensors are "used" or "ignored".
 
     The result is what `fit` returns; the truth of its `ranges` is the distances that were found. What the ranges do not
     determine is named: `UnanswerableError` is raised where no delay is determined, unless `minimum_norm` asks for those
@@ -84,7 +92,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
         reference_power_dbm=reference_power_dbm,
     )
     asked = _Asked(
-        usable=_checked(poses_until_s, attitudes, heading_std_deg, anchors),
+        usable=_checked(poses_until_s, attitudes, heading_std_deg, anchors, tuple(distances), heights),
         lift=lift,
         alpha_dbm=alpha_dbm,
         fixed=fixed,
@@ -98,23 +106,38 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
         problem, scene = _problem(scene, asked)
-        scene, start = beginning(scene, lambda share: done(FOLLOWING * share))
-        climbed = climb(scene, problem, start, lambda share: done(FOLLOWING + (1 - FOLLOWING) * share))
+        begun = beginning(scene, lambda share: done(FOLLOWING * share))
+        climbed = climb(begun.scene, problem, begun.state, lambda share: done(FOLLOWING + (1 - FOLLOWING) * share))
         found = judged(climbed, problem, asked.reference)
-        result = _result(climbed, problem, found, asked)
+        result = _result(climbed, problem, found, asked, begun.rival)
     done(1.0)
     if not minimum_norm:
         _refuse_undetermined(found, problem, scene)
     return result
 
 
-def _checked(poses_until_s: float | None, attitudes: str, heading_std_deg: float, anchors: str) -> Usable:
+def _checked(
+    poses_until_s: float | None,
+    attitudes: str,
+    heading_std_deg: float,
+    anchors: str,
+    distances: tuple[KnownDistance, ...],
+    heights: str,
+) -> Usable:
     check_choice("attitudes", attitudes, ATTITUDES)
     check_choice("anchors", anchors, ANCHORS)
+    check_choice("heights", heights, HEIGHTS)
     for name, value in (("poses_until_s", poses_until_s), ("heading_std_deg", heading_std_deg)):
         if value is not None and not (np.isfinite(value) and value >= 0):
             raise BadInputError(f"found {value!r}, expected a number of 0 or more", parameter=name)
-    return Usable(poses_until_s=poses_until_s, attitudes=attitudes, heading_std_deg=heading_std_deg, anchors=anchors)
+    return Usable(
+        poses_until_s=poses_until_s,
+        attitudes=attitudes,
+        heading_std_deg=heading_std_deg,
+        anchors=anchors,
+        distances=distances,
+        heights=heights,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +176,7 @@ def _problem(scene: Scene, asked: _Asked) -> tuple[Problem, Scene]:
     return replace(problem, ranges=bare, error=problem.error + rows), scene.only(rows.astype(np.int64))
 
 
-def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked) -> FitResult:
+def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked, rival: str) -> FitResult:
     ranges = replace(problem.ranges, truth_m=climbed.rows.distances(climbed.state))
     problem = replace(problem, ranges=ranges, error=problem.error - ranges.truth_m)
     rank = problem.rank
@@ -166,7 +189,12 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked) ->
     applied = replace(calibration, errors=None).apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
     inliers = np.abs(residuals) < SIGMAS * applied.sigma_m
-    warnings = [*found.open_ends(), *implausible(calibration.delays_ns, residuals)]
+    warnings = [
+        *found.open_ends(),
+        *([rival] if rival else []),
+        *climbed.scene.tapes.left_out,
+        *implausible(calibration.delays_ns, residuals),
+    ]
     if not climbed.settled:
         warnings.insert(0, f"the fit stopped after {climbed.steps} steps before it settled: delays are not final")
     provenance = _provenance(climbed, problem, found, asked) | {
@@ -217,6 +245,8 @@ def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked
             "anchors_sought": scene.sought,
             "attitudes": asked.usable.attitudes if scene.attitudes else "none",
             "heading_std_deg": asked.usable.heading_std_deg,
+            "distances": len(scene.tapes.told),
+            "heights": sorted({scene.moving[body] for body in scene.heights.body.tolist()}),
         },
         "distance_std_m": float(np.sqrt(np.mean(found.distance_std_m**2))),
         "absorbed": found.absorbed,

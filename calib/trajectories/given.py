@@ -12,10 +12,12 @@ from calib.errors import UnanswerableError
 from calib.ranges import Ranges
 from calib.sources import Data, Source, opened
 from calib.trajectories.attitudes import Attitude, matrices
+from calib.trajectories.heights import heights_of, no_heights
 from calib.trajectories.inertial import Readings, integrated, windows
 from calib.trajectories.scene import Places, Scene
+from calib.trajectories.tapes import tapes_of
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.schema import Arrangement, KnownDistance, Poses, Tag
 from uwblink.recording.target_reports import single_reports
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, intervals
@@ -41,6 +43,25 @@ class Usable:
     attitudes: str = "poses"
     heading_std_deg: float = 3.0
     anchors: str = "given"
+    distances: tuple[KnownDistance, ...] = ()
+    heights: str = "used"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Beside:
+    """What a recording has beside ranges and poses."""
+
+    imu: Mapping[str, Any]
+    height: Mapping[str, Any]
+    distances: tuple[KnownDistance, ...]
+    arrangements: tuple[Arrangement, ...]
+
+    @classmethod
+    def of(cls, source: Source) -> _Beside:
+        """Return it; a source need not have any."""
+        imu, height = (dict(getattr(source, name, None) or {}) for name in ("imu", "height"))
+        stated, marked = (tuple(getattr(source, name, ())) for name in ("known_distances", "arrangements"))
+        return cls(imu=imu, height=height, distances=stated, arrangements=marked)
 
 
 def scene_from(data: Data, usable: Usable, *, need_power: bool = True) -> Scene:
@@ -49,7 +70,7 @@ def scene_from(data: Data, usable: Usable, *, need_power: bool = True) -> Scene:
         exchanges = single_reports(source.exchanges).exchanges
         poses, tags = source.poses, list(source.tags)
         planted = _planted(source)
-        imu = dict(getattr(source, "imu", None) or {})
+        beside = _Beside.of(source)
     if not tags:
         raise UnanswerableError(f"{name}: does not say which tag sits on which body; 'uwblink poses --tags' adds that")
     # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
@@ -65,7 +86,7 @@ def scene_from(data: Data, usable: Usable, *, need_power: bool = True) -> Scene:
         raise UnanswerableError(f"{name}: no ranges between tags whose bodies are known")
     order = np.argsort(ranges.time_ns, kind="stable")
     rows, ranges = rows[order], ranges[order]
-    return _scene(ranges, exchanges[rows], poses, tags, imu, usable)
+    return _scene(ranges, exchanges[rows], poses, tags, beside, usable)
 
 
 def _planted(source: Source) -> Mapping[str, Any] | None:
@@ -74,7 +95,7 @@ def _planted(source: Source) -> Mapping[str, Any] | None:
 
 
 def _scene(
-    ranges: Ranges, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], imu: Mapping[str, Any], usable: Usable
+    ranges: Ranges, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], beside: _Beside, usable: Usable
 ) -> Scene:
     began = int(ranges.time_ns[0])
     # A range belongs to the middle of its first two messages.
@@ -90,7 +111,7 @@ def _scene(
         raise UnanswerableError(f"{ranges.source}: no body moves; boards that stand still are what a survey is for")
     last = float(time[-1])
     until = last if usable.poses_until_s is None else min(usable.poses_until_s, last)
-    sensed = {body: Readings.of(imu, body, began) for body in moving}
+    sensed = {body: Readings.of(beside.imu, body, began) for body in moving}
     attitudes = {body: _attitude(body, tracks[body], sensed[body], usable, until, ranges.source) for body in moving}
     turned = {body: attitude for body, attitude in attitudes.items() if attitude is not None}
     return Scene(
@@ -104,7 +125,15 @@ def _scene(
         attitudes=turned,
         inertial={body: windows(some, turned[body], last) for body, some in sensed.items() if some and body in turned},
         places=_places([tracks[body] for body in moving], until),
-        distances_m=np.asarray(exchanges.truth_m, dtype=np.float64),
+        heights=heights_of(beside.height, moving, began, last) if usable.heights == "used" else no_heights(),
+        tapes=tapes_of(
+            (*beside.distances, *usable.distances),
+            beside.arrangements,
+            {tag: body for tag, (body, _) in arms.items()},
+            still,
+            began,
+            last,
+        ),
     )
 
 

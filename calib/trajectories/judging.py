@@ -85,7 +85,8 @@ class Judged:
 def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judged:
     """Return intervals and verdict of a solution whose delays are stated at the lifted power `reference`."""
     _, local, border = climbed.rows.linear(climbed.state)
-    whole = Factored(normal_of(local, border, climbed.informed) + climbed.known.normal)
+    known = climbed.known.linear(climbed.state)
+    whole = Factored(normal_of(local, border, climbed.informed) + known.normal)
     columns, size = climbed.columns.design, climbed.columns.border
     schur = whole.schur + climbed.ridge
     # What is left of a range's derivatives when trajectories, standing bodies and biases have taken what they can.
@@ -94,7 +95,7 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
     if size > columns:
         taken[columns:] = -np.linalg.lstsq(schur[columns:, columns:], schur[columns:, :columns], rcond=1e-13)[0]
     design = (border - local @ whole.reach) @ taken
-    held = (climbed.known.border - climbed.known.local @ whole.reach) @ taken
+    held = (known.border - known.local @ whole.reach) @ taken
     slope, _ = climbed.loss.slopes(climbed.rows.residuals(climbed.state))
     prior = climbed.ridge[:columns, :columns] + held.T @ held
     scores, inverse, precision = _slopes(climbed, problem, design, -slope, prior)

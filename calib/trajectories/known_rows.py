@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.trajectories.arrow import Normal, normal_of
 from calib.trajectories.inertial import GRAVITY_M_S2
+from calib.trajectories.range_rows import RangeRows, tape_rows
 from calib.trajectories.scene import Scene
 from calib.trajectories.splines import cubic, cubic_speed, straight
 from calib.trajectories.unknowns import Columns, State
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -33,6 +35,9 @@ FAR_M: Final = 30.0
 BIAS_M_S2: Final = 0.4
 """What an accelerometer's bias may be."""
 
+LEVEL_M: Final = 0.15
+"""What a height sensor may be off by all along."""
+
 STANDS_M: Final = 100.0
 
 
@@ -46,24 +51,60 @@ class Block:
     border_value: Floats
     aim: Floats
     std: Floats
-    force: bool = False
+    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True)
+class Linear:
+    """Residuals (k,) over their standard errors, their derivatives (k, L) and (k, b), and their normal equations."""
+
+    residual: Floats
+    local: csr_array[Any]
+    border: Floats
+    normal: Normal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class KnownRows:
     """Rows `local @ x + border @ y - aim`, each over its standard error, and their normal equations.
 
-    `forces` (k,) says which are of an accelerometer.
+    `kinds` (k,) says which are of an accelerometer ("force") and of a height sensor ("height"). Distances that were
+    measured otherwise, `tapes` with standard errors `tape_std`, follow them, and are not linear.
     """
 
     local: csr_array[Any]
     border: Floats
     aim: Floats
     normal: Normal
-    forces: Bools
+    kinds: NDArray[np.str_]
+    tapes: RangeRows
+    tape_std: Floats
 
     def residuals(self, state: State) -> Floats:
         """Return the residuals (k,) over their standard errors."""
+        return np.concatenate([self._plain(state), self.tapes.residuals(state) / self.tape_std])
+
+    def of(self, kind: str, state: State) -> Floats:
+        """Return the residuals of one kind over their standard errors."""
+        return np.asarray(self._plain(state)[self.kinds == kind])
+
+    def linear(self, state: State) -> Linear:
+        """Return the rows as they are near a state."""
+        from scipy.sparse import vstack
+
+        plain = self._plain(state)
+        if not len(self.tape_std):
+            return Linear(plain, self.local, self.border, self.normal)
+        residual, local, border = self.tapes.linear(state)
+        weight = 1 / self.tape_std
+        return Linear(
+            np.concatenate([plain, residual * weight]),
+            vstack([self.local, local.multiply(weight[:, None])], format="csr"),
+            np.concatenate([self.border, border * weight[:, None]]),
+            self.normal + normal_of(local, border, weight**2),
+        )
+
+    def _plain(self, state: State) -> Floats:
         return np.asarray(self.local @ state.local + self.border @ state.border - self.aim)
 
 
@@ -87,8 +128,15 @@ def known_rows(scene: Scene, columns: Columns, start: State, jerk_m_s3: float = 
     row, column, value = (np.concatenate([part[k] for part in parts]) for k in range(3))
     local = csr_array((value, (row, column)), shape=(begin, columns.size))
     dense = np.concatenate(border)
-    forces = np.concatenate([np.full(len(block.aim), block.force) for block in blocks])
-    return KnownRows(local, dense, np.concatenate(aims), normal_of(local, dense, np.ones(begin)), forces)
+    return KnownRows(
+        local=local,
+        border=dense,
+        aim=np.concatenate(aims),
+        normal=normal_of(local, dense, np.ones(begin)),
+        kinds=np.concatenate([np.full(len(block.aim), block.kind, dtype="U6") for block in blocks]),
+        tapes=tape_rows(scene, columns),
+        tape_std=scene.tapes.std_m,
+    )
 
 
 def _blocks(scene: Scene, columns: Columns, start: State, jerk_m_s3: float) -> Iterator[Block]:
@@ -98,6 +146,7 @@ def _blocks(scene: Scene, columns: Columns, start: State, jerk_m_s3: float) -> I
             yield smoothness(columns, body, axis, jerk_m_s3)
         yield from _attitude(scene, columns, body)
         yield from _forces(scene, columns, body)
+        yield from _height(scene, columns, body)
     for where in columns.stand:
         yield _of_border(where, start.border[where], STANDS_M)
 
@@ -118,7 +167,6 @@ def _of_axis(scene: Scene, columns: Columns, start: State, body: int, axis: int)
 
 
 def smoothness(columns: Columns, body: int, axis: int, jerk_m_s3: float) -> Block:
-    """Return what holds the jerk of a body along an axis: third differences of its control points."""
     """Return what holds the jerk of a body along an axis: third differences of its control points."""
     column = columns.place[:, body, axis]
     four = np.column_stack([column[k : len(column) - 3 + k] for k in range(4)])
@@ -165,9 +213,27 @@ def _forces(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
             border_value=sensed.turn[:, axis, :],
             aim=aim,
             std=np.full(len(aim), sensed.std_m_s2),
-            force=True,
+            kind="force",
         )
     yield _of_border(columns.bias[body], np.zeros(3), BIAS_M_S2)
+
+
+def _height(scene: Scene, columns: Columns, body: int) -> Iterator[Block]:
+    mine = scene.heights[scene.heights.body == body]
+    if not len(mine.time_s):
+        return
+    weights = cubic(columns.places, mine.time_s)
+    where = np.full((len(mine.time_s), 1), columns.level[body])
+    yield Block(
+        column=columns.place[weights.point, body, 2],
+        value=weights.share,
+        border=where,
+        border_value=np.ones(where.shape),
+        aim=mine.height_m,
+        std=mine.std_m,
+        kind="height",
+    )
+    yield _of_border(columns.level[[body]], np.zeros(1), LEVEL_M)
 
 
 def _crossed(axis: int, vector: Floats) -> list[tuple[int, Floats]]:

@@ -90,10 +90,23 @@ class RangeRows:
 
 def range_rows(scene: Scene, columns: Columns, error: Floats, design: Floats) -> RangeRows:
     """Return the ranges of a scene as rows over its columns."""
-    weights = cubic(columns.places, scene.time_s), straight(columns.turns, scene.time_s)
-    both = (scene.ranges.initiator, scene.ranges.target)
-    first, second = (_side(ends_of(scene, ids), columns, *weights) for ids in both)
-    return RangeRows((first, second), columns, error, design)
+    ends = scene.ranges.initiator, scene.ranges.target
+    return RangeRows(_sides(scene, columns, ends, scene.time_s), columns, error, design)
+
+
+def tape_rows(scene: Scene, columns: Columns) -> RangeRows:
+    """Return the distances that were measured otherwise as rows over the columns of a scene."""
+    tapes = scene.tapes
+    # What holds always is between bodies that stand: any instant will do.
+    time = np.where(np.isnan(tapes.time_s), scene.time_s[0], tapes.time_s)
+    sides = _sides(scene, columns, (tapes.first, tapes.second), time)
+    return RangeRows(sides, columns, tapes.distance_m, np.zeros((len(tapes), columns.design)))
+
+
+def _sides(scene: Scene, columns: Columns, ends: tuple[Ints, Ints], time_s: Floats) -> tuple[Side, Side]:
+    weights = cubic(columns.places, time_s), straight(columns.turns, time_s)
+    first, second = (_side(ends_of(scene, ids, time_s), columns, *weights) for ids in ends)
+    return first, second
 
 
 def _side(ends: Ends, columns: Columns, place: Weights, turn: Weights) -> Side:

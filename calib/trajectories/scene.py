@@ -10,7 +10,9 @@ import numpy as np
 
 from calib.ranges import Ranges
 from calib.trajectories.attitudes import Attitude
+from calib.trajectories.heights import Heights, no_heights
 from calib.trajectories.inertial import Inertial
+from calib.trajectories.tapes import Tapes, no_tapes
 from uwblink.arrays import Bools, Floats, Ints
 
 NOWHERE: Final = -1
@@ -41,7 +43,7 @@ class Scene:
 
     `moving` names the bodies that move; `still` has those that do not, with their place or None where it is to be
     found. `arms` says of each tag its body and lever arm. `attitudes` are those of moving bodies; a body without any
-    has its tags in its middle. `distances_m` (n,) are measured distances of single ranges, NaN where there is none.
+    has its tags in its middle. `tapes` are distances that were measured otherwise, `heights` readings of sensors.
     """
 
     source: str
@@ -53,8 +55,9 @@ class Scene:
     arms: Mapping[int, tuple[str, Floats]]
     attitudes: Mapping[str, Attitude]
     places: Places
-    distances_m: Floats
     inertial: Mapping[str, Inertial] = field(default_factory=dict)
+    heights: Heights = field(default_factory=no_heights)
+    tapes: Tapes = field(default_factory=no_tapes)
 
     @property
     def sought(self) -> list[str]:
@@ -66,11 +69,21 @@ class Scene:
         known = (self.places.time_s >= begin_s) & (self.places.time_s <= end_s)
         rows = np.flatnonzero((self.time_s >= begin_s) & (self.time_s <= end_s))
         inertial = {body: sensed.within(begin_s, end_s) for body, sensed in self.inertial.items()}
-        return replace(self.only(rows), places=self.places[known], inertial=inertial)
+        return replace(
+            self.only(rows),
+            places=self.places[known],
+            inertial=inertial,
+            heights=self.heights.within(begin_s, end_s),
+            tapes=self.tapes.within(begin_s, end_s),
+        )
+
+    def at(self, places: Places) -> Scene:
+        """Return the scene with these places, and nothing else that is known beside its attitudes."""
+        return replace(self, places=places, inertial={}, heights=no_heights(), tapes=no_tapes())
 
     def only(self, rows: Ints) -> Scene:
         """Return the scene with some of its ranges."""
-        columns = {name: getattr(self, name)[rows] for name in ("ranges", "time_s", "distances_m")}
+        columns = {name: getattr(self, name)[rows] for name in ("ranges", "time_s")}
         return replace(self, **columns)
 
 
@@ -89,8 +102,8 @@ class Ends:
     arm_m: Floats
 
 
-def ends_of(scene: Scene, ids: Ints) -> Ends:
-    """Return the ends of ranges at tags `ids` (n,)."""
+def ends_of(scene: Scene, ids: Ints, time_s: Floats) -> Ends:
+    """Return the ends at tags `ids` (n,) at instants (n,)."""
     count = len(ids)
     mover, stander = np.full(count, NOWHERE), np.full(count, NOWHERE)
     base, arm = np.zeros((count, 3)), np.zeros((count, 3))
@@ -107,5 +120,5 @@ def ends_of(scene: Scene, ids: Ints) -> Ends:
         else:
             mover[rows] = scene.moving.index(body)
             if body in scene.attitudes:
-                arm[rows] = scene.attitudes[body].at(scene.time_s[rows]) @ lever
+                arm[rows] = scene.attitudes[body].at(time_s[rows]) @ lever
     return Ends(mover, stander, base, arm)

@@ -56,10 +56,10 @@ def minimise(
     while steps < most_steps and gained > settled and damping < MOST_DAMPING:
         residual, local, border = ranges.linear(state)
         slope, curvature = loss.slopes(residual)
-        normal = normal_of(local, border, curvature) + known.normal + _of_border(penalty, known)
-        rest = known.residuals(state)
-        pull_local = -(local.T @ slope + known.local.T @ rest)
-        pull_border = -(border.T @ slope + known.border.T @ rest + penalty @ state.border)
+        held = known.linear(state)
+        normal = normal_of(local, border, curvature) + held.normal + _of_border(penalty, known)
+        pull_local = -(local.T @ slope + held.local.T @ held.residual)
+        pull_border = -(border.T @ slope + held.border.T @ held.residual + penalty @ state.border)
         gained = 0.0
         while damping < MOST_DAMPING and steps < most_steps:
             trial = state.moved(*Factored(normal, damping).solve(pull_local, pull_border))

@@ -63,8 +63,7 @@ def through(scene: Scene, columns: Columns, followed: Followed, stand: Floats) -
             line = np.interp(columns.places.times_s, followed.time_s, followed.position_m[:, body, axis])
             start.local[columns.place[:, body, axis]] = line
     start.border[columns.stand] = stand
-    bare = replace(scene, places=places, inertial={})
-    known = known_rows(bare, columns, start)
+    known = known_rows(scene.at(places), columns, start)
     normal = replace(known.normal, border=known.normal.border + np.eye(columns.border))
     step = Factored(normal).solve(-(known.local.T @ known.residuals(start)), np.zeros(columns.border))
     return start.moved(step[0], np.zeros(columns.border))

@@ -23,7 +23,7 @@ class Columns:
     """Columns of places (points, moving, 3) and of errors of attitudes (points, moving, 3), -1 where none is sought.
 
     The border has `design` columns of delays and curves, then three for each standing body that is sought, then three
-    of an accelerometer's bias for each body that has one.
+    of an accelerometer's bias for each body that has one, then one of what a height sensor is off by for each that has.
     """
 
     places: Grid
@@ -34,6 +34,7 @@ class Columns:
     design: int
     stand: Ints
     bias: Ints
+    level: Ints
     border: int
 
 
@@ -61,6 +62,9 @@ def columns_of(scene: Scene, design: int, point_s: float = POINT_S) -> Columns:
     sensed = [body in scene.inertial for body in scene.moving]
     bias = np.full((moving, 3), -1)
     bias[sensed] = design + stand.size + np.arange(3 * sum(sensed)).reshape(-1, 3)
+    levelled = np.isin(np.arange(moving), scene.heights.body)
+    level = np.full(moving, -1)
+    level[levelled] = design + stand.size + 3 * sum(sensed) + np.arange(np.count_nonzero(levelled))
     return Columns(
         places=places,
         turns=turns,
@@ -70,7 +74,8 @@ def columns_of(scene: Scene, design: int, point_s: float = POINT_S) -> Columns:
         design=design,
         stand=stand,
         bias=bias,
-        border=design + stand.size + 3 * sum(sensed),
+        level=level,
+        border=design + stand.size + 3 * sum(sensed) + int(np.count_nonzero(levelled)),
     )
 
 

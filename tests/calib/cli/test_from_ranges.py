@@ -4,8 +4,10 @@ import json
 
 import pytest
 
+from calib.cli.from_ranges import taped
 from tests import processes
 from tests.calib.trajectories.sines import flight
+from uwblink import KnownDistance
 from uwblink.recording.file import Recording
 
 
@@ -35,6 +37,18 @@ def test_a_known_start_is_enough(recording, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("11-12=3.06", KnownDistance(11, 12, 3.06, 0.01)),
+        (" 1 - 3 = 1.5 +- .005 @ desk", KnownDistance(1, 3, 1.5, 0.005, "desk")),
+        ("1-3=2±0.02@2..8", KnownDistance(1, 3, 2.0, 0.02, "2..8")),
+    ],
+)
+def test_a_distance_is_read_as_one_types_it(text, found):
+    assert taped(text) == found
+
+
+@pytest.mark.parametrize(
     ("words", "said"),
     [
         (("--truth", "tape"), "--truth: found 'tape', allowed: recorded, ranges"),
@@ -42,6 +56,9 @@ def test_a_known_start_is_enough(recording, tmp_path):
         (("--truth", "ranges", "--loss", "huber"), "--loss: goes with known distances only"),
         (("--truth", "ranges", "--trim-static"), "--trim-static: goes with known distances only"),
         (("--truth", "ranges", "--anchors", "lost"), "--anchors: found 'lost', allowed: given, sought"),
+        (("--truth", "ranges", "--distance", "1:3=2"), "--distance: found '1:3=2', expected TAG-TAG=METRES"),
+        (("--truth", "ranges", "--distance", "1-9=2"), "--distance: found tag 9, the tags that range are 1, 2, 3"),
+        (("--truth", "ranges", "--heights", "guess"), "--heights: found 'guess', allowed: used, ignored"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(recording, tmp_path, words, said):

@@ -25,6 +25,12 @@ def place(body, t):
     return middle + 0.6 * size * wave
 
 
+def since_takeoff(t, standing_s):
+    """Seconds of flight (n,) at seconds (n,) of which bodies stand still for the first; they start gently."""
+    flown = np.maximum(t - standing_s, 0.0)
+    return flown - 0.8 * (1 - np.exp(-flown / 0.8)) if standing_s else t
+
+
 def heading(body, t):
     """Radians (n,)."""
     return body + 1.2 * np.sin(2 * np.pi * t / (13.0 + 2 * body))
@@ -36,8 +42,8 @@ def turn(angle, vector):
     return np.column_stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], np.full_like(c, vector[2])])
 
 
-def arm(tag):
-    return np.array([ARM, -ARM, -0.05]) * (1 if tag % 2 else -1)
+def arm(tag, length_m=ARM):
+    return np.array([1.0, -1.0, -0.2]) * length_m * (1 if tag % 2 else -1)
 
 
 @dataclass
@@ -48,6 +54,8 @@ class Flight:
     distance_m: np.ndarray
     planted: dict[str, Any] = field(default_factory=lambda: {"delays_ns": {str(t): d for t, d in DELAYS_NS.items()}})
     imu: dict[str, Any] = field(default_factory=dict)
+    height: dict[str, Any] = field(default_factory=dict)
+    antennas: Any = None
 
 
 def bias(lifted):
@@ -65,10 +73,15 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     curve=bias,
     tilt_deg=0.0,
     place_noise_m=0.0,
+    standing_s=0.0,
+    height_off_m=None,
+    arm_m=ARM,
 ):
     """A flight whose poses have noise in places, and headings and tilts that are off by sines of so many degrees.
 
-    `anchors` (k, 3) stand as tags 11 and on, with delays of their own, and range with each tag in turn.
+    `anchors` (k, 3) stand as tags 11 and on, with delays of their own, and range with each tag in turn. With
+    `height_off_m` bodies read their heights, wrong by that and by 3 cm of noise; for `standing_s` all stand.
+    `antennas(tags, seconds)` of the flight says where antennas are.
     """
     rng = np.random.default_rng(seed)
     n = int(seconds * rate)
@@ -85,20 +98,20 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     for k, tag in enumerate(stand):
         delay[tag] = 0.1 * (-1) ** k
 
-    def antenna(ids):
-        found = np.zeros((n, 3))
+    def antenna(ids, seconds):
+        found = np.zeros((len(ids), 3))
         for tag in np.unique(ids):
             rows = ids == tag
-            body = (tag - 1) // 2
+            body, when = (tag - 1) // 2, since_takeoff(seconds[rows], standing_s)
             here = (
                 np.broadcast_to(stand[tag], (rows.sum(), 3))
                 if tag in stand
-                else (place(body, t[rows]) + turn(heading(body, t[rows]), arm(tag)))
+                else (place(body, when) + turn(heading(body, when), arm(tag, arm_m)))
             )
             found[rows] = here
         return found
 
-    distance = np.linalg.norm(antenna(pair[:, 0]) - antenna(pair[:, 1]), axis=1)
+    distance = np.linalg.norm(antenna(pair[:, 0], t) - antenna(pair[:, 1], t), axis=1)
     fpp = -79 - 20 * np.log10(distance / 2) + rng.normal(0, 3, (2, n))
     lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
     error = curve(lifted) - curve(1.0) + noise_m * rng.normal(size=n)
@@ -117,20 +130,21 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
         fpp2_dbm=fpp[1],
     )
     half = REPLY * TICK_S / 2
-    tags = [Tag(tag, f"robot{(tag - 1) // 2}", tuple(arm(tag))) for tag in DELAYS_NS]
+    tags = [Tag(tag, f"robot{(tag - 1) // 2}", tuple(arm(tag, arm_m))) for tag in DELAYS_NS]
     tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in stand]
     # Poses say where bodies are; ranges belong to the middle of their first two messages, which `half` is.
     when = np.arange(0.0, seconds + 1.0, 0.02)
     poses_of: list[Any] = []
     for body in range(3):
         off = np.radians(wander_deg) * np.sin(2 * np.pi * when / 17.0 + body)
-        yaw = heading(body, when - half) + off
+        flown = since_takeoff(when - half, standing_s)
+        yaw = heading(body, flown) + off
         upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
         tilt = np.radians(tilt_deg) * np.sin(2 * np.pi * when / (11.0 + body) + body)
         # Tilted about the world's x axis: the quaternion of the tilt times that of the heading.
         s, c = np.sin(tilt / 2), np.cos(tilt / 2)
         upright = np.column_stack([s * upright[:, 3], -s * upright[:, 2], c * upright[:, 2], c * upright[:, 3]])
-        seen = place(body, when - half) + place_noise_m * rng.normal(size=(len(when), 3))
+        seen = place(body, flown) + place_noise_m * rng.normal(size=(len(when), 3))
         poses_of.append((np.full(len(when), f"robot{body}"), seen, upright, when))
     for tag, here in stand.items():
         two = np.array([0.0, seconds])
@@ -142,4 +156,16 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
         np.concatenate([r[2] for r in poses_of]),
     )
     planted = {str(tag): float(delay[tag]) for tag in [*DELAYS_NS, *stand]}
-    return Flight(exchanges, poses, tags, distance, {"delays_ns": planted})
+    height = {} if height_off_m is None else heights(rng, when, since_takeoff(when - half, standing_s), height_off_m)
+    return Flight(exchanges, poses, tags, distance, {"delays_ns": planted}, height=height, antennas=antenna)
+
+
+def heights(rng, when, flown, off_m):
+    """The columns of a recording's table of height readings, 50 a second of each body."""
+    read = [place(body, flown)[:, 2] + off_m + 0.03 * rng.normal(size=len(flown)) for body in range(3)]
+    names = np.repeat([f"robot{body}" for body in range(3)], len(when))
+    return {
+        "time_ns": np.tile(np.rint(when * 1e9).astype(np.int64), 3),
+        "body": names,
+        "height_m": np.concatenate(read),
+    }
