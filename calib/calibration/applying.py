@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
+from calib.calibration.content import CalibrationContent
 from calib.calibration.pair_offsets import offsets_m
 from calib.calibration.parts import CorrectedRanges
 from calib.calibration.power_curves import ends, lift
@@ -14,14 +15,11 @@ from calib.errors import BadInputError
 from calib.ranges import Ranges
 from uwblink.arrays import Floats
 
-if TYPE_CHECKING:
-    from calib.calibration.model import Calibration
-
 OUTLIER: Final = 0.5
 """Probability above which a range of known error is marked as an outlier."""
 
 
-def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRanges:
+def corrected_ranges(calibration: CalibrationContent, ranges: Ranges) -> CorrectedRanges:
     """Return what `Calibration.apply` returns, and raise what that raises."""
     delays = _without_delays(calibration, ranges)
     lifted = calibration.lifted(ranges)
@@ -37,7 +35,7 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
     )
 
 
-def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
+def _without_delays(calibration: CalibrationContent, ranges: Ranges) -> Floats:
     """Return ranges (n,) without the delays of both tags and without the constants of pairs, in metres."""
     missing = [t for t in ranges.tags() if t not in calibration.delays_ns]
     if missing:
@@ -52,7 +50,7 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
     return ranges.raw_m + calibration.speed_of_light * flight - offsets_m(calibration.pair_offsets, ranges)
 
 
-def _errors(calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: Floats) -> dict[str, Any]:
+def _errors(calibration: CalibrationContent, ranges: Ranges, lifted: Floats, error_m: Floats) -> dict[str, Any]:
     """Return what is known of the errors of ranges (n,), by the names of `CorrectedRanges`."""
     model = calibration.errors
     if model is None:
@@ -71,7 +69,7 @@ def _errors(calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: F
     }
 
 
-def _bias(calibration: Calibration, ranges: Ranges, lifted: Floats) -> Floats:
+def _bias(calibration: CalibrationContent, ranges: Ranges, lifted: Floats) -> Floats:
     """Return the bias of ranges (n,) in metres, at the power of the exchange or of each reception."""
     if calibration.power_at == "exchange":
         return _curve(calibration, ranges, lifted, "bias_curve")
@@ -83,7 +81,7 @@ def _bias(calibration: Calibration, ranges: Ranges, lifted: Floats) -> Floats:
 
 
 def _curve(
-    calibration: Calibration, ranges: Ranges, lifted: Floats, name: Literal["bias_curve", "sigma_curve"]
+    calibration: CalibrationContent, ranges: Ranges, lifted: Floats, name: Literal["bias_curve", "sigma_curve"]
 ) -> Floats:
     """Return a curve at lifted powers (n,): the mean of the curves of both tags' groups, where there are groups."""
     if not calibration.groups:

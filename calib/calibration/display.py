@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from calib.calibration.content import CalibrationContent
 from calib.calibration.pair_offsets import named
-
-if TYPE_CHECKING:
-    from calib.calibration.model import Calibration
-    from calib.calibration.parts import TagGroup
+from calib.calibration.parts import TagGroup
 
 TWO_SIDED_95: Final = 1.959963984540054
 MOST_TAGS: Final = 40
@@ -25,7 +23,7 @@ POINTS: Final = 6
 """Lifted powers at which the curves are shown."""
 
 
-def as_text(calibration: Calibration) -> str:
+def as_text(calibration: CalibrationContent) -> str:
     """Return the calibration as lines of text."""
     lines = [_headline(calibration)]
     apart = calibration.pair_offsets and not any(calibration.delays_ns.values())
@@ -40,7 +38,7 @@ def as_text(calibration: Calibration) -> str:
     return "\n".join(lines)
 
 
-def as_html(calibration: Calibration) -> str:
+def as_html(calibration: CalibrationContent) -> str:
     """Return the calibration as HTML tables, for notebooks."""
     delays = [HEAD, *delay_rows(calibration)]
     pairs = [PAIRS_HEAD, *pair_rows(calibration)] if calibration.pair_offsets else []
@@ -54,7 +52,7 @@ def as_html(calibration: Calibration) -> str:
     )
 
 
-def pair_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+def pair_rows(calibration: CalibrationContent) -> Iterator[tuple[str, str, str]]:
     """Yield each pair, the constant of its ranges in cm, and its interval in words."""
     rows = sorted(calibration.pair_offsets.items())
     for pair, one in rows[:MOST_TAGS]:
@@ -63,7 +61,7 @@ def pair_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         yield "...", "", f"{len(rows) - MOST_TAGS} more"
 
 
-def delay_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+def delay_rows(calibration: CalibrationContent) -> Iterator[tuple[str, str, str]]:
     """Yield tag, delay in ns, and its interval in words."""
     rows = sorted(calibration.delays_ns.items())
     for tag, delay in rows[:MOST_TAGS]:
@@ -79,10 +77,10 @@ def delay_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         yield "...", "", f"{len(rows) - MOST_TAGS} more"
 
 
-def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+def curve_rows(calibration: CalibrationContent) -> list[tuple[str, ...]]:
     """Return lifted powers, and the curves there: of each group of tags, or the one of all."""
     shown = np.linspace(*calibration.bias_curve.range, POINTS)
-    named: dict[str, Calibration | TagGroup] = dict(calibration.groups) or {"": calibration}
+    named: dict[str, CalibrationContent | TagGroup] = dict(calibration.groups) or {"": calibration}
     rows = [("lifted power", *(f"{power:.3g}" for power in shown))]
     for name, curves in named.items():
         of = f" {name}" if name else ""
@@ -91,7 +89,7 @@ def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
     return rows
 
 
-def _headline(calibration: Calibration) -> str:
+def _headline(calibration: CalibrationContent) -> str:
     fitted = calibration.provenance.get("exchanges")
     of = f" from {fitted} ranges" if fitted else ""
     return (

@@ -7,17 +7,15 @@ import math
 import re
 from collections.abc import Collection
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from calib.calibration.content import CalibrationContent
 from calib.calibration.error_model import read_errors
 from calib.calibration.json_format import Reader
 from calib.calibration.pair_offsets import offsets_from, table_of
 from calib.calibration.parts import TagGroup, Uncertainty
 from calib.calibration.power_curves import LIFTS, Curve
 from calib.errors import BadInputError
-
-if TYPE_CHECKING:
-    from calib.calibration.model import Calibration
 
 SCHEMA_VERSION: Final = 1
 GROUPED_VERSION: Final = 2
@@ -33,7 +31,7 @@ VERSIONS: Final = (SCHEMA_VERSION, GROUPED_VERSION, RECEPTION_VERSION, PAIRS_VER
 POWER_AT: Final = ("exchange", "reception")
 
 
-def text_of(calibration: Calibration) -> str:
+def text_of(calibration: CalibrationContent) -> str:
     """Return a calibration as JSON text."""
     document: dict[str, Any] = {
         "schema_version": _version(calibration),
@@ -54,7 +52,7 @@ def text_of(calibration: Calibration) -> str:
     return _rows_on_lines(json.dumps(document, indent=1, allow_nan=False)) + "\n"
 
 
-def _what_not_all_have(calibration: Calibration) -> dict[str, Any]:
+def _what_not_all_have(calibration: CalibrationContent) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if calibration.power_at != "exchange":
         found["power_at"] = calibration.power_at
@@ -69,7 +67,7 @@ def _what_not_all_have(calibration: Calibration) -> dict[str, Any]:
     return found
 
 
-def _version(calibration: Calibration) -> int:
+def _version(calibration: CalibrationContent) -> int:
     if calibration.pair_offsets:
         return PAIRS_VERSION
     if calibration.power_at != "exchange":

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.calibration.applying import corrected_ranges
+from calib.calibration.content import CalibrationContent
 from calib.calibration.display import as_html, as_text
 from calib.calibration.document import fields_of, text_of
-from calib.calibration.error_model import ErrorModel
-from calib.calibration.pair_offsets import PairOffset
-from calib.calibration.parts import CorrectedRanges, TagGroup, Uncertainty
-from calib.calibration.power_curves import Curve, basis, lifted_power
+from calib.calibration.parts import CorrectedRanges
+from calib.calibration.power_curves import basis
 from calib.calibration.runtime import CorrectedColumns, CorrectedRange, RangeCorrector
 from calib.errors import BadInputError, UnanswerableError
 from calib.ranges import HALVES, Ranges
@@ -29,7 +28,7 @@ SCALAR: Final = (float, int, np.generic)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Calibration:
+class Calibration(CalibrationContent):
     """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation.
 
     A standard error is infinite where the data did not determine the delay. `power_at` says where the bias curve is
@@ -41,21 +40,6 @@ class Calibration:
     and curves say, and a pair that has none cannot be corrected.
     """
 
-    delays_ns: dict[int, float]
-    delays_std_ns: dict[int, float]
-    loss: str
-    scale_ns: float
-    lift: str
-    alpha_dbm: float
-    speed_of_light: float
-    bias_curve: Curve
-    sigma_curve: Curve
-    provenance: dict[str, Any] = field(default_factory=dict)
-    uncertainty: Uncertainty | None = None
-    groups: dict[str, TagGroup] = field(default_factory=dict)
-    power_at: str = "exchange"
-    errors: ErrorModel | None = None
-    pair_offsets: dict[tuple[int, int], PairOffset] = field(default_factory=dict)
     _corrector: RangeCorrector | None = field(default=None, init=False, compare=False)
 
     def __repr__(self) -> str:
@@ -69,24 +53,6 @@ class Calibration:
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
         write_text(Path(path), self.to_json(), force=force)
-
-    @property
-    def stopped(self) -> bool:
-        """Whether the fit behind it stopped before it settled, so that delays and intervals are not final."""
-        return self.provenance.get("converged") is False
-
-    @property
-    def needs_power(self) -> bool:
-        """Whether ranges without any power cannot be corrected whole."""
-        curves = [self.bias_curve, self.sigma_curve]
-        curves += [curve for group in self.groups.values() for curve in (group.bias_curve, group.sigma_curve)]
-        return not all(curve.flat for curve in curves)
-
-    def lifted(self, ranges: Ranges) -> Floats:
-        """Return the lifted power of each range, as this calibration defines it."""
-        lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
-        # Where nothing depends on power, a range without any is as good as another.
-        return lifted if self.needs_power else np.where(np.isfinite(lifted), lifted, self.bias_curve.range[0])
 
     def apply(self, ranges: Ranges) -> CorrectedRanges:
         """Correct ranges: c (w_i d_i + w_j d_j) for the delays (ICRA 2023, section III), then the curve.

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from calib.calibration.content import CalibrationContent
 from calib.calibration.error_model import ErrorsAtOnce
 from calib.calibration.pair_offsets import offset_of
 from calib.calibration.power_curves import Curve
@@ -20,9 +21,6 @@ from calib.errors import BadInputError
 from calib.ranges import FAINTEST_DBM, LOUDEST_DBM
 from uwblink.arrays import Bools, Floats
 from uwblink.display import as_text, excerpt
-
-if TYPE_CHECKING:
-    from calib.calibration.model import Calibration
 
 NEPERS_A_DB: Final = math.log(10) / 10
 
@@ -101,7 +99,7 @@ def _unclamped(curve: Curve) -> Curve:
 class RangeCorrector:
     """Corrects single ranges by a calibration; make one, and call it as often as there are ranges."""
 
-    def __init__(self, calibration: Calibration) -> None:
+    def __init__(self, calibration: CalibrationContent) -> None:
         """Prepare the curves of every group of tags."""
         self._metres = {tag: d * 1e-9 * calibration.speed_of_light for tag, d in calibration.delays_ns.items()}
         self._offsets = calibration.pair_offsets

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -65,7 +66,6 @@ def evaluate(
         parts = load_each(recordings, need_power=known.needs_power)
         evaluation = calib.evaluate(parts, known)
         if report or figures:
-            from calib.cli.reporting import command_line
             from calib.report import origin_of
 
             origin = origin_of([*recordings, calibration], command_line())
@@ -81,6 +81,11 @@ def evaluate(
     print_table(evaluation, Console(width=None if sys.stdout.isatty() else WIDE))
     for path in filter(None, (report, figures)):
         typer.echo(f"report: {path}")
+
+
+def command_line() -> str:
+    """Return how the command was called, for the report to say."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def tell_seen(evaluation: Evaluation) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,17 +28,12 @@ from calib.cli.arguments import (
     Sequential,
     TrimStatic,
 )
-from calib.cli.evaluating import PANEL, tell_seen
+from calib.cli.evaluating import PANEL, command_line, tell_seen
 from calib.cli.flags import with_flags
 from calib.cli.loading import STOPPED
 from uwblink.cli.guide import add
 
 MANY: Final = "--tests"
-
-
-def command_line() -> str:
-    """Return how the command was called, for the report to say."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def add_to(app: typer.Typer) -> None:
