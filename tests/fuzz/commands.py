@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
 import io
 import multiprocessing
@@ -27,6 +28,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import typer
+
 import calib
 import calib.cli
 import uwblink
@@ -34,11 +37,13 @@ import uwblink.cli
 import uwbsim
 import uwbsim.cli
 from tests.fuzz.mutations import WORDS, damage_recording
-from tests.fuzz.seeds import KINDS, Kind, write_seeds
+from tests.fuzz.seeds import ALONE, KINDS, SELDOM, Kind, write_seeds
 
 MAINS: Final = {"uwblink": uwblink.cli.main, "uwbsim": uwbsim.cli.main, "calib": calib.cli.main}
 LONGEST_S: Final = 20.0
 LONGEST_WAIT_S: Final = 300.0
+CASES_A_PROCESS: Final = 1000
+TOLD_EVERY: Final = 1000
 MOST_BYTES: Final = 2_000_000_000
 USAGE: Final = ("Usage:", "─ Error ─")
 """What a mistake in options is answered with: how it would be right, in a few lines."""
@@ -55,48 +60,52 @@ class Outcome(NamedTuple):
     uncaught: str | None
 
 
+def kind_of(rng: random.Random) -> Kind:
+    """Return one of the kinds of files, by their shares."""
+    return rng.choices(KINDS, [kind.share for kind in KINDS])[0]
+
+
 def words_of(kind: Kind, damaged: Path, seeds: Path, out: Path, rng: random.Random) -> list[str]:
     """Return the words of one of a kind's commands."""
-    words = shlex.split(rng.choice(kind.commands))
-    for k, word in enumerate(words):
-        place = {"{}": str(damaged), "{out}": str(out)}
-        for name in place:
-            word = word.replace(name, place[name])
-        if "{" in word:
-            head, _, rest = word.partition("{")
-            word = head + str(seeds / rest.rstrip("}"))
-        words[k] = word
-    return words
+    seldom = kind.seldom and rng.randrange(SELDOM) == 0
+    place = {"{}": str(damaged), "{folder}": str(damaged.parent), "{out}": str(out)}
+    return [_filled(word, place, seeds) for word in shlex.split(rng.choice(kind.seldom if seldom else kind.commands))]
+
+
+def _filled(word: str, place: dict[str, str], seeds: Path) -> str:
+    for name in place:
+        word = word.replace(name, place[name])
+    head, brace, rest = word.partition("{")
+    return head + str(seeds / rest.rstrip("}")) if brace else word
 
 
 def damage_options(words: list[str], rng: random.Random) -> list[str]:
     """Change, drop or double one of a command's words after the first two."""
     changed = list(words)
-    place = rng.randrange(2, len(changed))
+    place = rng.randint(2, len(changed))
     hostile = rng.choice(WORDS).replace("\x00", "").encode("utf-8", "replace").decode()
-    changed[place : place + 1] = rng.choice(([], [hostile], [changed[place]] * 2, [changed[place], hostile]))
+    there = changed[place : place + 1]
+    changed[place : place + 1] = rng.choice(([], [hostile], there * 2, [*there, hostile]))
     return changed
 
 
 def prepare(number: int, seeds: Path, place: Path) -> list[str]:
     """Damage what case `number` damages, in `place`; returns the words of its command."""
     rng = random.Random(number)
-    kind = rng.choice(KINDS)
+    kind = kind_of(rng)
     damaged = place / kind.file
     shutil.copyfile(seeds / "scenario.toml", place / "scenario.toml")  # which a plan names
-    if rng.random() < OPTIONS_SHARE:
+    if damaged.parent != place:
+        shutil.copytree((seeds / kind.file).parent, damaged.parent)
+    if kind.commands is ALONE or rng.random() < OPTIONS_SHARE:
         shutil.copyfile(seeds / kind.file, damaged)
-        return damage_options(words_of(kind, damaged, seeds, _output(kind, place), rng), rng)
+        return damage_options(words_of(kind, damaged, seeds, place / "out", rng), rng)
     if kind.mutations:
         data = rng.choice(kind.mutations)((seeds / kind.file).read_bytes(), rng)
         damaged.write_bytes(b"" if data is None else data)
     else:
         damage_recording(seeds / kind.file, damaged, rng)
-    return words_of(kind, damaged, seeds, _output(kind, place), rng)
-
-
-def _output(kind: Kind, place: Path) -> Path:
-    return place / ("out.html" if kind.file == "scenario.toml" else "out")
+    return words_of(kind, damaged, seeds, place / "out", rng)
 
 
 def execute(words: list[str]) -> Outcome:
@@ -138,6 +147,7 @@ def judge(outcome: Outcome, written: list[Path]) -> str:
 def _work(connection: Connection, seeds: Path, folder: Path) -> None:
     """Take numbers of cases and return what is wrong with each."""
     resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
+    typer.main.get_command = functools.cache(typer.main.get_command)  # a third of the time of most cases
     while True:
         number = connection.recv()
         place = folder / str(number)
@@ -163,14 +173,17 @@ class Runner:
         self.statuses: Counter[int | None] = Counter()
         self._process: Any = None
         self._pipe: Any = None
+        self._tried = 0
 
     def run(self, number: int) -> str:
         """Try a case; returns what is wrong, or nothing."""
-        if self._process is None or not self._process.is_alive():
+        if self._process is None or not self._process.is_alive() or self._tried == CASES_A_PROCESS:
+            self.close()
             self._start()
+        self._tried += 1
         self._pipe.send(number)
         begun, busy = time.monotonic(), _busy_s(self._process.pid)
-        while not self._pipe.poll(0.2):
+        while not self._pipe.poll(0.5):
             if not self._process.is_alive():
                 return f"died with {self._process.exitcode}"
             worked = _busy_s(self._process.pid) - busy
@@ -189,6 +202,7 @@ class Runner:
             self._process = None
 
     def _start(self) -> None:
+        self._tried = 0
         self._pipe, theirs = self._context.Pipe()
         self._process = self._context.Process(target=_work, args=(theirs, self._seeds, self._folder), daemon=True)
         self._process.start()
@@ -229,12 +243,15 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         runner = Runner(seeds, folder)
         for number in range(options.first, options.first + options.cases):
-            if options.only and not random.Random(number).choice(KINDS).file.startswith(options.only):
+            if options.only and not kind_of(random.Random(number)).file.startswith(options.only):
                 continue
             wrong = runner.run(number)
             if wrong:
                 found[wrong.partition("   [")[0]] += 1
                 print(f"case {number}: {wrong}", flush=True)
+            if (number + 1 - options.first) % TOLD_EVERY == 0:
+                said = f"up to {number}: {sum(found.values())} wrong, {time.monotonic() - begun:.0f} s"
+                print(said, file=sys.stderr, flush=True)
         runner.close()
     print(
         f"{options.cases} cases, {sum(found.values())} wrong, {time.monotonic() - begun:.0f} s; ended with",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
+import io
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,99 +21,201 @@ from uwblink.exporters import export_recording
 ROOT: Final = Path(__file__).parents[2]
 
 SCENARIO: Final = "scenarios/noiseless.toml"
+NEW_TAG: Final = 6
 
 
 class Kind(NamedTuple):
-    """A kind of file: its name in the folder of seeds, what damages it, and commands with `{}` in its place.
+    """A kind of file: its place in the folder of seeds, share, what damages it, and commands with `{}` in its place.
 
-    `{out}` is an output that is not there, `{name}` any other seed.
+    `{folder}` is the folder that the file is in, `{out}` an output that is not there, `{name}` any other seed. What
+    takes longer, as pages with figures do, is drawn once in `SELDOM` times.
     """
 
     file: str
+    share: float
     mutations: Sequence[Mutation]
     commands: Sequence[str]
+    seldom: Sequence[str] = ()
 
+
+SELDOM: Final = 300
 
 RECORDING_COMMANDS: Final = (
     "uwblink show {}",
     "uwblink show {} --json",
     "uwblink export {} --to csv -o {out}",
+    "uwblink export {} --to parquet -o {out}",
     "uwblink export {} --to mcap -o {out}",
+    "uwblink export {} --to rosbag2 -o {out}",
     "uwblink export {} --to tum -o {out}",
-    "uwblink replay {} -o {out}",
+    "uwblink poses {} --from ifo001={poses.tum}",
+    "uwblink stream {} --speed inf -c {calibration.json}",
+    "uwblink stream {} --speed inf --quiet",
     "calib fit {} -o {out}",
-    "calib fit {} -o {out} --loss cauchy",
+    "calib fit {} -o {out} --loss cauchy --json",
+    "calib fit {} -o {out} --sequential",
+    "calib fit {} -o {out} --constants pair",
+    "calib fit {} -o {out} --delays-from {calibration.json}",
     "calib fit {} -o {out} --truth ranges --poses-until 1",
+    "calib add-tag {} -c {others.json} --tag 6 -o {out}",
     "calib survey {} --known plane -o {out}",
-    "calib compare {calibration.json} {calibration.json}",
     "calib evaluate {} -c {calibration.json}",
+    "calib evaluate {} -c {calibration.json} --json",
     "calib localize {} -c {calibration.json}",
+    "calib localize {} -c {calibration.json} --tum {out}",
     "calib apply {} -c {calibration.json} -o {out}",
+    "calib doctor {}",
+    "calib doctor {} {flight.uwb} --json",
+)
+
+BOARDS_COMMANDS: Final = (
+    "uwblink show {}",
+    "uwblink replay {} -o {out}",
+    "uwblink replay {} -o {out} --json",
+    "uwblink export {} --to csv -o {out}",
+    "uwblink stream {} --speed inf -c {calibration.json}",
+    "uwblink poses {} --from ifo001={poses.tum} --offset auto --tags {tags.toml}",
     "calib doctor {}",
 )
 
+RECORDING_PAGES: Final = (
+    "calib report {} -o {out}.html",
+    "calib evaluate {} -c {calibration.json} --report {out}.html",
+    "uwbsim twin {} -c {calibration.json} -o {out} --seeds 1",
+)
+
+ALONE: Final = (
+    "calib plan 4 --on plane --taped 2 --tape-sigma 0.01 --size 3,4",
+    "calib plan 1,2,3,4,5 --on space --anchors 1,2,3,4 --anchor-sigma 0.01 --pair-error 0.02 --rate 50 --json",
+    "calib plan 3 --on line --arrangements 3 --size 5",
+    "calib sample -o {out} -n 50 --seed 2",
+    "calib sample -o {out} -n 50 --anchors",
+    "uwbsim scenarios icra2023 -o {out}",
+    "uwbsim scenarios --json",
+    "uwbsim schema",
+    "uwbsim run {scenario.toml} -o {out} --set run.duration_s=0.5",
+    "uwbsim validate {scenario.toml} --set radio.rx_noise_ps=10",
+    "uwbsim predict {scenario.toml} --protocols ss,ds --set ranging.rate_hz=10",
+    "uwbsim optimum {scenario.toml} --protocols ds --overhead-us 10 --json",
+    "calib export {calibration.json} --to registers -o {out}",
+    "calib fit {flight.uwb} -o {out} --fix 1=-0.36 --reference-power -82 --scale 0.1",
+    "calib fit {flight.uwb} -o {out} --truth ranges --poses-until 1 --attitudes none --heading-std 3",
+)
+"""Commands of which options alone are damaged."""
+
 KINDS: Final = (
-    Kind("flight.uwb", (), RECORDING_COMMANDS),
-    Kind("flight.uwb", BINARY, RECORDING_COMMANDS),
+    Kind("flight.uwb", 12, (), RECORDING_COMMANDS, RECORDING_PAGES),
+    Kind("flight.uwb", 4, BINARY, RECORDING_COMMANDS, RECORDING_PAGES),
+    Kind("boards.uwb", 3, (), BOARDS_COMMANDS),
     Kind(
         "calibration.json",
+        22,
         JSON,
         (
             "calib evaluate {flight.uwb} -c {}",
             "calib apply {flight.uwb} -c {} -o {out}",
             "calib compare {} {calibration.json}",
+            "calib compare {calibration.json} {} --json",
             "calib show {}",
+            "calib show {} --json",
             "calib import miluv {} -o {out}",
             "calib localize {flight.uwb} -c {}",
+            "calib add-tag {flight.uwb} -c {} --tag 6 -o {out}",
+            "calib fit {flight.uwb} -o {out} --delays-from {}",
+            "uwblink stream {flight.uwb} --speed inf -c {}",
             *(
                 f"calib export {{}} --to {form} -o {{out}}"
                 for form in ("registers", "json", "csv", "miluv", "ros-yaml", "c-header")
             ),
         ),
+        ("calib evaluate {flight.uwb} -c {} --report {out}.html", "uwbsim twin {flight.uwb} -c {} -o {out} --seeds 1"),
     ),
     Kind(
         "scenario.toml",
+        20,
         TEXT,
-        ("uwbsim run {} -o {out}", "uwbsim validate {}", "uwbsim predict {}", "uwbsim show {} -o {out}"),
+        ("uwbsim run {} -o {out}", "uwbsim validate {}", "uwbsim predict {}", "uwbsim predict {} --json"),
+        ("uwbsim show {} -o {out}.html", "uwbsim compare {} -o {out} -n 200", "uwbsim optimum {} --protocols ds"),
     ),
-    Kind("table.csv", TEXT, ("uwblink import csv {} -o {out}", "uwblink import guess {} -o {out}")),
-    Kind("table.csv.gz", BINARY, ("uwblink import csv {} -o {out}",)),
-    Kind("map.toml", TEXT, ("uwblink import csv {table.csv} --map {} -o {out}",)),
-    Kind("poses.tum", TEXT, ("uwblink poses {live.uwb} --from ifo001={}",)),
+    Kind("table.csv", 10, TEXT, ("uwblink import csv {} -o {out}", "uwblink import guess {} -o {out}")),
+    Kind("table.csv.gz", 2, BINARY, ("uwblink import csv {} -o {out}",)),
+    Kind("table.jsonl", 4, (*TEXT, *JSON), ("uwblink import csv {} -o {out}", "uwblink import guess {} -o {out}")),
+    Kind("table.parquet", 2, BINARY, ("uwblink import csv {} -o {out}",)),
+    Kind("exported/exchanges.csv", 1, TEXT, ("uwblink import exported {folder} -o {out}",)),
+    Kind("exported/poses.csv", 1, TEXT, ("uwblink import exported {folder} -o {out}",)),
+    Kind("flight.mcap", 3, BINARY, ("uwblink import bag {} -o {out}", "uwblink poses {live.uwb} --from {}")),
+    Kind("map.toml", 4, TEXT, ("uwblink import csv {table.csv} --map {} -o {out}",)),
+    Kind("poses.tum", 3, TEXT, ("uwblink poses {live.uwb} --from ifo001={}",)),
+    Kind("poses.csv", 2, TEXT, ("uwblink poses {live.uwb} --from {}",)),
     Kind(
         "known.toml",
+        3,
         TEXT,
         ("calib survey {flight.uwb} --known {} -o {out}", "calib survey {flight.uwb} --known {} -o {out} --json"),
     ),
-    Kind(
-        "plan.toml",
-        TEXT,
-        ("calib plan 4 --on plane --taped 2 --tape-sigma 0.01 --size 3,4", "uwbsim sweep {} -o {out} --workers 1"),
-    ),
-    Kind("tags.toml", TEXT, ("uwblink poses {live.uwb} --from ifo001={poses.tum} --tags {}",)),
+    Kind("groups.toml", 2, TEXT, ("calib fit {flight.uwb} -o {out} --loss cauchy --group {}",)),
+    Kind("plan.toml", 0.1, TEXT, ("uwbsim sweep {} -o {out} --workers 1",)),
+    Kind("tags.toml", 3, TEXT, ("uwblink poses {live.uwb} --from ifo001={poses.tum} --tags {}",)),
+    Kind("nothing", 8, (), ALONE),
 )
 
 
 def write_seeds(folder: Path) -> None:
-    """Write a sound file of every kind into a folder."""
+    """Write a small sound file of every kind into a folder: a case should take hundredths of a second."""
     folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (
+        ("map.toml", MAP), ("known.toml", KNOWN), ("groups.toml", GROUPS), ("plan.toml", PLAN), ("nothing", ""),
+    ):  # fmt: skip
+        (folder / name).write_text(text)
+    _write_flights(folder)
+    _write_tables(folder)
+
+
+def _write_flights(folder: Path) -> None:
+    """Write a scenario, what was recorded in it, and calibrations from that."""
     scenario = (ROOT / SCENARIO).read_text()
-    short = scenario.replace("duration_s = 60.0", "duration_s = 3.0")
-    (folder / "scenario.toml").write_text(short)
+    (folder / "scenario.toml").write_text(scenario.replace("duration_s = 60.0", "duration_s = 1.5"))
     simulated = uwbsim.simulate(folder / "scenario.toml")
     simulated.save(folder / "flight.uwb")
     calib.fit(simulated).calibration.save(folder / "calibration.json")
     recording = uwblink.load(folder / "flight.uwb")
+    x = recording.exchanges
+    others = replace(recording, exchanges=x[(x.initiator != NEW_TAG) & (x.target != NEW_TAG)])
+    calib.fit(others).calibration.save(folder / "others.json")
     replace(recording, poses=recording.poses[:0]).save(folder / "live.uwb")
-    export_recording(folder / "flight.uwb", folder / "exported", to="tum")
-    shutil.copyfile(next((folder / "exported").glob("ifo001*")), folder / "poses.tum")
+    ports = uwbsim.VirtualPorts(uwbsim.load(folder / "scenario.toml"))
+    uwblink.record([*ports.names.values()], folder / "boards.uwb", uwblink.RangingPlan(), using=ports, duration_s=1.5)
     (folder / "tags.toml").write_text("".join(_tag(tag) for tag in recording.tags))
-    (folder / "map.toml").write_text(MAP)
-    (folder / "known.toml").write_text(KNOWN)
-    (folder / "plan.toml").write_text(PLAN)
+
+
+def _write_tables(folder: Path) -> None:
+    """Write tables, trajectories and a bag."""
     table = (ROOT / "docs/examples/exchanges.csv").read_bytes()
     (folder / "table.csv").write_bytes(table)
     (folder / "table.csv.gz").write_bytes(gzip.compress(table, mtime=0))
+    rows = list(csv.DictReader(io.StringIO(table.decode())))
+    lines = [json.dumps({name: _value(cell) for name, cell in row.items()}) for row in rows[:10]]
+    (folder / "table.jsonl").write_text("".join(f"{line}\n" for line in lines))
+    live = folder / "flight.uwb"
+    export_recording(live, folder / "parquet", to="parquet")
+    shutil.copyfile(folder / "parquet/exchanges.parquet", folder / "table.parquet")
+    export_recording(live, folder / "exported", to="csv")
+    export_recording(live, folder / "mcap", to="mcap")
+    shutil.copyfile(next((folder / "mcap").glob("*.mcap")), folder / "flight.mcap")
+    export_recording(live, folder / "tum", to="tum")
+    for source, name in (
+        (next((folder / "tum").glob("ifo001*")), "poses.tum"),
+        (folder / "exported/poses.csv", "poses.csv"),
+    ):
+        first = source.read_text().splitlines(keepends=True)[:300]
+        (folder / name).write_text("".join(first))
+
+
+def _value(cell: str) -> float | str:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
 
 
 def _tag(tag: uwblink.Tag) -> str:
@@ -134,14 +239,18 @@ start_s = 0.0
 end_s = 2.0
 """
 
+GROUPS: Final = """[groups]
+front = [1, 2, 3]
+back = [4, 5, 6]
+"""
+
 PLAN: Final = """[sweep]
 scenario = "scenario.toml"
 protocols = ["ss", "ds"]
-ranges = 20
+ranges = 5
 seeds = 1
 
 [vary]
-"ranging.response_delay_uus" = [300, 1500]
 "radio.rx_noise_ps" = [10.0, 100.0]
 """
 
