@@ -61,8 +61,7 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
         mixture = _about_their_centre(centred, pair, cell[rows], len(names))
         location = -float(mixture.of("design")[0])
         centred = centred - location
-    # Powers may repeat; what is straight between two of them needs them apart.
-    nodes = np.array([np.median(problem.lifted[cell == k]) for k in range(CELLS)]) + 1e-9 * np.arange(CELLS)
+    nodes = _middles(problem.lifted, cell)
     known = _of_pairs(mixture, time_ns, pair)
     wild = _outliers(mixture, centred)
     model = ErrorModel(
@@ -80,6 +79,14 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
         },
     )
     return _put_right(model, problem, residual_m)
+
+
+def _middles(lifted: Floats, cell: Ints) -> Floats:
+    """Return the lifted power that stands for each step (CELLS,): of few powers, some steps hold no range."""
+    held = np.unique(cell)
+    middles = np.interp(np.arange(CELLS), held, [np.median(lifted[cell == k]) for k in held])
+    # Powers may repeat; what is straight between two of them needs them apart.
+    return np.asarray(middles + 1e-9 * np.arange(CELLS))
 
 
 def _described(count: int) -> Ints | slice:

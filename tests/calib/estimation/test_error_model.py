@@ -69,6 +69,17 @@ def test_any_loss_says_what_errors_are_made_of(loss):
     assert 0.935 < found.inside_95 < 0.965
 
 
+@pytest.mark.parametrize("count", [100, 159, 161])
+def test_the_fewest_ranges_that_are_fitted_say_what_errors_are_made_of(tmp_path, count):
+    """Fewer than eight times twenty: of the model's eight steps of power, some hold no range."""
+    ranges = make(CLEAN["short, 30 s"], 11_005).ranges[:count]
+    known = calib.fit(ranges, loss="cauchy").calibration
+    assert known.errors is not None
+    assert (np.diff(known.errors.lifted) > 0).all()
+    known.save(tmp_path / "c.json")
+    assert calib.load_calibration(tmp_path / "c.json").errors == known.errors
+
+
 def test_a_power_beyond_the_curve_widens_the_total():
     known = calib.fit(calib.sample_flight()).calibration
     low, high = known.bias_curve.range
