@@ -264,6 +264,8 @@ class Store:
         if "meta" not in found:
             raise RecordingError(f"{self.path}: a DuckDB file, but not a {SUFFIX} recording (no table meta)")
         for table, columns in TABLES.items():
-            missing = sorted(columns.keys() - found.get(table, set()) - ADDED_LATER.get(table, frozenset()))
+            present, later = found.get(table, set()), ADDED_LATER.get(table, frozenset())
+            came_whole = later == columns.keys()
+            missing = sorted(columns.keys() - present - (later if not (present and came_whole) else set()))
             if missing:
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")

@@ -51,3 +51,15 @@ def test_a_table_that_was_always_there_is_missed(older):
         db.execute("DROP TABLE poses")
     with pytest.raises(RecordingError, match="table poses lacks"):
         Recording.open(older)
+
+
+@pytest.mark.parametrize("table", LATER)
+def test_a_table_that_came_later_came_whole(tmp_path, table):
+    path = tmp_path / "f.uwb"
+    with Recording.create(path):
+        pass
+    column = list(TABLES[table])[-1]
+    with duckdb.connect(str(path)) as db:
+        db.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
+    with pytest.raises(RecordingError, match=f"table {table} lacks {column}"):
+        Recording.open(path)
