@@ -229,7 +229,7 @@ def _json_lines(path: Path) -> _Relation:
     for line in _first_lines(path):
         try:
             row = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
         if isinstance(row, dict):
             fields |= dict(_fields(row, "", ""))

@@ -445,6 +445,7 @@ def test_maps_that_cannot_be(tmp_path, text, fragment):
     [
         ("t.parquet", b"PAR1 no"),
         ("t.jsonl", b"no\n"),
+        ("t.jsonl", b"[" * 100_000 + b"\n"),
         ("t.csv.gz", b"no"),
         ("t.csv", b"\xff\xfe\x00"),
         ("t.csv", b"\n"),
