@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from uwblink.arrays import Bools, Floats
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.relative_clocks import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
-from uwblink.twr import Exchanges, intervals
+from uwblink.twr import COLUMNS, Exchanges, intervals, names_in
 
 ENOUGH: Final = 10_000
 """Exchanges that are asked, drawn by chance, if there are more."""
@@ -55,7 +55,41 @@ def clocks_apart(exchanges: Exchanges) -> ClocksApart | None:
 
     Which sign readings have is settled by most pairs: that of all is no matter for ranges with a third message.
     """
-    some = exchanges[_asked(exchanges)]
+    asked = Asked()
+    asked.add(exchanges)
+    return asked.apart()
+
+
+class Asked:
+    """Exchanges of which the clocks are compared: as many as it takes, drawn by chance from all that come by."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._random, self._count = np.random.default_rng(0), 0
+        self._parts: list[Exchanges] = []
+        self._draws: list[Floats] = []
+
+    def add(self, exchanges: Exchanges) -> None:
+        """Look at some more exchanges."""
+        able = _able(exchanges)
+        self._count += int(np.count_nonzero(able))
+        draws = self._random.random(len(exchanges))
+        # More are kept than of all will be asked: their number only grows.
+        kept = able & (draws < self._share())
+        self._parts.append(exchanges[kept])
+        self._draws.append(draws[kept])
+
+    def _share(self) -> float:
+        return ENOUGH / self._count if self._count > ENOUGH else 1.0
+
+    def apart(self) -> ClocksApart | None:
+        """Return the pair whose clocks are farthest apart, None where all agree."""
+        parts = [part[draws < self._share()] for part, draws in zip(self._parts, self._draws, strict=True)]
+        joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+        return _farthest_pair(replace(parts[0], **joined))
+
+
+def _farthest_pair(some: Exchanges) -> ClocksApart | None:
     if not len(some):
         return None
     forth = np.where(some.initiator < some.target, 1.0, -1.0)
@@ -78,16 +112,12 @@ def farthest(several: Iterable[ClocksApart | None]) -> ClocksApart | None:
     return max(filter(None, several), key=lambda one: one.moves_m, default=None)
 
 
-def _asked(exchanges: Exchanges) -> Bools:
+def _able(exchanges: Exchanges) -> Bools:
     """Return which exchanges tell both: three messages with stamps, and readings, of which 0 is none."""
-    triple = [name for name in np.unique(exchanges.protocol).tolist() if PROTOCOLS[name].third_sender is not None]
-    asked = np.isin(exchanges.protocol, triple) & ((exchanges.tx3 | exchanges.rx3) != 0)
+    triple = [name for name in names_in(exchanges.protocol) if PROTOCOLS[name].third_sender is not None]
+    able = np.isin(exchanges.protocol, triple) & ((exchanges.tx3 | exchanges.rx3) != 0)
     readings = np.abs(exchanges.skew1_ppm) + np.abs(exchanges.skew2_ppm)
-    asked &= np.isfinite(readings) & (readings != 0)
-    count = int(np.count_nonzero(asked))
-    if count > ENOUGH:
-        asked &= np.random.default_rng(0).random(len(asked)) < ENOUGH / count
-    return np.asarray(asked)
+    return np.asarray(able & np.isfinite(readings) & (readings != 0))
 
 
 def _apart(pair: tuple[int, int], stamps: Floats, carrier: Floats, reply_s: Floats) -> ClocksApart | None:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.carriers import ClocksApart, clocks_apart, farthest
 from calib.errors import BadInputError, UnanswerableError
+from calib.long_columns import joined, picked
 from calib.single_sided import LeftSkew, left_skew, worst
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
@@ -85,24 +86,13 @@ class Ranges:
         given = exchanges.truth_m if truth_m is None else np.asarray(truth_m, dtype=np.float64)
         if given.shape != (len(exchanges),):
             raise BadInputError(f"has shape {given.shape}, expected ({len(exchanges)},)", parameter="truth_m")
-        raw, initiator, target, middle = _of_stamps(exchanges)
-        bare = without_stamps(exchanges)
         return cls(
             source=source,
-            time_ns=exchanges.time_ns,
-            initiator=exchanges.initiator,
-            target=exchanges.target,
-            protocol=np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
-            raw_m=raw,
-            truth_m=_truth(exchanges, given, poses, tags, middle),
-            weight_initiator=initiator,
-            weight_target=target,
-            fpp1_dbm=measured_powers(exchanges.fpp1_dbm),
-            fpp2_dbm=measured_powers(exchanges.fpp2_dbm),
             excluded={},
             planted=dict(planted) if planted else None,
             left_skew=left_skew(exchanges),
             clocks_apart=clocks_apart(exchanges),
+            **columns_of(exchanges, given, poses, tags),
         )
 
     @classmethod
@@ -166,7 +156,8 @@ class Ranges:
 
     def __getitem__(self, rows: Bools | Ints | slice) -> Ranges:
         """Return the chosen rows, in their order."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+        columns: dict[str, Any] = {name: picked(getattr(self, name), rows) for name in COLUMNS}
+        return replace(self, **columns)
 
     def __repr__(self) -> str:
         """Return how many ranges of which tags there are, and what was left out."""
@@ -184,31 +175,51 @@ class Ranges:
         Without `need_power`, ranges without any stay. Raises `UnanswerableError` where nothing is left, with
         `why_no_truth` where that is the reason.
         """
-        if not len(self):
-            raise UnanswerableError(f"{self.source}: holds no exchanges")
-        reasons = {
-            "a tag with itself": self.initiator != self.target,
-            "no true distance": np.isfinite(self.truth_m),
-            "no power": np.isfinite(self.fpp1_dbm) | np.isfinite(self.fpp2_dbm) | (not need_power),
-            "impossible stamps": np.isfinite(self.raw_m) & (np.abs(self.raw_m) < LONGEST_M),
-        }
-        keep = np.ones(len(self), dtype=bool)
-        excluded = {}
-        for reason, good in reasons.items():
-            excluded[reason] = int(np.count_nonzero(keep & ~good))
-            keep &= good
-        if keep.all():
+        found = usable_rows(self, need_power=need_power)
+        require_some(self.source, len(self), found.excluded, why_no_truth)
+        if found.keep.all():
             return self
-        if not keep.any():
-            most = max(excluded, key=lambda reason: excluded[reason])
-            hints = {
-                "no true distance": why_no_truth or "it needs poses and lever arms, or measured distances",
-                "no power": "a calibration without a curve needs none: `calib fit --delays-only` makes one",
-                "a tag with itself": "look at from_id and to_id of what was imported",
-            }
-            hint = f"; {hints[most]}" if most in hints else ""
-            raise UnanswerableError(f"{self.source}: none of its {len(self)} exchanges can be used: {most}{hint}")
-        return replace(self[keep], excluded=self.excluded | {r: n for r, n in excluded.items() if n})
+        return replace(self[found.keep], excluded=self.excluded | {r: n for r, n in found.excluded.items() if n})
+
+
+@dataclass(frozen=True, slots=True)
+class Usable:
+    """Which ranges can be used, (n,), and how many not for which reason, in the order in which they are looked for."""
+
+    keep: Bools
+    excluded: dict[str, int]
+
+
+def usable_rows(ranges: Ranges, *, need_power: bool) -> Usable:
+    """Return which of some ranges can be used, and how many not for which reason."""
+    reasons = {
+        "a tag with itself": ranges.initiator != ranges.target,
+        "no true distance": np.isfinite(ranges.truth_m),
+        "no power": np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm) | (not need_power),
+        "impossible stamps": np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < LONGEST_M),
+    }
+    keep = np.ones(len(ranges), dtype=bool)
+    excluded = {}
+    for reason, good in reasons.items():
+        excluded[reason] = int(np.count_nonzero(keep & ~good))
+        keep &= good
+    return Usable(keep, excluded)
+
+
+def require_some(source: str, count: int, excluded: Mapping[str, int], why_no_truth: str) -> None:
+    """Raise `UnanswerableError` where there are no ranges, or all of so many were left out, and say for what."""
+    if not count:
+        raise UnanswerableError(f"{source}: holds no exchanges")
+    if sum(excluded.values()) < count:
+        return
+    most = max(excluded, key=lambda reason: excluded[reason])
+    hints = {
+        "no true distance": why_no_truth or "it needs poses and lever arms, or measured distances",
+        "no power": "a calibration without a curve needs none: `calib fit --delays-only` makes one",
+        "a tag with itself": "look at from_id and to_id of what was imported",
+    }
+    hint = f"; {hints[most]}" if most in hints else ""
+    raise UnanswerableError(f"{source}: none of its {count} exchanges can be used: {most}{hint}")
 
 
 APART: Final = ("source", "excluded", "planted", "left_skew", "clocks_apart", "recordings")
@@ -219,7 +230,7 @@ COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in APART)
 
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
     """Join the ranges of several recordings, in their order."""
-    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS}
+    columns: dict[str, Any] = {name: joined([getattr(p, name) for p in parts]) for name in COLUMNS}
     reasons = sorted({reason for p in parts for reason in p.excluded})
     return Ranges(
         source=", ".join(p.source for p in parts),
@@ -262,6 +273,24 @@ def measured_powers(fpp_dbm: Floats) -> Floats:
     """Return first-path powers (n,) in dBm, NaN where the number cannot be one."""
     with np.errstate(invalid="ignore"):
         return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
+
+
+def columns_of(exchanges: Exchanges, given_m: Floats, poses: Poses | None, tags: Sequence[Tag]) -> dict[str, Any]:
+    """Return exchanges as the columns of ranges, with true distances `given_m` (n,), from poses where they are NaN."""
+    raw, initiator, target, middle = _of_stamps(exchanges)
+    bare = without_stamps(exchanges)
+    return {
+        "time_ns": exchanges.time_ns,
+        "initiator": exchanges.initiator,
+        "target": exchanges.target,
+        "protocol": np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
+        "raw_m": raw,
+        "truth_m": _truth(exchanges, given_m, poses, tags, middle),
+        "weight_initiator": initiator,
+        "weight_target": target,
+        "fpp1_dbm": measured_powers(exchanges.fpp1_dbm),
+        "fpp2_dbm": measured_powers(exchanges.fpp2_dbm),
+    }
 
 
 def _of_stamps(exchanges: Exchanges) -> tuple[Floats, Floats, Floats, Ints]:

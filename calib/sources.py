@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
@@ -16,12 +16,17 @@ from numpy.typing import NDArray
 
 from calib.errors import BadInputError, UnanswerableError
 from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
+from calib.recorded import FINGERPRINT, read_ranges
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
 from uwblink.recording.target_reports import single_reports
 from uwblink.twr import Exchanges
 
 __all__: Final = ["load_each"]
+
+
+READING_MB: Final = 256
+"""Of a file that is read some rows at a time so much is kept in memory."""
 
 
 def no_poses() -> Poses:
@@ -190,6 +195,11 @@ def each(data: Data | Iterable[Data]) -> list[Data]:
 def _load(data: Data, need_power: bool) -> Ranges:
     if isinstance(data, Ranges):
         return data.usable(need_power=need_power)
+    if isinstance(data, str | os.PathLike | Recording):
+        with _recording(data) as recording:
+            found = read_ranges(recording, recording.path.name, need_power=need_power)
+        if found is not None:
+            return found
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
         complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
@@ -200,12 +210,16 @@ def _load(data: Data, need_power: bool) -> Ranges:
     return ranges.usable(_why_no_truth(ranges, poses, tags), need_power=need_power)
 
 
+def _recording(data: str | os.PathLike[str] | Recording) -> AbstractContextManager[Recording]:
+    return nullcontext(data) if isinstance(data, Recording) else Recording.open(data, memory_mb=READING_MB)
+
+
 def fingerprint(exchanges: Exchanges) -> str:
     """Return what tells exchanges from all others, whatever their file is called: a hash of their times and ranges."""
     found = sha256()
     for column in (exchanges.time_ns, exchanges.range_m):
         found.update(np.ascontiguousarray(column).data)
-    return found.hexdigest()[:32]
+    return found.hexdigest()[:FINGERPRINT]
 
 
 def _planted(source: Source) -> Mapping[str, Any] | None:

@@ -62,7 +62,9 @@ FLOORS = {
     ),
     "calib": (
         ("carriers", "densities", "errors", "samples", "single_sided", "spread"),
-        ("error_mixture", "information", "ranges"),
+        ("error_mixture", "information", "long_columns"),
+        ("ranges",),
+        ("recorded",),
         ("calibration", "sources"),
         ("evaluation",),
         ("figures",),

@@ -175,6 +175,13 @@ def _protocol_of(protocol: ArrayLike | None, tx3: ArrayLike | None, rx3: ArrayLi
     return "ss" if tx3 is None else "ds"
 
 
+def names_in(words: NDArray[np.str_]) -> list[str]:
+    """Return the words that occur in a column (n,), in order; mostly it is one, which takes no sorting."""
+    if len(words) and bool(np.all(words == words[0])):
+        return [str(words[0])]
+    return [str(word) for word in np.unique(words)]
+
+
 def _messages(names: NDArray[np.str_]) -> Ints:
     """Return how many messages the protocol of each row has, (n,); raises `ArgumentError` for an unknown one."""
     known, place = np.unique(names, return_inverse=True)

@@ -88,8 +88,11 @@ class Recording(TableWriters, TableReaders):
         return recording
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str], *, update: bool = False) -> Self:
+    def open(cls, path: str | os.PathLike[str], *, update: bool = False, memory_mb: int | None = None) -> Self:
         """Open a recording for reading, or to `update` it in place.
+
+        Of what was read from the file no more than `memory_mb` is kept in memory, for those who read a long one some
+        rows at a time; sorting more than that takes more.
 
         Of one that is being recorded a snapshot is opened, which its recorder makes: everything until now. Raises
         `RecordingMissingError` or `RecordingError` (a directory, not a recording, truncated, tables or columns missing,
@@ -101,11 +104,11 @@ class Recording(TableWriters, TableReaders):
         if source.is_dir():
             raise RecordingError(f"{source}: is a directory, expected a {SUFFIX} recording")
         try:
-            store = Store.open(source, update=update)
+            store = Store.open(source, update=update, memory_mb=memory_mb)
         except RecordingInUseError:
             if update:
                 raise
-            store = open_snapshot(source, partial(Store.open, update=False))
+            store = open_snapshot(source, partial(Store.open, update=False, memory_mb=memory_mb))
             store.path = source
         recording = cls(store)
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from uwblink.display import printable
 from uwblink.errors import RecordingError
-from uwblink.protocols.table import PROTOCOLS
+from uwblink.recording.blocks import ROWS_AT_ONCE, PoseWindows, exchange_blocks, filled, read_exchanges
 from uwblink.recording.intake import decode_json
 from uwblink.recording.schema import TABLES, Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.recording.store import Store
 from uwblink.ticks import REPORT_BITS
-from uwblink.twr import BITS, COLUMNS, Exchanges
+from uwblink.twr import BITS, Exchanges
 
 _EMPTY: Final = {"BIGINT": np.int64, "BOOLEAN": np.bool_, "DOUBLE": np.float64, "USMALLINT": np.uint16}
 
@@ -49,21 +49,15 @@ class TableReaders:
 
     def exchanges(self) -> Exchanges:
         """Return all exchanges in the order in which they were written."""
-        plain = ", ".join(name for name in COLUMNS if name != "protocol")
-        # Those of other distributions are looked for only where the ones in use do not suffice.
-        for known in ((row.name for row in PROTOCOLS.known()), PROTOCOLS):
-            names = sorted(known)
-            listed = ", ".join(f"'{name}'" for name in names)
-            query = f"SELECT {plain}, list_position([{listed}], protocol)::TINYINT AS protocol FROM exchanges"  # noqa: S608 - names are checked words
-            rows = self._store.read(query)
-            code = rows.pop("protocol")
-            if not np.ma.is_masked(code):
-                break
-        else:
-            raise RecordingError(f"{self.path}: exchanges of an unknown protocol; known are {', '.join(names)}")
-        columns = {name: filled(rows[name]) for name in rows}
-        protocol = np.array(names)[np.asarray(code, dtype=np.int64) - 1]
-        return Exchanges(protocol=protocol, bits=self._bits(), **columns)
+        return read_exchanges(self._store, self._bits())
+
+    def exchange_blocks(self, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
+        """Yield the same exchanges in the same order, about so many `rows` at once."""
+        return exchange_blocks(self._store, self._bits(), rows)
+
+    def pose_windows(self) -> PoseWindows:
+        """Return the poses by stretches of time, for those who need not have all of them at once."""
+        return PoseWindows(self._store)
 
     def _bits(self) -> int:
         bits = self.meta().get("timestamp_bits", REPORT_BITS)
@@ -193,11 +187,3 @@ def known_tables(names: Iterable[str]) -> None:
     for name in names:
         if name not in TABLES:
             raise RecordingError(f"no table {name!r} in a recording; there are {', '.join(TABLES)}")
-
-
-def filled(column: NDArray[Any]) -> NDArray[Any]:
-    """Return a column (n,) without nulls: they become NaN in floats and zero in integers."""
-    kind = np.float64 if column.dtype.kind == "f" else np.int64
-    if isinstance(column, np.ma.MaskedArray):
-        column = column.filled(np.nan if column.dtype.kind == "f" else 0)
-    return np.asarray(column, dtype=kind)

@@ -67,15 +67,26 @@ class Store:
         return store
 
     @classmethod
-    def open(cls, path: Path, *, update: bool) -> Self:
-        """Open a file for reading, or to `update` it; raises `RecordingError` for what is none, or is in use."""
+    def open(cls, path: Path, *, update: bool, memory_mb: int | None = None) -> Self:
+        """Open a file for reading, or to `update` it; raises `RecordingError` for what is none, or is in use.
+
+        Of what was read, and of what a query works on, no more than `memory_mb` is kept in memory, by default most of
+        what there is; a file that is open in this program already keeps what it was opened with.
+        """
         import duckdb
 
         check_length(path)
         config: dict[str, Any] = dict(setting.split(" = ") for setting in _LOCKED)
         size = path.stat().st_size
+        limit = {} if memory_mb is None else {"memory_limit": f"{memory_mb}MB"}
         try:
-            store = cls(duckdb.connect(str(path), read_only=not update, config=config), path, size)
+            try:
+                connection = duckdb.connect(str(path), read_only=not update, config=limit | config)
+            except duckdb.ConnectionException:
+                if not limit:
+                    raise
+                connection = duckdb.connect(str(path), read_only=not update, config=config)
+            store = cls(connection, path, size)
         except duckdb.ConnectionException as error:
             raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error
         except duckdb.IOException as error:

@@ -1,0 +1,93 @@
+"""Columns of many rows, which lie in files without a name: in memory is what is worked on, and no more.
+
+A column of a million rows and more is a mapped file in the folder for temporary files (`TMPDIR`), which is gone when
+nobody holds the column any more. It is an array like any other; `let_go` takes its pages out of this process, and the
+next look at them brings them back from the file, of which the system keeps in memory what it has room for.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from calib.errors import UnanswerableError
+from uwblink.arrays import Bools, Ints
+
+MANY: Final = 1_000_000
+"""Rows from which a column lies in a file."""
+
+ROWS_AT_ONCE: Final = 1 << 20
+
+
+def empty(rows: int, dtype: DTypeLike = np.float64, *, each: tuple[int, ...] = ()) -> NDArray[Any]:
+    """Return room for a column (rows,), or for several (*each, rows) at once.
+
+    Raises `UnanswerableError` where a file is needed and the folder for temporary files has no room for it.
+    """
+    shape, kind = (*each, rows), np.dtype(dtype)
+    if rows < MANY:
+        return np.empty(shape, kind)
+    size = int(np.prod(shape)) * kind.itemsize
+    with tempfile.TemporaryFile(prefix="uwbcal-") as file:
+        try:
+            _take_room(file.fileno(), size)
+        except OSError as error:
+            raise UnanswerableError(
+                f"{tempfile.gettempdir()}: no room for {size / 1e9:.1f} GB of columns ({error.strerror}); "
+                "set TMPDIR to a folder with more"
+            ) from error
+        place = mmap.mmap(file.fileno(), size)
+    return np.frombuffer(place, kind).reshape(shape)
+
+
+def _take_room(file: int, size: int) -> None:
+    """Make a file so long; where the system can, its room on the disk is taken too, so that none lacks later."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.ftruncate(file, size)
+
+
+def let_go(*columns: NDArray[Any] | None) -> None:
+    """Take the pages of columns that lie in files out of memory; what is in them stays."""
+    for column in columns:
+        place: Any = column
+        while isinstance(place, np.ndarray):
+            place = place.base
+        place = place.obj if isinstance(place, memoryview) else place
+        if isinstance(place, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+            place.madvise(mmap.MADV_DONTNEED)
+
+
+def picked(column: NDArray[Any], rows: Bools | Ints | slice) -> NDArray[Any]:
+    """Return some rows of a column (n,), as `column[rows]` does; one value for all of them stays one."""
+    if column.strides == (0,) and len(column):
+        return np.broadcast_to(np.asarray(column[0]), np.arange(len(column))[rows].shape)
+    if len(column) < MANY or isinstance(rows, slice):
+        return np.asarray(column[rows])
+    where = np.flatnonzero(rows) if rows.dtype == bool else rows
+    found = empty(len(where), column.dtype)
+    for begin in range(0, len(where), ROWS_AT_ONCE):
+        some = slice(begin, begin + ROWS_AT_ONCE)
+        found[some] = column[where[some]]
+        let_go(found, column)
+    return found
+
+
+def joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return columns one after the other, as `numpy.concatenate` does."""
+    count = sum(map(len, columns))
+    if count < MANY:
+        return np.concatenate(columns)
+    found, begin = empty(count, np.result_type(*columns)), 0
+    for column in columns:
+        found[begin : begin + len(column)] = column
+        begin += len(column)
+        let_go(found, column)
+    return found

@@ -1,0 +1,150 @@
+"""Ranges read some exchanges at a time are those of all exchanges and all poses, to the last bit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import long_columns, recorded
+from calib.errors import UnanswerableError
+from calib.long_columns import empty, joined, let_go, picked
+from calib.ranges import APART, COLUMNS, Ranges
+from calib.recorded import read_ranges
+from calib.samples import sample_flight
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Poses, Tag
+
+ROWS = 300
+
+
+def written(path, exchanges, poses, tags):
+    with Recording.create(path, meta={"planted": {"delays_ns": {"1": 0.1}}}) as recording:
+        recording.append_tags(tags)
+        recording.append_poses(poses)
+        recording.append_exchanges(exchanges)
+    return path
+
+
+def of_all(path):
+    with Recording.open(path) as recording:
+        whole = recording.exchanges()
+        found = Ranges.from_exchanges(
+            whole, poses=recording.poses(), tags=recording.tags(), planted=recording.meta()["planted"], source="it"
+        )
+    return found.usable()
+
+
+def assert_same(one, other):
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for name in set(APART) - {"recordings"}:
+        assert repr(getattr(one, name)) == repr(getattr(other, name)), name
+
+
+def awkward():
+    """A flight with everything that makes a difference between all poses and some of them."""
+    flight = sample_flight(ROWS, seed=3)
+    rng = np.random.default_rng(5)
+    first, last = int(flight.poses.time_ns[0]), int(flight.poses.time_ns[-1])
+    time_s = (flight.poses.time_ns - first) * 1e-9
+    body = np.array(sorted(set(flight.poses.body.tolist())))
+    gap = (flight.poses.body == body[0]) & (time_s > 0.2 * time_s[-1]) & (time_s < 0.5 * time_s[-1])
+    short = (flight.poses.body == body[1]) & (time_s > 0.6 * time_s[-1])
+    poses = flight.poses[~gap & ~short]
+    still = Poses(
+        np.array([last + 10**12]), np.array(["post"]), np.array([[3.0, 2.0, 1.0]]), np.array([[0.0, 0, 0, 1]])
+    )
+    poses = Poses(
+        *(
+            np.concatenate([getattr(poses, n), getattr(still, n)])
+            for n in ("time_ns", "body", "position_m", "quaternion")
+        )
+    )
+    tags = [tag if tag.tag != 3 else Tag(3, "post", (0.1, 0.0, 0.0)) for tag in flight.tags]
+    exchanges = flight.exchanges[np.argsort(rng.random(ROWS) + np.arange(ROWS) / 20)]
+    fpp1 = exchanges.fpp1_dbm.copy()
+    fpp2 = exchanges.fpp2_dbm.copy()
+    fpp1[::7], fpp2[::14] = np.nan, np.nan
+    truth = np.where(np.arange(ROWS) % 11 == 0, 2.5, np.nan)
+    protocol = np.where(np.arange(ROWS) < ROWS // 2, exchanges.protocol, "ss")
+    return replace(exchanges, fpp1_dbm=fpp1, fpp2_dbm=fpp2, truth_m=truth, protocol=protocol), poses, tags
+
+
+def test_blocks_of_any_size_make_the_ranges_of_the_whole(tmp_path, monkeypatch):
+    path = written(tmp_path / "it.uwb", *awkward())
+    whole = of_all(path)
+    assert whole.excluded["no true distance"] > 5
+    assert whole.excluded["no power"] > 5
+    assert whole.left_skew is not None
+    monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**7)
+    monkeypatch.setattr(recorded, "POSES_AT_ONCE", 300)
+    with Recording.open(path) as recording:
+        for rows in (37, ROWS - 1, 10 * ROWS):
+            assert_same(read_ranges(recording, "it", need_power=True, rows=rows), whole)
+
+
+def test_columns_of_files_are_those_of_memory(tmp_path, monkeypatch):
+    path = written(tmp_path / "it.uwb", *awkward())
+    whole = of_all(path)
+    monkeypatch.setattr(long_columns, "MANY", 10)
+    monkeypatch.setattr(long_columns, "ROWS_AT_ONCE", 7)
+    with Recording.open(path, memory_mb=64) as recording:
+        found = read_ranges(recording, "it", need_power=True, rows=20)
+    assert_same(found, whole)
+    assert_same(found[np.arange(len(found)) % 3 > 0], whole[np.arange(len(whole)) % 3 > 0])
+
+
+def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeypatch):
+    flight = sample_flight(3000)
+    path = written(tmp_path / "it.uwb", flight.exchanges, flight.poses, flight.tags)
+    held = []
+    monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**8)
+    monkeypatch.setattr(recorded, "POSES_AT_ONCE", len(flight.poses) // 20)
+    around = recorded._PosesAround.around
+    monkeypatch.setattr(
+        recorded._PosesAround, "around", lambda self, part: held.append(len(found := around(self, part))) or found
+    )
+    with Recording.open(path) as recording:
+        assert len(read_ranges(recording, "it", need_power=True)) == 3000
+    assert len(held) > 10
+    assert max(held) < len(flight.poses) / 10
+
+
+def test_what_takes_all_exchanges_at_once_is_left_to_others(tmp_path):
+    flight = sample_flight(ROWS)
+    twice = replace(flight.exchanges, reporter=flight.exchanges.target)
+    for name, exchanges, poses in (("twice", twice, flight.poses), ("no truth", flight.exchanges, flight.poses[:0])):
+        with Recording.open(written(tmp_path / f"{name}.uwb", exchanges, poses, flight.tags)) as recording:
+            assert read_ranges(recording, name, need_power=True) is None
+
+
+def test_long_columns_are_arrays_like_any_other(monkeypatch):
+    monkeypatch.setattr(long_columns, "MANY", 4)
+    monkeypatch.setattr(long_columns, "ROWS_AT_ONCE", 2)
+    column = empty(9)
+    column[:] = np.arange(9.0)
+    let_go(column, column[3:], None, np.zeros(3))
+    rows = column % 2 == 0
+    np.testing.assert_array_equal(column, np.arange(9.0))
+    np.testing.assert_array_equal(picked(column, rows), [0, 2, 4, 6, 8])
+    np.testing.assert_array_equal(picked(column, np.array([8, 1, 1, 5, 0])), [8, 1, 1, 5, 0])
+    np.testing.assert_array_equal(joined([column, column[:2]]), [*range(9), 0, 1])
+    one = np.broadcast_to(np.array("ds"), 9)
+    assert picked(one, rows).strides == (0,)
+    assert picked(one, rows).tolist() == ["ds"] * 5
+    pair = empty(5, np.int32, each=(2,))
+    pair[1] = 7
+    assert pair.shape == (2, 5)
+    assert pair[1].tolist() == [7] * 5
+
+
+def test_a_full_disk_is_said_before_anything_is_computed(monkeypatch):
+    def full(file, size):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(long_columns, "MANY", 4)
+    monkeypatch.setattr(long_columns, "_take_room", full)
+    with pytest.raises(
+        UnanswerableError, match=r"no room for .* GB of columns \(No space left on device\); set TMPDIR"
+    ):
+        empty(9)
