@@ -88,7 +88,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     """
     require_calibration(first, "first")
     require_calibration(second, "second")
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     if first.pair_offsets or second.pair_offsets:
         raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
@@ -116,7 +116,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         offset_m=shift * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),
         curve_rms_m=float(curves.std()),
         chi_square=score,
-        probability=float(chi2.sf(score, len(common) - 1)),
+        probability=float(chdtrc(len(common) - 1, score)),
         only_first=tuple(sorted(set(first.delays_ns) - set(common))),
         only_second=tuple(sorted(set(second.delays_ns) - set(common))),
     )

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from calib.calibration.bsplines import combination
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.display import as_html, as_text
@@ -185,14 +186,12 @@ def beside_planted(ranges: Ranges, applied: CorrectedRanges, calibration: Calibr
 
 def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
     """Return a curve that the simulation planted, at lifted powers (n,), or None."""
-    from scipy.interpolate import BSpline
-
     curve: dict[str, Any] | None = (ranges.planted or {}).get(which)
     if not curve:
         return None
     knots, degree = np.array(curve["knots"], dtype=float), int(curve["degree"])
-    spline = BSpline(knots, np.array(curve["coefficients"], dtype=float), degree)
-    return np.asarray(spline(np.clip(lifted, knots[degree], knots[-1 - degree])))
+    inside = np.clip(lifted, knots[degree], knots[-1 - degree])
+    return combination(inside, knots, np.array(curve["coefficients"], dtype=float), degree)
 
 
 def pair_rows(ranges: Ranges) -> dict[str, Bools]:

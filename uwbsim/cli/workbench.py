@@ -177,13 +177,14 @@ def optimum(
 ) -> None:
     """Find the delay of the scheduled message at which the mean of a second of a pair's ranges errs least."""
     import uwbsim
-    from uwbsim.output import check_folder
-    from uwbsim.pages import optimum_file, write_optima
     from uwbsim.protocols import chosen
 
     rows = chosen(_names(protocols))
     loaded = uwbsim.load(scenario, overrides or ())
     if output:
+        from uwbsim.output import check_folder
+        from uwbsim.pages import optimum_file, write_optima
+
         check_folder(output, [optimum_file(row.name) for row in rows], force=force)
     with waiting("searching"):
         found = [uwbsim.optimum(loaded, row, overhead_us * 1e-6) for row in rows]

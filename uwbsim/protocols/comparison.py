@@ -18,6 +18,7 @@ from uwbsim.protocols.conditions import Conditions, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.airtime import (
+    RECEIVER_ON_S,
     TURNAROUND_S,
     after_marker_s,
     exchange_air_s,
@@ -27,7 +28,6 @@ from uwbsim.scenario.airtime import (
 )
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.air import RECEIVER_ON_S
 
 MOST: Final = 50_000_000
 """Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""

@@ -19,6 +19,9 @@ TURNAROUND_S: Final = 1e-3
 Boards report 2.5 to 3.6 ms after the command of a double-sided exchange of 2.0 ms (firmware wire format, 1.5).
 """
 
+RECEIVER_ON_S: Final = 40e-6
+"""From the end of a frame until the receiver is on again (firmware wire format, 3.1)."""
+
 POLL_BYTES: Final = 11
 RESPONSE_BYTES: Final = 8
 FINAL_BYTES: Final = 28

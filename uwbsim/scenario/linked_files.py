@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from uwblink.errors import UwblinkError
-from uwblink.importers.poses import read_poses
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses
 from uwbsim.errors import ScenarioError
@@ -136,6 +135,9 @@ def _trajectory(path: Path, body: str | None, duration_s: float) -> dict[str, An
             with Recording.open(path) as recording:
                 poses = recording.poses()
         else:
+            # With it come all importers, which few scenarios need.
+            from uwblink.importers.poses import read_poses
+
             poses = read_poses(path, body if path.suffix in (".tum", ".txt") else None)
     except UwblinkError as error:
         raise ScenarioError(str(error)) from error

@@ -19,14 +19,11 @@ import simpy
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.rows import RangingProtocol
-from uwbsim.scenario.airtime import TURNAROUND_S, after_marker_s, before_marker_s, message_bytes
+from uwbsim.scenario.airtime import RECEIVER_ON_S, TURNAROUND_S, after_marker_s, before_marker_s, message_bytes
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 
 PREAMBLE_TIMEOUT_S: Final = 6.521e-3
 """How long a board waits for a preamble (firmware wire format, 3.1)."""
-
-RECEIVER_ON_S: Final = 40e-6
-"""From the end of a frame until the receiver is on again (firmware wire format, 3.1)."""
 
 WEAK, COLLIDED, BUSY, FOREIGN, LATE = "below sensitivity", "collision", "receiver busy", "another's frame", "too late"
 

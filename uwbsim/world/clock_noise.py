@@ -18,7 +18,6 @@ from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.random_streams import stream
@@ -126,6 +125,8 @@ def _normal(index: Words, key: Words) -> Floats:
 @lru_cache(maxsize=1)
 def _quantiles() -> Floats:
     """Return equally probable values of a standard normal variable, with variance one."""
+    from scipy.special import ndtri
+
     count = 1 << DRAWS_BITS
     values = np.asarray(ndtri((np.arange(count) + 0.5) / count))
     return np.asarray(values / np.std(values))

@@ -11,7 +11,6 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-from scipy.special import fresnel
 
 from uwblink.arrays import Complexes, Floats
 from uwbsim.scenario.model import WAVELENGTH_M
@@ -49,6 +48,8 @@ def covered(nu: Floats) -> Complexes:
 
 @cache
 def _covered_table() -> Complexes:
+    from scipy.special import fresnel
+
     nu = np.linspace(-DEEPEST, DEEPEST, int(2 * DEEPEST * STEPS_A_UNIT) + 1)
     sine, cosine = fresnel(nu)
     exact = 0.5 + (cosine - 1j * sine) * (1 + 1j) / 2

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.scenario.devices import GroupDelay, GroupDelayHarmonics, GroupDelayTable
 from uwbsim.scenario.model import Scenario
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RegularGridInterpolator
 
 
 def has_group_delays(scenario: Scenario) -> bool:
@@ -51,4 +54,6 @@ def _harmonics_cm(model: GroupDelayHarmonics, azimuth: Floats, sine: Floats) -> 
 
 @lru_cache(maxsize=16)
 def _interpolator(table: GroupDelayTable) -> RegularGridInterpolator:
+    from scipy.interpolate import RegularGridInterpolator
+
     return RegularGridInterpolator((table.azimuth_deg, table.elevation_deg), np.array(table.delay_cm))

@@ -11,7 +11,6 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_array
 
 from uwblink.arrays import Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -120,6 +119,8 @@ def _accumulated(paths: Paths) -> Floats:
     A pulse lies in the block of taps where it begins and the next one; so each path adds one row of a table to two
     blocks at its amplitude, which a sparse matrix does without a list of its taps.
     """
+    from scipy.sparse import coo_array
+
     count, blocks = len(paths.amplitude), TAPS // BLOCK
     place = (BEFORE + EDGE_TO_PEAK + paths.detour_m / TAP_M) * FRACTIONS
     inside = (paths.detour_m < LAST_M) & (place >= 0)

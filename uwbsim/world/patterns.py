@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from math import factorial, isqrt, sqrt
 
 import numpy as np
-from scipy.special import lpmv
 
 from uwblink.arrays import Floats
 
@@ -17,6 +16,8 @@ def harmonics(direction: Floats, degree: int) -> Floats:
     In order of degree l, and in each of m from -l to l: the sine of azimuth for negative ones. Their root mean square
     over all directions is one.
     """
+    from scipy.special import lpmv
+
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     height = np.clip(direction[:, 2], -1, 1)
     columns = []
