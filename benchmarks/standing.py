@@ -63,6 +63,7 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
     size_m: float = 5.0,
     apart_m: float = 0.4,
     reflected: float = 0.0,
+    detour_m: tuple[float, float] = (0.15, 0.6),
     bias_size_m: float = 0.0,
     stay_s: float = 60.0,
     pause_s: float = 10.0,
@@ -70,7 +71,7 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
 ) -> Standing:
     """Return ranges of boards in random arrangements on a "line", in a "plane" or in "space".
 
-    `each` ranges a pair and arrangement; `reflected` is the share of pairs whose way is 15 to 60 cm longer in one.
+    `each` ranges a pair and arrangement; `reflected` is the share of pairs whose way is longer in one, by `detour_m`.
     """
     rng = np.random.default_rng([seed, boards, arrangements])
     delays = dict(zip(range(1, boards + 1), rng.normal(-0.05, 0.2, boards).tolist(), strict=True))
@@ -85,7 +86,7 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
             length = float(np.linalg.norm(place[i] - place[j]))
             power = power_dbm(length) + rng.normal(0, 1.0)
             constant = pair_error_m * rng.normal() + bias_m(power, bias_size_m)
-            constant += rng.uniform(0.15, 0.6) if rng.uniform() < reflected else 0.0
+            constant += rng.uniform(*detour_m) if rng.uniform() < reflected else 0.0
             constant -= C_M_PER_NS / 2 * (delays[i + 1] + delays[j + 1])
             turned = rng.uniform(size=each) < 0.5
             columns["t"].append(k * (stay_s + pause_s) + rng.uniform(0, stay_s, each))

@@ -22,12 +22,21 @@ from calib.planning.candidates import Layout, delay_information
 PAGE = Path(__file__).parents[1] / "docs" / "without-motion-capture.md"
 PLACE = re.compile(r"(<!-- surveys:begin[^>]*-->\n).*?(<!-- surveys:end -->)", re.DOTALL)
 C_M_PER_NS = 0.299702547
+LINE: dict[str, Any] = {"shape": "line", "boards": 5, "arrangements": 8}
+PLANE: dict[str, Any] = {"shape": "plane", "boards": 6, "arrangements": 8}
+SPACE: dict[str, Any] = {"shape": "space", "boards": 8, "arrangements": 8}
 WORLDS: dict[str, dict[str, Any]] = {
-    "line, 4 boards, 8 arrangements": {"shape": "line", "boards": 4, "arrangements": 8},
-    "plane, 6 boards, 8 arrangements": {"shape": "plane", "boards": 6, "arrangements": 8},
-    "space, 8 boards, 8 arrangements": {"shape": "space", "boards": 8, "arrangements": 8},
-    "line, 5 % of pairs reflected": {"shape": "line", "boards": 5, "arrangements": 8, "reflected": 0.05},
-    "plane, bias over power": {"shape": "plane", "boards": 6, "arrangements": 8, "bias_size_m": 0.05, "size_m": 8.0},
+    "line, 4 boards, 8 arrangements": LINE | {"boards": 4},
+    "plane, 6 boards, 8 arrangements": PLANE,
+    "space, 8 boards, 8 arrangements": SPACE,
+    "line, 5 boards, no pair reflected": LINE,
+    "line, 2 % of pairs reflected": LINE | {"reflected": 0.02},
+    "line, 5 % of pairs reflected": LINE | {"reflected": 0.05},
+    "line, 10 % of pairs reflected": LINE | {"reflected": 0.1},
+    "line, 5 % reflected, by 5 to 20 cm": LINE | {"reflected": 0.05, "detour_m": (0.05, 0.2)},
+    "plane, 5 % of pairs reflected": PLANE | {"reflected": 0.05},
+    "space, 5 % of pairs reflected": SPACE | {"reflected": 0.05},
+    "plane, bias over power": PLANE | {"bias_size_m": 0.05, "size_m": 8.0},
     "space, one arrangement": {"shape": "space", "boards": 5, "arrangements": 1},
 }
 

@@ -8,13 +8,14 @@ little of either.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from calib.surveys.network import Network
-from uwblink.arrays import Floats
+from calib.surveys.network import DETOUR_M, Network
+from calib.surveys.reflections import choices, searched, unlikely
+from uwblink.arrays import Bools, Floats
 
 PAIR_STD_M: Final = 0.02
 """What a constant error of a pair is like before any data, and worth how many degrees of freedom."""
@@ -24,35 +25,46 @@ CURVE_STD_M: Final = 0.03
 CURVE_FACTOR: Final = 1.8
 """Spread of a curve before any data, and the factor by which that may be wrong."""
 
+SETTLED: Final = 1e-8
+"""Share of the weighed squares below which a step gains nothing: a ten-thousandth of a standard deviation."""
+
 MOST_STEPS: Final = 60
-ROUNDS: Final = 3
+ROUNDS: Final = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Adjusted:
     """The best unknowns (unknowns,), their information without any prior on what the data say, and the residuals.
 
-    `weighed` is the sum of squared residuals over their standard deviations, priors included; `freedom` the degrees of
-    freedom that are left; `pair_std_m` and `curve_std_m` are the estimated spreads.
+    `unlikely` is -2 log of the likelihood of everything, up to a constant that all adjustments of one set of means
+    share; `freedom` the degrees of freedom that are left; `pair_std_m` and `curve_std_m` are the estimated spreads.
+    Which means are reflected is marked in `network`; `chance` (n,) is how probable that is of each, and `open_m2` what
+    it adds to the covariance (unknowns, unknowns) that others may be reflected instead.
     """
 
     network: Network
     x: Floats
     residuals_m: Floats
     std_m: Floats
-    weighed: float
+    unlikely: float
     freedom: float
     pair_std_m: float
     curve_std_m: float
     settled: bool
+    chance: Floats
+    open_m2: Floats
 
     def information(self, *, guess: bool = False) -> Floats:
         """Return the information (unknowns, unknowns), rigid motions held; with the guess of delays, or without."""
-        return information_at(self.network, self.x, self.std_m, self.curve_std_m, guess=guess)
+        found = information_at(self.network, self.x, self.std_m, self.curve_std_m, guess=guess)
+        # Of the sum of two covariances, the first of which may be infinite.
+        wider = np.linalg.solve(np.eye(len(found)) + found @ self.open_m2, found)
+        return np.asarray((wider + wider.T) / 2)
 
     def covariance(self) -> Floats:
         """Return the covariance (unknowns, unknowns), with the guess of delays, so that there is always one."""
-        return np.asarray(np.linalg.inv(self.information(guess=True)), dtype=np.float64)
+        found = information_at(self.network, self.x, self.std_m, self.curve_std_m, guess=True)
+        return np.asarray(np.linalg.inv(found) + self.open_m2, dtype=np.float64)
 
 
 def information_at(network: Network, x: Floats, std_m: Floats, curve_std_m: float, *, guess: bool = False) -> Floats:
@@ -80,10 +92,13 @@ def settle(network: Network, x: Floats, std_m: Floats, curve_std_m: float) -> tu
         return float(scaled @ scaled + away @ prior @ away), scaled
 
     value, scaled = cost(x)
+    # Rigid motions change nothing: without this each step would drift along them.
+    motions = network.motions(x)
+    held = motions.T @ motions / float(np.mean(std_m)) ** 2
     damping = 1e-3
     for _ in range(MOST_STEPS):
         rows = network.jacobian(x) / std_m[:, None]
-        matrix = rows.T @ rows + prior
+        matrix = rows.T @ rows + prior + held
         slope = rows.T @ scaled - prior @ (x - centre)
         while damping < 1e12:
             step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), slope)
@@ -96,17 +111,39 @@ def settle(network: Network, x: Floats, std_m: Floats, curve_std_m: float) -> tu
         gained = value - tried
         x, value, scaled = x + step, tried, tried_scaled
         damping = max(damping / 8, 1e-9)
-        if gained < 1e-7 * max(value, 1.0) and np.abs(step).max() < 1e-6:
+        if gained < SETTLED * max(value, 1.0):
             return x, value, True
     return x, value, False
 
 
-def adjust(network: Network, x: Floats, *, pair_std_m: float | None = None, rounds: int = ROUNDS) -> Adjusted:
-    """Return the best unknowns from a start, with the spreads estimated along; `pair_std_m` is known where given."""
-    pair, curve = pair_std_m or PAIR_STD_M, CURVE_STD_M
-    for _ in range(rounds):
+def adjust(network: Network, x: Floats, *, pair_std_m: float | None = None, careful: bool = False) -> Adjusted:
+    """Return the best unknowns from a start, with the spreads and the reflected means estimated along.
+
+    `pair_std_m` is known where given. A `careful` one begins with all means straight and large errors of pairs, too,
+    and takes what is likelier.
+    """
+    found = _alternated(network, x, pair_std_m, first_spread=False)
+    if careful:
+        other = _alternated(network.marked(np.zeros_like(network.reflected)), x, pair_std_m, first_spread=True)
+        found = min(found, other, key=lambda one: one.unlikely)
+    return found
+
+
+def _alternated(network: Network, x: Floats, known: float | None, *, first_spread: bool) -> Adjusted:
+    """Return what comes of settling, of searching for reflections, and of estimating spreads, in turns."""
+    pair, curve = known or PAIR_STD_M, CURVE_STD_M
+    if first_spread:
         x, _, _ = settle(network, x, network.std_m(pair), curve)
-        pair, curve = _spreads(network, x, pair, curve, pair_std_m)
+        pair, curve = _spreads(network, x, pair, curve, known)
+    for _ in range(ROUNDS):
+        x, _, _ = settle(network, x, network.std_m(pair), curve)
+        marks = searched(network, x, network.std_m(pair), curve)
+        before = pair, network.reflected
+        network = network.marked(marks)
+        x, _, _ = settle(network, x, network.std_m(pair), curve)
+        pair, curve = _spreads(network, x, pair, curve, known)
+        if abs(pair - before[0]) < 0.02 * pair and np.array_equal(marks, before[1]):
+            break
     std = network.std_m(pair)
     x, value, settled = settle(network, x, std, curve)
     return Adjusted(
@@ -114,12 +151,58 @@ def adjust(network: Network, x: Floats, *, pair_std_m: float | None = None, roun
         x=x,
         residuals_m=network.residuals(x),
         std_m=std,
-        weighed=value,
+        unlikely=unlikely_at(network, x, std, curve, value) + _unlikely_spreads(pair, curve),
         freedom=freedom(network, x, std, curve),
         pair_std_m=pair,
         curve_std_m=curve,
         settled=settled,
+        chance=network.reflected.astype(float),
+        open_m2=np.zeros((network.size,) * 2),
     )
+
+
+def unlikely_at(network: Network, x: Floats, std_m: Floats, curve_std_m: float, weighed: float) -> float:
+    """Return -2 log likelihood where a search settled with so many weighed squares (Laplace), whatever the unknowns."""
+    rows = network.jacobian(x) / std_m[:, None]
+    prior = network.prior(curve_std_m)
+    known = float(np.linalg.slogdet(rows.T @ rows + prior)[1]) - float(np.linalg.slogdet(prior)[1])
+    marks = unlikely(int(network.reflected.sum()), len(network.means))
+    return weighed + known + 2 * float(np.log(std_m).sum()) + marks
+
+
+def averaged(found: Adjusted) -> Adjusted:
+    """Return the mean over choices of reflected means that are nearly as likely, with the covariance that they add."""
+    network, x, std = found.network, found.x, found.std_m
+    every = choices(network, x, std, found.curve_std_m)
+    held = network.motions(x)
+    jacobian, prior = network.jacobian(x), network.prior(found.curve_std_m)
+    deviation = network.residuals(x) + DETOUR_M * _padded(network.reflected, len(std))
+    steps, spreads = [], []
+    for marks in every.marks:
+        other = network.marked(marks).std_m(found.pair_std_m)
+        rows = jacobian / other[:, None]
+        spread = np.linalg.inv(rows.T @ rows + prior + held.T @ held)
+        away = (deviation - DETOUR_M * _padded(marks, len(std))) / other
+        steps.append(spread @ (rows.T @ away - prior @ (x - network.centre())))
+        spreads.append(spread)
+    mean = every.weight @ np.array(steps)
+    around = np.array(steps) - mean
+    wider = np.einsum("k,kij->ij", every.weight, np.array(spreads)) - spreads[0] + (around.T * every.weight) @ around
+    values, vectors = np.linalg.eigh((wider + wider.T) / 2)
+    more = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    at = x + mean
+    return replace(found, x=at, residuals_m=network.residuals(at), chance=every.chance, open_m2=more)
+
+
+def _padded(marks: Bools, rows: int) -> Floats:
+    return np.pad(marks.astype(float), (0, rows - len(marks)))
+
+
+def _unlikely_spreads(pair: float, curve: float) -> float:
+    """Return -2 log of what is known of the spreads beforehand."""
+    log_pair = math.log(pair)
+    found = PAIR_WORTH * (2 * log_pair + math.exp(2 * (math.log(PAIR_STD_M) - log_pair)))
+    return found + ((math.log(curve) - math.log(CURVE_STD_M)) / math.log(CURVE_FACTOR)) ** 2
 
 
 def freedom(network: Network, x: Floats, std_m: Floats, curve_std_m: float) -> float:
@@ -134,8 +217,8 @@ def freedom(network: Network, x: Floats, std_m: Floats, curve_std_m: float) -> f
 def leverages(found: Adjusted) -> Floats:
     """Return the share (n,) of each row's variance that the fit leaves: 1 less its leverage."""
     rows = found.network.jacobian(found.x) / found.std_m[:, None]
-    inverse = found.covariance()
-    return np.asarray(1 - np.einsum("ij,jk,ik->i", rows, inverse, rows))
+    information = information_at(found.network, found.x, found.std_m, found.curve_std_m, guess=True)
+    return np.asarray(1 - np.einsum("ij,ji->i", rows, np.linalg.solve(information, rows.T)))
 
 
 def _spreads(network: Network, x: Floats, pair: float, curve: float, known: float | None) -> tuple[float, float]:
@@ -157,8 +240,7 @@ def _spreads(network: Network, x: Floats, pair: float, curve: float, known: floa
     smooth = curves @ np.linalg.inv(network.power.precision) @ curves.T if network.power is not None else 0.0
 
     def unlikely(log_pair: float, log_curve: float) -> float:
-        value = PAIR_WORTH * (2 * log_pair + math.exp(2 * (math.log(PAIR_STD_M) - log_pair)))
-        value += ((log_curve - math.log(CURVE_STD_M)) / math.log(CURVE_FACTOR)) ** 2
+        value = _unlikely_spreads(math.exp(log_pair), math.exp(log_curve))
         if len(seen):
             root = np.linalg.cholesky(own + math.exp(2 * log_pair) * shared + math.exp(2 * log_curve) * smooth)
             value += 2 * float(np.log(np.diag(root)).sum()) + float(np.sum(np.linalg.solve(root, seen) ** 2))

@@ -1,11 +1,13 @@
-"""What contradicts the ranges: single pairs, known distances, shapes that are none, labels that were exchanged.
+"""What contradicts the ranges: known distances, shapes that are none, labels that were exchanged.
 
-Each doubt is a hypothesis with a few unknowns more. What it explains of the weighed squares, over what it leaves, has
-Fisher's F where nothing is wrong; the likeliest hypothesis is taken first, because a wrong tape makes pairs look wrong.
+Each doubt is a hypothesis whose likelihood, whatever its unknowns are, is held against that of the survey as it was
+said to be, each with the reflections that fit it best: a few reflected pairs can look like a string that is not
+straight. The likeliest doubt is taken first, because a wrong tape makes other things look wrong, too.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -13,13 +15,25 @@ from typing import Final
 
 import numpy as np
 
-from calib.surveys.adjustment import PAIR_WORTH, Adjusted, adjust, leverages, settle
+from calib.surveys.adjustment import Adjusted, adjust, leverages
+from calib.surveys.minima import alone, found_positions, settled_marks
 from calib.surveys.network import Network, Place
-from calib.surveys.starts import first_start, scaled
+from calib.surveys.starts import first_start
 from uwblink.arrays import Floats
 
-ALARM: Final = 1e-3
-"""Probability of a false alarm of all hypotheses of one survey together."""
+SURE: Final = 2 * math.log(100.0)
+"""By how much -2 log likelihood must fall for a doubt to be taken: a hundred to one."""
+
+WORTH_A_LOOK: Final = 1.0
+"""The same for one arrangement alone, with delays as they are, if there are more than a few: less is no doubt."""
+
+FEW: Final = 3
+ODD: Final = 3.0
+"""Standard deviations by which something known must be off for labels to be looked at."""
+
+WRONG_TAPE_M: Final = 0.5
+BESIDE_M: Final = 0.5
+"""How wrong a tape is if it is, and how far boards stand beside a line that is none, before any data."""
 
 LEAST_SHARE: Final = 0.02
 """Share of its variance that the fit must leave of a row before it can be doubted."""
@@ -29,63 +43,40 @@ LIFT_M: Final = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What may be wrong: its kind, in words, how many unknowns more it has, the network without it, and a start."""
+    """What may be wrong: in words, the network without it, a start, and by how much more unlikely it is beforehand.
 
-    kind: str
+    That brings what is known of its size (-2 log), where the network without it knows nothing of it.
+    """
+
     text: str
-    unknowns: int
     instead: Network
     start: Floats
+    beforehand: float = 0.0
 
 
-def worst(found: Adjusted, names: tuple[str, ...], pair_std_m: float | None = None) -> Doubt | None:
+def worst(found: Adjusted, names: tuple[str, ...], pair_std_m: float | None = None) -> tuple[Doubt, Adjusted] | None:
     """Return the likeliest doubt that chance does not explain; `names` say what each known distance is called."""
-    every = [*_pairs(found), *_distances(found, names), *_shapes(found)]
-    rated = [(chance(found, d.instead, d.start, d.unknowns, pair_std_m), k) for k, d in enumerate(every)]
-    if min(rated, default=(1.0, 0))[0] < ALARM:
-        # Exchanged labels make something else look wrong, too; there are many pairs of labels to look at.
-        more = list(_exchanged(found))
-        rated += [
-            (chance(found, d.instead, d.start, d.unknowns, pair_std_m), len(every) + k) for k, d in enumerate(more)
-        ]
-        every += more
-    least, k = min(rated, default=(1.0, 0))
-    # Of the pairs, which are many, the three oddest stand for all.
-    return every[k] if least * (len(every) + len(found.network.means)) < ALARM else None
+    every = [*_distances(found, names), *_shapes(found)]
+    if _odd(found):
+        every += _exchanged(found)
+    if not every:
+        return None
+    rated = [_rated(found, doubt, pair_std_m) for doubt in every]
+    k = max(range(len(every)), key=lambda n: rated[n][0])
+    return (every[k], rated[k][1]) if rated[k][0] > SURE else None
 
 
-def chance(found: Adjusted, instead: Network, start: Floats, unknowns: int, pair_std_m: float | None) -> float:
-    """Return how probable it is by chance that so many more unknowns explain so much of the weighed squares.
-
-    The errors of pairs are weighed as they are without what is doubted: with it they would seem large enough for it.
-    """
-    from scipy.special import fdtrc
-
-    without = adjust(instead, start, pair_std_m=pair_std_m, rounds=2)
-    left = without.freedom + PAIR_WORTH
-    if left < 1:
-        return 1.0
-    std = found.network.std_m(without.pair_std_m)
-    _, weighed, _ = settle(found.network, found.x, std, without.curve_std_m)
-    explained = max(weighed - without.weighed, 0.0)
-    return float(fdtrc(unknowns, left, (explained / unknowns) / ((without.weighed + PAIR_WORTH) / left)))
+def _odd(found: Adjusted) -> bool:
+    """Return whether labels are worth a look: what is known is off, or something is where it is known."""
+    known, here = found.network.known, len(found.network.means)
+    off = np.abs(found.residuals_m[here:]) > ODD * found.std_m[here:] * np.sqrt(leverages(found)[here:])
+    return bool(off.any() or (len(known.at) + len(known.ends) and found.network.reflected.any()))
 
 
-def _standardized(found: Adjusted) -> tuple[Floats, Floats]:
-    """Return the squares (n,) that each row would take along if it were left out, and which rows are controlled."""
-    left = leverages(found)
-    squares = (found.residuals_m / found.std_m) ** 2 / np.maximum(left, LEAST_SHARE)
-    return np.where(left > LEAST_SHARE, squares, 0.0), left
-
-
-def _pairs(found: Adjusted) -> Iterator[Doubt]:
-    squares, left = _standardized(found)
-    m, network = found.network.means, found.network
-    for k in np.argsort(-squares[: len(m)])[:3].tolist():
-        off = found.residuals_m[k] / max(left[k], LEAST_SHARE)
-        where = network.places[int(m.arrangement[k])].name
-        text = f"{where}: the range of {m.first[k]} and {m.second[k]} is {_cm(off)} off what all others say; left out"
-        yield Doubt("pair", text, 1, network.without([k]), found.x)
+def _rated(found: Adjusted, doubt: Doubt, pair_std_m: float | None) -> tuple[float, Adjusted]:
+    """Return by how much -2 log likelihood falls if a doubt is true, and the adjustment then."""
+    without = adjust(doubt.instead, doubt.start, pair_std_m=pair_std_m)
+    return found.unlikely - without.unlikely - doubt.beforehand, without
 
 
 def _distances(found: Adjusted, names: tuple[str, ...]) -> Iterator[Doubt]:
@@ -104,49 +95,58 @@ def _distances(found: Adjusted, names: tuple[str, ...]) -> Iterator[Doubt]:
             distance_of=known.distance_of[keep],
         )
         text = f"{names[statement]} is {_cm(off)} off what the ranges say; measure it again or leave it out"
-        yield Doubt("distance", text, len(rows), replace(network, known=less), found.x)
+        # The rows go, and with them what they say of likelihood: as if the tape were wrong by some half a metre.
+        std = np.append(known.distance_std_m[rows][1:], WRONG_TAPE_M)
+        beforehand = 2 * float(np.log(std).sum()) + (off / WRONG_TAPE_M) ** 2
+        yield Doubt(text, replace(network, known=less), found.x, beforehand)
 
 
 def _shapes(found: Adjusted) -> Iterator[Doubt]:
     network = found.network
     for k, place in enumerate(network.places):
-        more = len(place.tags) - 1 - place.dimensions
-        if place.dimensions == 3 or more < 1 or found.freedom + PAIR_WORTH - more < 1:
+        if place.dimensions == 3 or len(place.tags) < place.dimensions + 2:
+            continue
+        single, gain = _beside(found, k)
+        if gain < WORTH_A_LOOK and len(network.places) > FEW:
             continue
         places = list(network.places)
-        places[k] = Place(place.name, place.dimensions + 1, place.tags)
+        places[k] = single.network.places[0]
         freed = replace(network, places=tuple(places))
-        x = _lifted(found, freed, k)
-        std = freed.std_m(found.pair_std_m)
-        x, _, _ = settle(freed, x, std, found.curve_std_m)
-        away = np.abs(freed.positions(x)[:, place.dimensions][[a == k for a, _ in freed.points]])
+        x = np.concatenate([np.zeros(freed.coordinates), found.x[network.coordinates :]])
+        points = network.positions(found.x)
+        points[[n for n, (a, _) in enumerate(network.points) if a == k]] = single.network.positions(single.x)
+        x = freed.with_positions(x, points)
+        away = single.network.positions(single.x)[:, place.dimensions]
         shape, who = ("line", "straight") if place.dimensions == 1 else ("plane", "plane")
         odd = place.tags[int(np.argmax(np.abs(away - np.median(away))))]
         text = (
             f"{place.name} is said to be a {shape} and is none: its ranges fit if boards, {odd} first of all, stand up "
             f"to {_cm(float(np.ptp(away)), sign=False)} beside it; put them {who}, or do not say so"
         )
-        yield Doubt("shape", text, more, freed, x)
+        yield Doubt(text, freed, x)
 
 
-def _lifted(found: Adjusted, freed: Network, arrangement: int) -> Floats:
-    """Return unknowns of a network with one dimension more, in which that arrangement begins anew."""
-    network = found.network
-    x = np.concatenate([np.zeros(freed.coordinates), found.x[network.coordinates :]])
-    place = network.positions(found.x)
-    here = [k for k, (a, _) in enumerate(network.points) if a == arrangement]
-    apart = np.linalg.norm(place[here][:, None] - place[here], axis=2)
-    number = {point: k for k, point in enumerate(here)}
-    measured = network.means.range_m - network.linear @ found.x
-    for (i, j), length in zip(network.ends.tolist(), measured.tolist(), strict=True):
-        if i in number and j in number:
-            apart[number[i], number[j]] = apart[number[j], number[i]] = max(length, 0.01)
-    place[here] = 0.0
-    points = scaled(apart, freed.places[arrangement].dimensions)
+@dataclass(frozen=True, slots=True)
+class _Single:
+    network: Network
+    x: Floats
+
+
+def _beside(found: Adjusted, arrangement: int) -> tuple[_Single, float]:
+    """Return an arrangement alone in one dimension more, delays as they are, and by how much that is likelier."""
+    flat = alone(found, arrangement)
+    place = flat.places[0]
+    here = settled_marks(flat, found, flat.with_positions(flat.centre(), found_positions(found, arrangement)))[0]
+    freed = replace(flat, places=(Place(place.name, place.dimensions + 1, place.tags, BESIDE_M),))
+    freed = freed.marked(np.zeros_like(freed.reflected))
+    points = first_start(freed, np.array([flat.fixed_m[tag] for tag in flat.tags]))
+    place_m = freed.positions(points)
+    last = place.dimensions
     # Where scaling finds nothing beside the line, a derivative there would be zero.
-    points[:, -1] += LIFT_M * np.where(np.arange(len(here)) % 2, 1.0, -1.0) * (np.ptp(points[:, -1]) < LIFT_M)
-    place[np.array(here), : points.shape[1]] = points
-    return freed.with_positions(x, place)
+    if np.ptp(place_m[:, last]) < LIFT_M:
+        place_m[:, last] += LIFT_M * np.where(np.arange(len(place_m)) % 2, 1.0, -1.0)
+    there, x, marked = settled_marks(freed, found, freed.with_positions(points, place_m))
+    return _Single(marked, x), here - there
 
 
 def _exchanged(found: Adjusted) -> Iterator[Doubt]:
@@ -160,7 +160,7 @@ def _exchanged(found: Adjusted) -> Iterator[Doubt]:
         changed = replace(network, known=instead)
         start = first_start(changed, found.x[network.delay_columns])
         text = f"what is known fits if {one} and {other} are exchanged: look at the labels of these two boards"
-        yield Doubt("labels", text, 1, changed, start)
+        yield Doubt(text, changed, start)
 
 
 def _cm(length_m: float, *, sign: bool = True) -> str:

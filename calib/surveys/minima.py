@@ -7,8 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.surveys.adjustment import Adjusted, adjust, settle
+from calib.surveys.adjustment import Adjusted, adjust, settle, unlikely_at
 from calib.surveys.network import Known, Network
+from calib.surveys.reflections import searched
 from calib.surveys.starts import first_start, other_starts
 from uwblink.arrays import Bools, Floats
 
@@ -18,14 +19,16 @@ SHAKEN: Final = 4
 APART_M: Final = 0.03
 """How far a board must be from where it was for a solution to be another one."""
 
+MOST_MOVES: Final = 6
+BETTER: Final = 1e-3
 WORTH_A_LOOK: Final = 60.0
 AMBIGUOUS: Final = 9.0
-"""Weighed squares by which a second solution may be worse and still be as good: three standard deviations."""
+"""By how much a second solution may be worse and still be as good: three standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class SecondBest:
-    """The best other solution: in which arrangement it differs, whose places, and by how many weighed squares worse."""
+    """The best other solution: in which arrangement it differs, whose places, how much worse its -2 log likelihood."""
 
     arrangement: str
     tags: tuple[int, ...]
@@ -39,52 +42,88 @@ class SecondBest:
 
 def best(network: Network, *, pair_std_m: float | None) -> tuple[Adjusted, SecondBest | None]:
     """Return the best solution that any start leads to, and the second-best."""
-    found = adjust(network, first_start(network), pair_std_m=pair_std_m)
+    found = adjust(network, first_start(network), pair_std_m=pair_std_m, careful=True)
     # Once more with the delays that came out: the first guess of places was made without any.
     again = adjust(network, first_start(network, found.x[network.delay_columns]), pair_std_m=pair_std_m)
-    found = min(found, again, key=lambda one: (one.weighed, 0))
-    for _ in range(3):
+    found = min(found, again, key=lambda one: one.unlikely)
+    worse: list[tuple[float, Who]] = []
+    for _ in range(MOST_MOVES):
         others = [other for k in range(len(network.places)) for other in _others(found, k)]
-        better = [x for value, x, _ in others if value < found.weighed - 1e-3]
+        here = settled(found.network, found, found.x)[0]
+        worse = [(one.unlikely - here, one.who) for one in others if one.unlikely >= here - BETTER]
+        better = [one for one in others if one.unlikely < here - BETTER]
         if not better:
             break
-        start = min(others, key=lambda row: row[0])[1]
-        found = adjust(network, start, pair_std_m=pair_std_m)
-    worse = [(value - found.weighed, where) for value, _, where in others if value >= found.weighed - 1e-3]
+        start = min(better, key=lambda one: one.unlikely)
+        moved = adjust(found.network.marked(start.marks), start.x, pair_std_m=pair_std_m)
+        if moved.unlikely > found.unlikely - BETTER:
+            break
+        found = moved
     if not worse:
         return found, None
     gap, (name, tags) = min(worse)
     return found, SecondBest(name, tags, max(gap, 0.0))
 
 
-Other = tuple[float, Floats, tuple[str, tuple[int, ...]]]
+Who = tuple[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Other:
+    """Another solution that differs in one arrangement: its unknowns, which means are reflected, who is elsewhere."""
+
+    unlikely: float
+    x: Floats
+    marks: Bools
+    who: Who
+
+
+def settled(network: Network, found: Adjusted, x: Floats) -> tuple[float, Floats]:
+    """Return -2 log likelihood with the spreads that were found, and the unknowns, from a start."""
+    std = network.std_m(found.pair_std_m)
+    x, value, _ = settle(network, x, std, found.curve_std_m)
+    return unlikely_at(network, x, std, found.curve_std_m, value), x
+
+
+def settled_marks(network: Network, found: Adjusted, x: Floats) -> tuple[float, Floats, Network]:
+    """Return the same with what is likeliest reflected there."""
+    for _ in range(2):
+        value, x = settled(network, found, x)
+        marks = searched(network, x, network.std_m(found.pair_std_m), found.curve_std_m)
+        if np.array_equal(marks, network.reflected):
+            break
+        network = network.marked(marks)
+        value, x = settled(network, found, x)
+    return value, x, network
 
 
 def _others(found: Adjusted, arrangement: int) -> list[Other]:
-    """Return other solutions that differ in one arrangement: weighed squares, unknowns, and who is elsewhere."""
+    """Return other solutions that differ in one arrangement."""
     network = found.network
-    alone = _alone(found, arrangement)
-    if not len(alone.means):
+    single = alone(found, arrangement)
+    mine = network.means.arrangement == arrangement
+    if not len(single.means):
         return []
-    std = alone.std_m(found.pair_std_m)
-    start = alone.with_positions(alone.centre(), network.positions(found.x)[_rows(network, arrangement)])
-    _, here, _ = settle(alone, start, std, found.curve_std_m)
+    start = single.with_positions(single.centre(), network.positions(found.x)[_rows(network, arrangement)])
+    here, _ = settled(single, found, start)
     rows: list[Other] = []
-    seen: list[Floats] = [_signature(alone, start)]
-    for other in other_starts(alone, start, 0, SHAKEN):
-        x, value, _ = settle(alone, other, std, found.curve_std_m)
-        mark = _signature(alone, x)
+    seen: list[Floats] = [_signature(single, start)]
+    for other in other_starts(single, start, 0, SHAKEN):
+        value, x, marked = settled_marks(single.marked(np.zeros_like(single.reflected)), found, other)
+        mark = _signature(single, x)
         if value > here + WORTH_A_LOOK or any(_same(mark, known) for known in seen):
             continue
         seen.append(mark)
         place = network.positions(found.x)
-        place[_rows(network, arrangement)] = alone.positions(x)
-        whole, cost, _ = settle(network, network.with_positions(found.x, place), found.std_m, found.curve_std_m)
+        place[_rows(network, arrangement)] = single.positions(x)
+        marks = network.reflected.copy()
+        marks[mine] = marked.reflected
+        cost, whole, changed = settled_marks(network.marked(marks), found, network.with_positions(found.x, place))
         there = network.positions(whole)[_rows(network, arrangement)]
-        mark = _signature(alone, alone.with_positions(x, there))
+        mark = _signature(single, single.with_positions(x, there))
         if not _same(mark, seen[0]):
-            who = tuple(np.array(alone.places[0].tags)[_elsewhere(mark, seen[0])].tolist())
-            rows.append((cost, whole, (alone.places[0].name, who)))
+            who = tuple(np.array(single.places[0].tags)[_elsewhere(mark, seen[0])].tolist())
+            rows.append(Other(cost, whole, changed.reflected, (single.places[0].name, who)))
     return rows
 
 
@@ -92,7 +131,12 @@ def _rows(network: Network, arrangement: int) -> list[int]:
     return [k for k, (a, _) in enumerate(network.points) if a == arrangement]
 
 
-def _alone(found: Adjusted, arrangement: int) -> Network:
+def found_positions(found: Adjusted, arrangement: int) -> Floats:
+    """Return where the boards of an arrangement were found (boards, 3)."""
+    return found.network.positions(found.x)[_rows(found.network, arrangement)]
+
+
+def alone(found: Adjusted, arrangement: int) -> Network:
     """Return one arrangement as a network of its own, with delays and curve as they were found."""
     network, rows = found.network, found.network.means.arrangement == arrangement
     means = network.means[rows]
@@ -119,6 +163,7 @@ def _alone(found: Adjusted, arrangement: int) -> Network:
         known=known,
         fixed_m={tag: delays[tag] for tag in tags},
         power=None,
+        reflected=network.reflected[rows],
     )
 
 

@@ -7,7 +7,6 @@ variance of its own, which is estimated (`calib.surveys.adjustment`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -23,15 +22,22 @@ GUESS_M: Final = 0.45
 """What a delay is without any data, as a standard deviation: 1.5 ns."""
 
 FAR_M: Final = 1e3
+DETOUR_M: Final = 0.3
+DETOUR_STD_M: Final = 0.25
+"""How much longer a reflected way is, before any data: two in three detours within these."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """An arrangement of boards: its name, in how many dimensions they may stand, and who they are."""
+    """An arrangement of boards: its name, in how many dimensions they may stand, and who they are.
+
+    `beside_m` is how far they stand out into the last of these dimensions, as a standard deviation.
+    """
 
     name: str
     dimensions: int
     tags: tuple[int, ...]
+    beside_m: float = FAR_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +71,8 @@ class Known:
 class Network:
     """Means of pairs, where they belong, and what is known beside them.
 
-    The unknowns are coordinates, then delays in metres, then coefficients of the curve over power.
+    The unknowns are coordinates, then delays in metres, then coefficients of the curve over power. `reflected` (n,) are
+    means that a detour lengthens, by what is known of detours beforehand.
     """
 
     means: PairMeans
@@ -74,6 +81,7 @@ class Network:
     known: Known
     fixed_m: dict[int, float]
     power: PowerModel | None
+    reflected: Bools
 
     @cached_property
     def points(self) -> list[tuple[int, int]]:
@@ -146,7 +154,7 @@ class Network:
         """Return what was measured less what the unknowns say: means, known distances, known coordinates."""
         place = self.positions(x)
         k = self.known
-        means = self.means.range_m - _lengths(place, self.ends) - self.linear @ x
+        means = self.means.range_m - _lengths(place, self.ends) - self.linear @ x - DETOUR_M * self.reflected
         return np.concatenate(
             [means, k.distance_m - _lengths(place, k.ends), (k.position_m - place[k.at])[self._position_free]]
         )
@@ -164,7 +172,8 @@ class Network:
         """Return the standard deviation of each row, with that of a pair's constant error."""
         k = self.known
         each = np.repeat(k.position_std_m[:, None], 3, axis=1)[self._position_free]
-        return np.concatenate([np.hypot(self.means.std_m, pair_std_m), k.distance_std_m, each])
+        means = np.sqrt(self.means.std_m**2 + pair_std_m**2 + DETOUR_STD_M**2 * self.reflected)
+        return np.concatenate([means, k.distance_std_m, each])
 
     def prior(self, curve_std_m: float) -> Floats:
         """Return what is known of the unknowns before any data (unknowns, unknowns), as information.
@@ -174,6 +183,8 @@ class Network:
         """
         found = np.zeros((self.size, self.size))
         diagonal = np.full(self.size, FAR_M**-2)
+        for (k, _), columns in zip(self.points, self.columns.tolist(), strict=True):
+            diagonal[columns[self.places[k].dimensions - 1]] = self.places[k].beside_m ** -2
         fixed = [tag in self.fixed_m for tag in self.tags]
         diagonal[self.delay_columns] = np.where(fixed, 1e-5**-2, GUESS_M**-2)
         found[np.diag_indices(self.size)] = diagonal
@@ -206,12 +217,9 @@ class Network:
         each = np.repeat(owner[k.at][:, None], 3, axis=1)[self._position_free]
         return np.asarray(np.concatenate([self.means.arrangement, owner[k.ends[:, 0]], each]) == arrangement)
 
-    def without(self, rows: Sequence[int]) -> Network:
-        """Return the network without some of its means."""
-        keep = np.ones(len(self.means), dtype=bool)
-        keep[list(rows)] = False
-        power = None if self.power is None else self.power.only(keep)
-        return replace(self, means=self.means[keep], power=power)
+    def marked(self, reflected: Bools) -> Network:
+        """Return the network with other means (n,) taken to be reflected."""
+        return replace(self, reflected=reflected)
 
     @cached_property
     def _position_free(self) -> Bools:

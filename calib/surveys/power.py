@@ -7,13 +7,13 @@ cubic splines over lifted power.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, basis
-from uwblink.arrays import Bools, Floats
+from uwblink.arrays import Floats
 
 SEGMENTS: Final = 4
 BEND_DB: Final = 8.0
@@ -35,10 +35,6 @@ class PowerModel:
     def size(self) -> int:
         """How many coefficients there are."""
         return int(self.design.shape[1])
-
-    def only(self, rows: Bools) -> PowerModel:
-        """Return the model of some rows."""
-        return replace(self, design=self.design[rows])
 
 
 def in_dbm(lifted: Floats) -> Floats:

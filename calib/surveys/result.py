@@ -59,13 +59,37 @@ class SurveyedArrangement:
         return {"name": self.name, "known": self.known, "frame": self.frame, "boards": boards}
 
 
+@dataclass(frozen=True, slots=True)
+class ReflectedPair:
+    """A pair that is believed to be reflected in an arrangement: by how much its range is off, and how probable it is.
+
+    `chance` below a half is for one that may be reflected instead of another.
+    """
+
+    arrangement: str
+    first: int
+    second: int
+    longer_m: float
+    chance: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as JSON takes it."""
+        return {
+            "arrangement": self.arrangement,
+            "between": [self.first, self.second],
+            "longer_m": round(self.longer_m, 4),
+            "chance": round(self.chance, 3),
+        }
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SurveyResult:
     """A calibration from boards that stood still, and where they stood.
 
     `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` says what
     of the delays (in ns) is determined; `findings` are contradictions between the ranges and what was said to be known;
-    `warnings` what a user should know. `second_best` is the best other solution.
+    `warnings` what a user should know. `second_best` is the best other solution, `reflected` are
+    pairs that are, or may be, reflected.
 
     >>> import calib
     >>> result = calib.survey(calib.sample_arrangements(), known="line")
@@ -80,6 +104,7 @@ class SurveyResult:
     second_best: SecondBest | None
     findings: tuple[str, ...]
     warnings: tuple[str, ...]
+    reflected: tuple[ReflectedPair, ...] = ()
 
     def __repr__(self) -> str:
         """Return the calibration as a table, below what it rests on, above the warnings."""

@@ -1,0 +1,109 @@
+"""Reflected pairs: what a search thinks of them against likelihoods written out, and planted ones."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.special import betaln
+
+import calib
+from benchmarks.standing import standing_boards
+from calib.surveys.assembling import assembled
+from calib.surveys.gathering import gather
+from calib.surveys.knowledge import Knowledge
+from calib.surveys.reflections import choices, searched
+from calib.surveys.starts import first_start
+
+PAIR_M = 0.02
+
+
+def network_of(world, shape="line"):
+    knowledge = Knowledge(shape=shape)
+    return assembled(gather(world.ranges, knowledge), knowledge, {}, delays_only=True)[0]
+
+
+@pytest.fixture(scope="module")
+def linear():
+    """A network of three arrangements on a line, unknowns about which it is linear, and what is known of its rows."""
+    network = network_of(standing_boards(11, boards=4, arrangements=3, reflected=0.12))
+    x = first_start(network)
+    rows = len(network.means)
+    jacobian = network.jacobian(x)
+    spread = jacobian @ np.linalg.inv(network.prior(0.03)) @ jacobian.T
+    seen = network.residuals(x) + jacobian @ (x - network.centre())
+
+    def unlikely(marks):
+        marks = np.array(marks, dtype=float)
+        own = network.means.std_m**2 + PAIR_M**2 + 0.25**2 * marks
+        count = marks.sum()
+        prior = betaln(1 + count, 30 + rows - count) - betaln(1, 30)
+        covariance, away = np.diag(own) + spread, seen - 0.3 * marks
+        return np.linalg.slogdet(covariance)[1] + away @ np.linalg.solve(covariance, away) - 2 * prior
+
+    return network, x, unlikely
+
+
+def test_weights_are_those_of_the_likelihood_written_out(linear):
+    network, x, unlikely = linear
+    found = choices(network, x, network.std_m(PAIR_M), 0.03)
+    assert len(found.weight) > 3
+    value = np.array([unlikely(marks) for marks in found.marks])
+    weight = np.exp(-0.5 * (value - value.min()))
+    # The covariance written out has numbers from 1e-4 to 1e6.
+    assert found.weight == pytest.approx(weight / weight.sum(), rel=5e-3)
+
+
+def test_the_search_ends_where_no_change_of_two_rows_is_likelier(linear):
+    network, x, unlikely = linear
+    marks = searched(network, x, network.std_m(PAIR_M), 0.03)
+    assert marks.any()
+    here = unlikely(marks)
+    for rows in [*combinations(range(len(marks)), 1), *combinations(range(len(marks)), 2)]:
+        other = marks.copy()
+        other[list(rows)] ^= True
+        assert unlikely(other) > here - 1e-3
+
+
+def reflected(world, arrangement, first, second, longer_m):
+    """Ranges of a world in which one pair of an arrangement is longer."""
+    r = world.ranges
+    there = (r.time_ns >= 70e9 * arrangement) & (r.time_ns < 70e9 * (arrangement + 1) - 5e9)
+    ends = np.sort(np.column_stack([r.initiator, r.target]), axis=1)
+    hit = there & (ends == sorted([first, second])).all(axis=1)
+    assert hit.sum() == 60
+    return longer_m * hit
+
+
+def test_planted_reflections_are_named_and_delays_are_as_good_as_without():
+    world = standing_boards(21, boards=5, arrangements=7)
+    planted = [(0, 1, 3, 0.35), (2, 2, 5, 0.2), (3, 1, 4, 0.5), (3, 2, 3, 0.25), (6, 4, 5, 0.3)]
+    longer = sum(reflected(world, *one) for one in planted)
+    result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")
+    clean = calib.survey(world.ranges, known="line")
+    named = {(int(one.arrangement) - 1, one.first, one.second): one for one in result.reflected if one.chance > 0.5}
+    assert set(named) == {one[:3] for one in planted}
+    for *where, much in planted:
+        assert named[tuple(where)].longer_m == pytest.approx(much, abs=0.12)
+    assert result.findings == ()
+    assert not any(one.chance > 0.5 for one in clean.reflected)
+    for tag, delay in world.delays_ns.items():
+        assert abs(result.calibration.delays_ns[tag] - delay) < 3 * result.calibration.delays_std_ns[tag]
+        # 5 of 70 rows count no longer: a little wider, and as near.
+        assert result.calibration.delays_std_ns[tag] < 1.5 * clean.calibration.delays_std_ns[tag]
+        assert abs(result.calibration.delays_ns[tag] - clean.calibration.delays_ns[tag]) < 0.08
+    assert len(result.calibration.provenance["reflected"]) == len(result.reflected)
+
+
+def test_what_cannot_be_told_is_said_and_widens():
+    world = standing_boards(5, boards=3, arrangements=6, pair_error_m=0.01)
+    longer = reflected(world, 1, 1, 2, 0.4)
+    result = calib.survey(replace(world.ranges, raw_m=world.ranges.raw_m + longer), known="line")
+    # Of three boards on a line, any of the three ranges may be the wrong one, longer or too short.
+    who = [(one.first, one.second) for one in result.reflected if one.arrangement == "2"]
+    assert len(who) > 1
+    assert any(text.startswith("may be reflected, too: ") for text in result.warnings)
+    clean = calib.survey(world.ranges, known="line").calibration
+    for tag, delay in result.calibration.delays_ns.items():
+        assert abs(delay - world.delays_ns[tag]) < 3 * result.calibration.delays_std_ns[tag]
+        assert result.calibration.delays_std_ns[tag] > clean.delays_std_ns[tag]
