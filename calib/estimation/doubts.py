@@ -15,6 +15,7 @@ from calib.estimation.misfit import (
     SMALLEST_M,
     SMALLEST_NS,
     Finding,
+    Judgement,
     everywhere,
     examine,
     families,
@@ -56,10 +57,9 @@ class Doubts:
 
 def doubts(problem: Problem, found: Solved) -> Doubts:
     """Hold a fit against its residuals, and widen the delays' covariance by what does not fit."""
-    plain = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
     ranges = problem.ranges
     blocks, seconds = blocks_of(ranges.time_ns)
-    louder = _of_a_decibel(problem, found)
+    louder = of_a_decibel(problem, found)
     tested, kept = families(problem, louder, seconds), found.scores.design.kept
     judged = examine(
         found.scores,
@@ -71,6 +71,14 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
         tested=tested,
         shape_m=kept(_of_another_shape(problem, found)),
     )
+    covariance, sentences = weighed(problem, found, judged)
+    sentences += [*reflected(problem, found), *short(found), *_confounded(problem, found)]
+    return Doubts(covariance_ns2=covariance, sentences=sentences)
+
+
+def weighed(problem: Problem, found: Solved, judged: Judgement) -> tuple[Floats, list[str]]:
+    """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences."""
+    plain = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
     covariance = plain + judged.widening_ns2
     matter, plain = [], covariance
     for finding in judged.findings:
@@ -82,9 +90,7 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
             matter.append(finding)
     # A tag that was moved stands out in more than one span of time: once is enough.
     once = {(finding.kind, finding.names): finding for finding in reversed(matter)}
-    sentences = [told(finding) for finding in matter if once[finding.kind, finding.names] is finding]
-    sentences += [*_reflected(problem, found), *_short(found), *_confounded(problem, found)]
-    return Doubts(covariance_ns2=covariance, sentences=sentences)
+    return covariance, [told(finding) for finding in matter if once[finding.kind, finding.names] is finding]
 
 
 def _moved(finding: Finding, covariance: Floats) -> float:
@@ -101,7 +107,7 @@ def _moved(finding: Finding, covariance: Floats) -> float:
     return moved
 
 
-def _of_a_decibel(problem: Problem, found: Solved) -> Floats:
+def of_a_decibel(problem: Problem, found: Solved) -> Floats:
     """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
     if not problem.unknowns.curve:
         return np.zeros(len(problem.error))
@@ -118,7 +124,7 @@ def _of_another_shape(problem: Problem, found: Solved) -> Floats:
     return np.asarray(SHAPE * share[problem.pairs.number])
 
 
-def _reflected(problem: Problem, found: Solved) -> list[str]:
+def reflected(problem: Problem, found: Solved) -> list[str]:
     """Name the pairs of which hardly a range is direct, and tags most of whose are not, where that was fitted."""
     if found.mixture is None:
         return []
@@ -175,7 +181,8 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
     ]
 
 
-def _short(found: Solved) -> list[str]:
+def short(found: Solved) -> list[str]:
+    """Say where errors last so long that a recording holds few independent stretches of time."""
     lasting = found.lasting
     if lasting.stretches >= FEWEST_STRETCHES:
         return []

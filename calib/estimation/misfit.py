@@ -179,8 +179,8 @@ def examine(
     # One family at a time: each has columns of its own.
     results = [_test(family, scores, own, inverse, delays, blocks, seconds) for family in tested]
     several = sum(len(result.names) for result in results)
-    found = [finding for result in results for finding in _findings(result, several)]
-    widening += sum(_spread_of_pairs(result) for result in results if result.kind == "pair")
+    found = [finding for result in results for finding in findings(result, several)]
+    widening += sum(widening_of_pairs(result) for result in results if result.kind == "pair")
     found += list(_of_gain(found, results))
     return Judgement(findings=sorted(found, key=lambda finding: -abs(finding.deviation)), widening_ns2=widening)
 
@@ -232,7 +232,8 @@ def _test(
     whole = max(float(np.diag(square).max()), 1e-300)
     free = np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True)
     # What an alternative does must not pass for errors that last: those are judged within spans of time.
-    lasting = persistence(_spans(efficient, segments(seconds) if family.kind == "time" else SPANS), seconds, int(free))
+    spans = segments(seconds) if family.kind == "time" else SPANS
+    lasting = persistence(in_spans(efficient, spans), seconds, int(free))
     return Tested(
         kind=family.kind,
         names=family.names,
@@ -245,14 +246,14 @@ def _test(
     )
 
 
-def _spans(series: Floats, count: int) -> Floats:
+def in_spans(series: Floats, count: int) -> Floats:
     """Return slopes (blocks, k) as columns of a span of time each, less their means."""
     length = len(series) // count
     cut = series[: length * count].reshape(count, length, -1)
     return np.hstack(list(cut - cut.mean(axis=1, keepdims=True)))
 
 
-def _spread_of_pairs(result: Tested) -> Floats:
+def widening_of_pairs(result: Tested) -> Floats:
     """Return what pairs that scatter more than their slopes allow add to the delays' covariance.
 
     Offsets of pairs are taken for draws with one variance, which is estimated by the method of moments (DerSimonian and
@@ -272,7 +273,7 @@ def _spread_of_pairs(result: Tested) -> Floats:
     return np.asarray(variance * result.effects @ result.effects.T)
 
 
-def _findings(result: Tested, several: int) -> Iterator[Finding]:
+def findings(result: Tested, several: int) -> Iterator[Finding]:
     """Yield the alternatives that stand out, one after the other, each beside those already found."""
     from scipy.special import stdtrit
 

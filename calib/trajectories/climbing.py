@@ -16,13 +16,14 @@ from calib.estimation.robust import QuadraticModel, scale_of
 from calib.estimation.smoothing import reml_penalty
 from calib.spread import robust_spread
 from calib.trajectories.arrow import Factored, normal_of
+from calib.trajectories.coarseness import Coarseness, coarseness
 from calib.trajectories.known_rows import JERK_M_S3, KnownRows, known_rows, smoothness
 from calib.trajectories.likelihood import loss_of, mixture_of
 from calib.trajectories.range_losses import Cauchy, RangeLoss
 from calib.trajectories.range_rows import RangeRows, range_rows
 from calib.trajectories.scene import Scene
 from calib.trajectories.solving import minimise
-from calib.trajectories.unknowns import Columns, State, columns_of
+from calib.trajectories.unknowns import Columns, State, columns_of, refined
 from uwblink.arrays import Floats
 
 if TYPE_CHECKING:
@@ -42,7 +43,13 @@ FELT: Final = 3.0
 
 FORCES_M_S2: Final = (0.02, 5.0)
 PROBES: Final = 20
-JERKS_M_S3: Final = (0.2, 50.0)
+JERKS_M_S3: Final = (0.2, 2000.0)
+QUICK_M_S3: Final = 100.0
+"""By how much accelerations change in a second where they change too fast for the control points, to begin with."""
+
+FINEST_S: Final = 0.11
+"""Control points are not halved again below this."""
+
 ROUNDS: Final = 2
 FIRST_ROUGHNESS: Final = 1e-6
 
@@ -85,10 +92,10 @@ def climb(scene: Scene, problem: Problem, state: State, done: Callable[[float], 
     search.begin(state)
     loss = Cauchy(FIRST_SCALE_M)
     search.go(loss, 1 / (2 * FIRST_SCALE_M**2))
-    for _ in range(ROUNDS):
-        search.tune(search.expected(loss, None))
-        loss = Cauchy(WIDE * search.scale())
-        search.go(loss)
+    loss = search.robust(loss)
+    while search.coarseness(loss).shows and search.columns.places.step_s > FINEST_S:
+        search.refine()
+        loss = search.robust(loss)
     if len(scene.time_s) < FEWEST_A_PAIR * len(problem.pairs.ends):
         return search.found(loss, None)
     for _ in range(ROUNDS):
@@ -121,6 +128,27 @@ class _Search:
         count = len(self.scene.time_s)
         for penalty in self.penalties:
             self.ridge += FIRST_ROUGHNESS * count / float(np.trace(penalty)) * penalty
+
+    def robust(self, loss: Cauchy) -> Cauchy:
+        """Go to the optimum of a robust loss, as wide as the data ask for, and return it."""
+        for _ in range(ROUNDS):
+            self.tune(self.expected(loss, None))
+            loss = Cauchy(WIDE * self.scale())
+            self.go(loss)
+        return loss
+
+    def coarseness(self, loss: RangeLoss) -> Coarseness:
+        """Return how much of the bodies' motion is not in their trajectories."""
+        return coarseness(self.scene, self.columns, self.rows, self.state, loss, self.expected(loss, None))
+
+    def refine(self) -> None:
+        """Put twice as many control points, which may be followed by quick motion."""
+        finer = columns_of(self.scene, self.columns.design, self.columns.places.step_s / 2)
+        self.state, self.origin = (refined(self.columns, finer, some) for some in (self.state, self.origin))
+        self.columns, self.jerk = finer, QUICK_M_S3
+        self.rows = range_rows(self.scene, finer, self.rows.error, self.rows.design)
+        self.known = known_rows(self.scene, finer, self.origin, self.jerk)
+        self.go(Cauchy(WIDE * self.scale()))
 
     def scale(self) -> float:
         """Return the scale of a loss by residuals, from which trajectories have taken a part, metres."""

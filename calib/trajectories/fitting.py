@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Final
@@ -17,11 +17,13 @@ from calib.calibration.power_curves import lift as lift_power
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.arguments import check_choice, check_fit
 from calib.estimation.fitting import calibration_of
+from calib.estimation.limits import limits
 from calib.estimation.losses import MIXTURE
-from calib.estimation.plausibility import implausible
+from calib.estimation.plausibility import implausible, one_way
 from calib.estimation.problem import Problem, build_problem
 from calib.estimation.result import FitResult
 from calib.estimation.unknowns import Unknowns
+from calib.estimation.warnings import warnings_of
 from calib.sources import Data
 from calib.trajectories.beginning import beginning
 from calib.trajectories.climbing import Climbed, climb
@@ -108,6 +110,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
         problem, scene = _problem(scene, asked)
         begun = beginning(scene, lambda share: done(FOLLOWING * share))
         climbed = climb(begun.scene, problem, begun.state, lambda share: done(FOLLOWING + (1 - FOLLOWING) * share))
+        problem = _with_distances(problem, climbed)
         found = judged(climbed, problem, asked.reference)
         result = _result(climbed, problem, found, asked, begun.rival)
     done(1.0)
@@ -176,13 +179,16 @@ def _problem(scene: Scene, asked: _Asked) -> tuple[Problem, Scene]:
     return replace(problem, ranges=bare, error=problem.error + rows), scene.only(rows.astype(np.int64))
 
 
-def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked, rival: str) -> FitResult:
+def _with_distances(problem: Problem, climbed: Climbed) -> Problem:
+    """Return the columns of delays and curves with the distances that were found."""
     ranges = replace(problem.ranges, truth_m=climbed.rows.distances(climbed.state))
-    problem = replace(problem, ranges=ranges, error=problem.error - ranges.truth_m)
-    rank = problem.rank
-    covariance = problem.directions @ found.solved.covariance[:rank, :rank] @ problem.directions.T
+    return replace(problem, ranges=ranges, error=problem.error - ranges.truth_m)
+
+
+def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked, rival: str) -> FitResult:
+    ranges, solved, covariance = problem.ranges, found.solved, found.covariance_ns2
     calibration = calibration_of(
-        problem, found.solved, covariance, climbed.told, asked.lift, asked.alpha_dbm, asked.fixed, asked.groups
+        problem, solved, covariance, climbed.told, asked.lift, asked.alpha_dbm, asked.fixed, asked.groups
     )
     std = calibration.delays_std_ns | dict.fromkeys(found.free_tags, math.inf)
     calibration = replace(calibration, delays_std_ns=std)
@@ -191,12 +197,14 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked, ri
     inliers = np.abs(residuals) < SIGMAS * applied.sigma_m
     warnings = [
         *found.open_ends(),
-        *([rival] if rival else []),
+        *_of_search(climbed, rival),
         *climbed.scene.tapes.left_out,
+        *limits(ranges, problem, residuals, asked.fixed),
+        *found.doubts,
+        *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
+        *warnings_of(ranges, applied, float(np.mean(inliers)), []),
     ]
-    if not climbed.settled:
-        warnings.insert(0, f"the fit stopped after {climbed.steps} steps before it settled: delays are not final")
     provenance = _provenance(climbed, problem, found, asked) | {
         "inliers": int(np.count_nonzero(inliers)),
         "warnings": warnings,
@@ -210,6 +218,13 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked, ri
         message=f"{'converged' if climbed.settled else 'stopped'} after {climbed.steps} steps",
         warnings=warnings,
     )
+
+
+def _of_search(climbed: Climbed, rival: str) -> Iterator[str]:
+    if not climbed.settled:
+        yield f"the fit stopped after {climbed.steps} steps before it settled: delays are not final"
+    if rival:
+        yield rival
 
 
 def _refuse_undetermined(found: Judged, problem: Problem, scene: Scene) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -18,6 +19,9 @@ from calib.estimation.solver import Solved
 from calib.information import Unknown, Verdict, judge
 from calib.trajectories.arrow import Factored, normal_of
 from calib.trajectories.climbing import Climbed
+from calib.trajectories.coarseness import coarseness
+from calib.trajectories.contradictions import contradictions
+from calib.trajectories.doubts import Taken, doubted
 from uwblink.arrays import Floats
 
 PRIOR_NS: Final = 2.0
@@ -41,8 +45,8 @@ class Judged:
     """A solution as a fit with known distances would have it, and the verdict on the delays of `problem.tags`.
 
     `absorbed` says for the least known direction of delays how many times its variance grew because distances are not
-    known; `distance_std_m` (k,) are standard errors of some distances,
-    `covariance_ns2` (tags, tags) is that of the delays.
+    known; `distance_std_m` (k,) are standard errors of some distances, `covariance_ns2` (tags, tags) is that of the
+    delays, with what does not fit, and `doubts` are sentences of that.
     """
 
     solved: Solved
@@ -50,6 +54,7 @@ class Judged:
     absorbed: float
     distance_std_m: Floats
     covariance_ns2: Floats
+    doubts: list[str]
 
     @property
     def free_tags(self) -> list[int]:
@@ -83,28 +88,94 @@ class Judged:
 
 
 def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judged:
-    """Return intervals and verdict of a solution whose delays are stated at the lifted power `reference`."""
+    """Return intervals and verdict of a solution whose delays are stated at the lifted power `reference`.
+
+    `problem` has the distances that were found.
+    """
+    reduced = _reduced(climbed)
+    solved, precision = _solved(climbed, problem, reduced, reference)
+    spread = _spread(climbed, reduced.taken)
+    doubts = doubted(problem, solved, reduced.taken)
+    sentences = [*_of_motion(climbed, reduced), *doubts.sentences]
+    if not problem.rank:
+        return Judged(
+            solved=solved,
+            verdict=None,
+            absorbed=1.0,
+            distance_std_m=spread,
+            covariance_ns2=np.zeros((0, 0)),
+            doubts=sentences,
+        )
+    columns, delays = climbed.columns.design, solved.delays
+    ridge = climbed.ridge[:columns, :columns]
+    with_truth = delays @ np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + ridge) @ delays.T
+    plain = np.linalg.pinv(_information(reduced.design, climbed.informed) + precision[:columns, :columns])
+    return Judged(
+        solved=solved,
+        verdict=_verdict(doubts.covariance_ns2, with_truth, problem),
+        absorbed=_absorbed(delays @ plain @ delays.T, with_truth),
+        distance_std_m=spread,
+        covariance_ns2=doubts.covariance_ns2,
+        doubts=sentences,
+    )
+
+
+def _of_motion(climbed: Climbed, reduced: _Reduced) -> Iterator[str]:
+    """Yield what contradicts the trajectories."""
+    scene, columns, state = climbed.scene, climbed.columns, climbed.state
+    left = coarseness(scene, columns, climbed.rows, state, climbed.loss, climbed.informed)
+    yield from left.told(columns.places.step_s)
+    yield from contradictions(climbed.known, scene.tapes, state, reduced.taken.whole, reduced.schur)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Reduced:
+    """What is left of derivatives by delays and curve when trajectories, standing bodies and biases took what they can.
+
+    `design` (n, m) are those of the ranges, `held` (k, m) those of what is known beside them, `schur` (b, b) what is
+    known of the border.
+    """
+
+    taken: Taken
+    schur: Floats
+    design: Floats
+    held: Floats
+
+
+def _reduced(climbed: Climbed) -> _Reduced:
     _, local, border = climbed.rows.linear(climbed.state)
     known = climbed.known.linear(climbed.state)
     whole = Factored(normal_of(local, border, climbed.informed) + known.normal)
     columns, size = climbed.columns.design, climbed.columns.border
     schur = whole.schur + climbed.ridge
-    # What is left of a range's derivatives when trajectories, standing bodies and biases have taken what they can.
-    taken = np.zeros((size, columns))
-    taken[:columns] = np.eye(columns)
+    turn = np.zeros((size, columns))
+    turn[:columns] = np.eye(columns)
     if size > columns:
-        taken[columns:] = -np.linalg.lstsq(schur[columns:, columns:], schur[columns:, :columns], rcond=1e-13)[0]
-    design = (border - local @ whole.reach) @ taken
-    held = (known.border - known.local @ whole.reach) @ taken
+        turn[columns:] = -np.linalg.lstsq(schur[columns:, columns:], schur[columns:, :columns], rcond=1e-13)[0]
+    left, held = border - local @ whole.reach, known.border - known.local @ whole.reach
+    taken = Taken(
+        local=local,
+        whole=whole,
+        rest=left[:, columns:],
+        schur=schur[columns:, columns:],
+        held=known.local,
+        informed=climbed.informed,
+    )
+    return _Reduced(taken=taken, schur=schur, design=left @ turn, held=held @ turn)
+
+
+def _solved(climbed: Climbed, problem: Problem, reduced: _Reduced, reference: float | None) -> tuple[Solved, Floats]:
+    """Return the solution as a fit with known distances would have it, and the whole prior."""
+    columns = climbed.columns.design
+    ridge, found = climbed.ridge[:columns, :columns], climbed.state.border[:columns]
     slope, _ = climbed.loss.slopes(climbed.rows.residuals(climbed.state))
-    prior = climbed.ridge[:columns, :columns] + held.T @ held
-    scores, inverse, precision = _slopes(climbed, problem, design, -slope, prior)
+    prior = ridge + reduced.held.T @ reduced.held
+    scores, inverse, precision = _slopes(climbed, problem, reduced.design, -slope, prior)
     stated = stating(problem, reference)
     delays = problem.directions @ stated[: problem.rank]
     blocks, seconds = blocks_of(problem.ranges.time_ns)
     of_blocks = intervals(scores, inverse, precision, delays, problem.rank, blocks=blocks, seconds=seconds)
-    found = climbed.state.border[:columns]
-    shares = [_of_curve(climbed.ridge[:columns, :columns], curve) for _, curve in problem.curves()]
+    shares = [_of_curve(ridge, curve) for _, curve in problem.curves()]
     # Residuals are smaller by what trajectories have taken of them (as HC3 has it; MacKinnon and White 1985).
     covariance = of_blocks.covariance / (1 - climbed.used) ** 2 + unsure(inverse[:columns, :columns], found, shares)
     solved = Solved(
@@ -121,25 +192,7 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
         lasting=of_blocks.lasting,
         mixture=climbed.mixture,
     )
-    rank = problem.rank
-    if not rank:
-        return Judged(
-            solved=solved,
-            verdict=None,
-            absorbed=1.0,
-            distance_std_m=_spread(climbed, whole),
-            covariance_ns2=np.zeros((0, 0)),
-        )
-    apart = problem.directions @ solved.covariance[:rank, :rank] @ problem.directions.T
-    with_truth = np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + climbed.ridge[:columns, :columns])
-    plain = np.linalg.pinv(_information(design, climbed.informed) + precision[:columns, :columns])
-    return Judged(
-        solved=solved,
-        verdict=_verdict(apart, delays @ with_truth @ delays.T, problem),
-        absorbed=_absorbed(delays @ plain @ delays.T, delays @ with_truth @ delays.T),
-        distance_std_m=_spread(climbed, whole),
-        covariance_ns2=apart,
-    )
+    return solved, precision
 
 
 def _slopes(
@@ -177,13 +230,12 @@ def _absorbed(covariance: Floats, with_truth: Floats) -> float:
     return float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
 
 
-def _spread(climbed: Climbed, whole: Factored) -> Floats:
+def _spread(climbed: Climbed, taken: Taken) -> Floats:
     """Return the standard errors of some distances, given delays and curve."""
-    _, rows, _ = climbed.rows.linear(climbed.state)
-    count = rows.shape[0]
+    rows, count = taken.local, taken.local.shape[0]
     some = np.unique(np.linspace(0, count - 1, LOOKED_AT).astype(np.int64))
     few = np.asarray(rows[some].todense())
-    variance = np.einsum("kl,lk->k", few, whole.inverse_on(np.ascontiguousarray(few.T)))
+    variance = np.einsum("kl,lk->k", few, taken.whole.inverse_on(np.ascontiguousarray(few.T)))
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 

@@ -45,6 +45,11 @@ class RangeRows:
         first, second = (self._antenna(side, state)[0] for side in self.sides)
         return np.asarray(np.linalg.norm(second - first, axis=1))
 
+    def directions(self, state: State) -> Floats:
+        """Return unit vectors (n, 3) from each range's first antenna to its second."""
+        first, second = (self._antenna(side, state)[0] for side in self.sides)
+        return _unit(second - first)
+
     def residuals(self, state: State) -> Floats:
         """Return the residuals (n,)."""
         fitted = self.design @ state.border[: self.columns.design]
@@ -57,7 +62,7 @@ class RangeRows:
         (first, arm_first), (second, arm_second) = (self._antenna(side, state) for side in self.sides)
         away = second - first
         distance = np.linalg.norm(away, axis=1)
-        towards = away / np.maximum(distance, 1e-6)[:, None]
+        towards = _unit(away)
         count, columns = len(distance), self.columns
         border = np.zeros((count, columns.border))
         border[:, : columns.design] = self.design
@@ -114,6 +119,10 @@ def _side(ends: Ends, columns: Columns, place: Weights, turn: Weights) -> Side:
     where = np.where(moves[:, None, None], columns.place[place.point, ends.mover[:, None]], -1)
     turns = np.where(moves[:, None, None], columns.turn[turn.point, ends.mover[:, None]], -1)
     return Side(ends, where, _shares(where, place.share), turns, _shares(turns, turn.share))
+
+
+def _unit(away: Floats) -> Floats:
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1), 1e-6)[:, None])
 
 
 def _shares(columns: Ints, share: Floats) -> Floats:

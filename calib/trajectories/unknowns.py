@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from calib.trajectories.scene import Scene
-from calib.trajectories.splines import Grid, grid_over
+from calib.trajectories.splines import Grid, grid_over, halved
 from uwblink.arrays import Floats, Ints
 
 POINT_S: Final = 0.4
@@ -89,3 +89,12 @@ class State:
     def moved(self, local: Floats, border: Floats) -> State:
         """Return the state after a step."""
         return replace(self, local=self.local + local, border=self.border + border)
+
+
+def refined(columns: Columns, finer: Columns, state: State) -> State:
+    """Return the same trajectories by control points at half the distance."""
+    local = np.zeros(finer.size)
+    local[finer.place] = halved(columns.places, finer.places, state.local[columns.place])
+    turns = finer.turn >= 0
+    local[finer.turn[turns]] = state.local[columns.turn[turns]]
+    return replace(state, local=local)

@@ -31,6 +31,11 @@ def since_takeoff(t, standing_s):
     return flown - 0.8 * (1 - np.exp(-flown / 0.8)) if standing_s else t
 
 
+def shake(body, t, size_m, rate_hz):
+    """Metres (n, 3): a body shaken along all axes, each at its own rate about the given one."""
+    return size_m * np.sin(2 * np.pi * rate_hz * t[:, None] * np.array([1.0, 1.13, 0.91]) + body)
+
+
 def heading(body, t):
     """Radians (n,)."""
     return body + 1.2 * np.sin(2 * np.pi * t / (13.0 + 2 * body))
@@ -76,11 +81,14 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     standing_s=0.0,
     height_off_m=None,
     arm_m=ARM,
+    shaken=(0.0, 1.0),
+    late_m=None,
 ):
     """A flight whose poses have noise in places, and headings and tilts that are off by sines of so many degrees.
 
     `anchors` (k, 3) stand as tags 11 and on, with delays of their own, and range with each tag in turn. With
     `height_off_m` bodies read their heights, wrong by that and by 3 cm of noise; for `standing_s` all stand.
+    `shaken` bodies move beside by so many metres, so many times a second; ranges of a pair in `late_m` are too long.
     `antennas(tags, seconds)` of the flight says where antennas are.
     """
     rng = np.random.default_rng(seed)
@@ -106,7 +114,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
             here = (
                 np.broadcast_to(stand[tag], (rows.sum(), 3))
                 if tag in stand
-                else (place(body, when) + turn(heading(body, when), arm(tag, arm_m)))
+                else (place(body, when) + turn(heading(body, when), arm(tag, arm_m)) + shake(body, when, *shaken))
             )
             found[rows] = here
         return found
@@ -116,6 +124,8 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     lifted = np.mean(10 ** ((fpp + 82) / 10), axis=0)
     error = curve(lifted) - curve(1.0) + noise_m * rng.normal(size=n)
     error += np.where(rng.random(n) < reflected, rng.exponential(0.3, n), 0)
+    for ends, late in (late_m or {}).items():
+        error += late * (np.sort(pair, axis=1) == ends).all(axis=1)
     measured = distance + error - 0.5e-9 * SPEED_OF_LIGHT * (delay[pair[:, 0]] + delay[pair[:, 1]])
     there_and_back = np.rint(2 * measured / SPEED_OF_LIGHT / TICK_S).astype(np.int64)
     zero = np.zeros(n, np.int64)
@@ -144,7 +154,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
         # Tilted about the world's x axis: the quaternion of the tilt times that of the heading.
         s, c = np.sin(tilt / 2), np.cos(tilt / 2)
         upright = np.column_stack([s * upright[:, 3], -s * upright[:, 2], c * upright[:, 2], c * upright[:, 3]])
-        seen = place(body, flown) + place_noise_m * rng.normal(size=(len(when), 3))
+        seen = place(body, flown) + shake(body, flown, *shaken) + place_noise_m * rng.normal(size=(len(when), 3))
         poses_of.append((np.full(len(when), f"robot{body}"), seen, upright, when))
     for tag, here in stand.items():
         two = np.array([0.0, seconds])

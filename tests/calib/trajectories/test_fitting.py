@@ -30,6 +30,8 @@ def test_planted_delays_are_found_from_a_known_start(flown, fitted):
     result, _ = fitted
     std = np.array(list(result.calibration.delays_std_ns.values()))
     assert result.success
+    # Nothing is doubted of a sound flight, but that it is short.
+    assert [warning[:12] for warning in result.warnings] == ["only 24 s of"]
     # One flight of 24 s: a fit with all distances known leaves 18 ps.
     assert np.abs(errors_ns(result) / std).max() < 3.5
     assert 0.015 < std.max() < 0.06
@@ -74,12 +76,6 @@ def test_a_bad_parameter_is_named(flown):
 
 
 ANCHORS = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5]]
-
-
-def test_nothing_is_claimed_where_nothing_is_known_and_differences_are_told():
-    with pytest.raises(calib.UnanswerableError, match="what all have in common is known to") as raised:
-        calib.fit_from_ranges(flight(seconds=16.0), poses_until_s=0.0)
-    assert raised.value.undetermined == [list(DELAYS_NS)]
 
 
 def test_places_of_anchors_make_up_for_a_known_start():

@@ -9,8 +9,8 @@ from calib.trajectories.given import Usable, scene_from
 from calib.trajectories.known_rows import known_rows
 from calib.trajectories.range_losses import Cauchy
 from calib.trajectories.range_rows import range_rows
-from calib.trajectories.splines import cubic, cubic_speed, grid_over, straight
-from calib.trajectories.unknowns import State, columns_of
+from calib.trajectories.splines import cubic, cubic_speed, grid_over, halved, straight
+from calib.trajectories.unknowns import State, columns_of, refined
 from tests.calib.trajectories.sines import flight
 
 
@@ -23,6 +23,17 @@ def test_cubic_splines_sum_to_one_and_reproduce_a_parabola():
     assert np.allclose((weights.share * points[weights.point]).sum(axis=1), time**2)
     speed = cubic_speed(grid, time)
     assert np.allclose((speed.share * points[speed.point]).sum(axis=1), 2 * time)
+
+
+def test_twice_as_many_control_points_make_the_same_spline():
+    for begin in (2.0, -1.0):
+        grid, finer = grid_over(begin, 8.7, 0.4, 1), grid_over(begin, 8.7, 0.2, 1)
+        points = np.random.default_rng(0).normal(size=(grid.count, 2, 3))
+        time = np.linspace(begin, 8.7, 200)
+        coarse, fine = cubic(grid, time), cubic(finer, time)
+        again = halved(grid, finer, points)
+        values = (np.einsum("np,npba->nba", w.share, p[w.point]) for w, p in ((coarse, points), (fine, again)))
+        assert np.allclose(*values)
 
 
 def test_straight_lines_are_reproduced():
@@ -52,6 +63,15 @@ def rows():
     columns = columns_of(scene, 2)
     design = np.random.default_rng(1).normal(size=(len(scene.time_s), 2))
     return scene, columns, range_rows(scene, columns, scene.ranges.raw_m, design)
+
+
+def test_refined_trajectories_are_the_same(rows):
+    scene, columns, ranges = rows
+    rng = np.random.default_rng(3)
+    state = State(rng.normal(size=columns.size), rng.normal(size=columns.border))
+    finer = columns_of(scene, 2, columns.places.step_s / 2)
+    again = range_rows(scene, finer, ranges.error, ranges.design)
+    assert np.allclose(again.residuals(refined(columns, finer, state)), ranges.residuals(state))
 
 
 def test_derivatives_are_those_of_finite_differences(rows):
