@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.tails import erfcx
 from uwblink.arrays import Floats
 
 ROOT_2: Final = float(np.sqrt(2))
@@ -48,8 +49,6 @@ def densities(error_m: Floats, sigma_m: Floats, least_m: float, detour_m: Floats
     That of reflected ones is exp(-v^2/2) erfcx(-u/sqrt 2) / (2 detour), which does not cancel; where it overflows, far
     beyond the noise, it is the exponential's own.
     """
-    from scipy.special import erfcx
-
     inverse = 1 / sigma_m
     z, v, ratio = error_m * inverse, (error_m - least_m) * inverse, sigma_m / detour_m
     u = v - ratio

@@ -61,9 +61,9 @@ FLOORS = {
         ("cli",),
     ),
     "calib": (
-        ("carriers", "densities", "errors", "samples", "single_sided", "spread"),
-        ("error_mixture", "information", "long_columns"),
-        ("ranges",),
+        ("carriers", "errors", "samples", "single_sided", "spread", "tails"),
+        ("densities", "information", "long_columns"),
+        ("error_mixture", "ranges"),
         ("recorded",),
         ("calibration", "sources"),
         ("evaluation",),

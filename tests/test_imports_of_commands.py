@@ -36,7 +36,6 @@ SPLINES = {"scipy.interpolate", "scipy.linalg", "scipy.optimize", "scipy.sparse"
 """`scipy.interpolate`, of which flights on splines and curves over power are made, and what it loads itself."""
 
 FLIGHT = NUMBERS | SPLINES
-FIT = TABLE | SPECIAL | {"scipy.linalg", "scipy.sparse"}
 BOARD = {"serial"}
 DRAWS = None
 """Commands that draw a page take seconds, and everything that draws: they are tried with `--help` alone."""
@@ -86,17 +85,17 @@ COMMANDS = {
     "uwbsim sweep": Row(DRAWS),
     "uwbsim twin": Row(DRAWS),
     "calib sample": Row("-o sample.uwb -n 10", TABLE),
-    "calib fit": Row("f.uwb -o new.json", FIT),
-    "calib add-tag": Row("f.uwb -c two.json --tag 3 -o three.json", FIT),
+    "calib fit": Row("f.uwb -o new.json", TABLE),
+    "calib add-tag": Row("f.uwb -c two.json --tag 3 -o three.json", TABLE),
     "calib plan": Row("3", NUMBERS | SPECIAL),
     "calib survey": Row("standing.uwb -o delays.json", TABLE | SPECIAL),
     "calib show": Row("c.json", NUMBERS),
-    "calib evaluate": Row("f.uwb -c c.json", TABLE | SPECIAL | {"rich"}),
+    "calib evaluate": Row("f.uwb -c c.json", TABLE | {"rich"}),
     "calib localize": Row("f.uwb -c c.json --seeds 1", TABLE | SPECIAL),
     "calib doctor": Row("f.uwb", TABLE),
     "calib compare": Row("c.json c.json", NUMBERS | SPECIAL),
     "calib report": Row(DRAWS),
-    "calib apply": Row("f.uwb -c c.json -o corrected.uwb", TABLE | SPECIAL),
+    "calib apply": Row("f.uwb -c c.json -o corrected.uwb", TABLE),
     "calib export": Row("c.json --to miluv -o miluv.json", NUMBERS),
     "calib import miluv": Row("miluv.json -o c2.json", NUMBERS),
 }

@@ -21,6 +21,7 @@ from calib.calibration.json_format import Reader, is_tag
 from calib.calibration.power_curves import Curve
 from calib.densities import ROOT_2PI, densities
 from calib.errors import BadInputError
+from calib.tails import log_normal_below, normal_below
 from uwblink.arrays import Floats, Ints
 
 BISECTIONS: Final = 50
@@ -96,14 +97,14 @@ class ErrorModel:
 
     def below(self, error_m: Floats, shapes: ErrorShapes) -> Floats:
         """Return the model's share of errors below some (n,)."""
-        from scipy.special import log_ndtr, ndtr
-
         error = error_m - self.location_m
         noise, share = shapes.noise_m, shapes.tail_share
         away, ratio = (error - self.least_m) / noise, noise / shapes.detour_m
-        reflected = ndtr(away) - np.exp(np.minimum(ratio * (0.5 * ratio - away) + log_ndtr(away - ratio), 0.0))
-        inside = (1 - share) * ndtr(error / noise) + share * reflected
-        wild = ndtr(error / max(self.outlier_m, 1e-9))
+        reflected = normal_below(away) - np.exp(
+            np.minimum(ratio * (0.5 * ratio - away) + log_normal_below(away - ratio), 0.0)
+        )
+        inside = (1 - share) * normal_below(error / noise) + share * reflected
+        wild = normal_below(error / max(self.outlier_m, 1e-9))
         return np.asarray((1 - self.outlier_share) * inside + self.outlier_share * wild)
 
     def quantiles(self, probabilities: Sequence[float], lifted: Floats, initiator: Ints, target: Ints) -> Floats:

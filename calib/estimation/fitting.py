@@ -12,7 +12,6 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
@@ -120,8 +119,6 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     # Before the columns of a fit are there: sorting millions of ranges takes memory too.
     skewed = list(one_way(ranges))
     # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
-    # SciPy brings a linear algebra of its own, which is held to one thread only if it is there by now.
-    import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
         problem = build_problem(
             ranges,

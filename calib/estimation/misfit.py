@@ -18,6 +18,7 @@ from calib.estimation.design import Runs
 from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
+from calib.tails import students_quantile
 from uwblink.arrays import Floats, Ints
 
 ERROR_RATE: Final = 0.005
@@ -275,9 +276,7 @@ def widening_of_pairs(result: Tested) -> Floats:
 
 def findings(result: Tested, several: int) -> Iterator[Finding]:
     """Yield the alternatives that stand out, one after the other, each beside those already found."""
-    from scipy.special import stdtrit
-
-    limit = float(stdtrit(max(result.lasting.freedom, 3.0), 1 - ERROR_RATE / several / 2))
+    limit = students_quantile(max(result.lasting.freedom, 3.0), 1 - ERROR_RATE / several / 2)
     total, covariance, information = result.total.copy(), result.covariance.copy(), result.information.copy()
     for _ in range(MOST_NAMED):
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.tails import students_quantile
 from uwblink.arrays import Floats, Ints
 
 MOST_BLOCKS: Final = 1000
@@ -47,9 +48,7 @@ class Persistence:
     @property
     def quantile95(self) -> float:
         """Half the width of a 95 % interval, in standard errors."""
-        from scipy.special import stdtrit
-
-        return float(stdtrit(self.freedom, 0.975))
+        return students_quantile(self.freedom, 0.975)
 
 
 def short_blocks(time_ns: Ints) -> Ints:

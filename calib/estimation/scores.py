@@ -234,13 +234,11 @@ def inverse_of(matrix: Floats, places: int = 0, sorts: int = 0) -> Floats:
 
 
 def _positive(matrix: Floats) -> Floats:
-    from scipy.linalg import lapack
-
-    factor, failed = lapack.dpotrf(matrix, lower=1)
-    if failed:
+    try:
+        half = np.linalg.inv(np.linalg.cholesky(matrix))
+    except np.linalg.LinAlgError:
         return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
-    lower, _ = lapack.dpotri(factor, lower=1)
-    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+    return np.asarray(half.T @ half)
 
 
 def _eliminated(matrix: Floats, places: int, sorts: int) -> Floats:
