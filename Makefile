@@ -87,6 +87,9 @@ bench-import: setup ## measure how long tables and poses take to come in (2 minu
 trajectories: setup ## fits without known distances over 50 seeds a world, into docs/fit-from-ranges.md (30 minutes)
 	$(BIN)/python -m benchmarks.trajectories --write
 
+plans: setup ## plans of flights beside fits of them, into docs/planning.md (15 minutes)
+	$(BIN)/python -m benchmarks.plans --write
+
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy
 

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
     from calib.planning.arranging import plan
+    from calib.planning.flight_result import FlightPlan
+    from calib.planning.flights import plan_flight
     from calib.planning.result import Plan
     from calib.ranges import Ranges
     from calib.report.campaign import run_campaign
@@ -44,6 +46,7 @@ __all__ = [
     "Calibration",
     "CorrectedRanges",
     "FitResult",
+    "FlightPlan",
     "Knowledge",
     "KnownPosition",
     "OnboardSettings",
@@ -64,6 +67,7 @@ __all__ = [
     "localize",
     "localize_onboard",
     "plan",
+    "plan_flight",
     "register_loss",
     "register_report_section",
     "run_campaign",
@@ -79,6 +83,7 @@ _HOMES: Final = {
     "Calibration": "calib.calibration.model",
     "CorrectedRanges": "calib.calibration.parts",
     "FitResult": "calib.estimation.result",
+    "FlightPlan": "calib.planning.flight_result",
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",
     "OnboardSettings": "calib.evaluation.onboard",
@@ -99,6 +104,7 @@ _HOMES: Final = {
     "localize": "calib.evaluation.localization",
     "localize_onboard": "calib.evaluation.onboard",
     "plan": "calib.planning.arranging",
+    "plan_flight": "calib.planning.flights",
     "register_loss": "calib.estimation.losses",
     "register_report_section": "calib.report.layout",
     "run_campaign": "calib.report.campaign",

@@ -59,10 +59,10 @@ def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> 
     measured_m = measured_m - 0.5e-9 * SPEED_OF_LIGHT * (delay[initiator] + delay[target])
     tags = [Tag(int(tag), f"robot{tag}", (0.0, 0.0, 0.0)) for tag in np.unique(pair)]
     poses = _poses(int(time_ns[-1]), tags, fixed)
-    return SampleFlight(_exchanges(time_ns, pair, measured_m, power), poses, tags, _planted(tags))
+    return SampleFlight(stamped(time_ns, pair, measured_m, power), poses, tags, _planted(tags))
 
 
-def _exchanges(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Exchanges:
+def stamped(time_ns: Any, pair: Any, measured_m: Floats, power: Floats) -> Exchanges:
     """Stamps of double-sided exchanges whose clocks run alike, so that the formula gives the measured range."""
     there_and_back = np.rint(2 * measured_m / SPEED_OF_LIGHT / TICK_S).astype(np.int64)
     zero, nothing = np.zeros_like(time_ns), np.zeros(len(time_ns))

@@ -9,6 +9,10 @@ from uwblink.cli import shared
 FLAGS: Final = {
     "boards": "COUNT",
     "distances": "--distance",
+    "robots": "COUNT",
+    "noise_m": "--noise",
+    "speed_m_s": "--speed",
+    "apart_m": "--apart",
     "fixed_ns": "--fix",
     "groups": "--group",
     "scale_ns": "--scale",

@@ -1,4 +1,4 @@
-"""Commands that calibrate without true distances: plan, survey."""
+"""The command that calibrates without true distances: survey."""
 
 from __future__ import annotations
 
@@ -22,15 +22,7 @@ PANEL: Final = "Calibrate"
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands."""
-    add(
-        app,
-        plan,
-        "calib plan 4 --on line",
-        "calib plan 6 --on plane --size 3,2 --arrangements 8 --taped 2",
-        "calib plan 1,2,3,4,5,6 --on space --anchors 1,2,3,4",
-        panel=PANEL,
-    )
+    """Register the command."""
     add(
         app,
         survey,
@@ -133,74 +125,3 @@ def _figures(result: calib.SurveyResult) -> dict[str, Any]:
         "findings": list(result.findings),
         "warnings": [with_flags(text) for text in result.warnings],
     }
-
-
-def plan(
-    boards: Annotated[str, typer.Argument(metavar="COUNT|TAG,TAG...", help="How many boards, or their ids.")],
-    on: Annotated[
-        str, typer.Option(metavar="line|plane|space", help="A string (line), a table (plane) or a room (space).")
-    ] = "line",
-    arrangements: Annotated[
-        int | None, typer.Option(help="How many arrangements; by default as many as are worth it.")
-    ] = None,
-    size: Annotated[
-        str | None, typer.Option(metavar="M,M,M", help="Length of the string, or sides of table or room (m).")
-    ] = None,
-    taped: Annotated[int, typer.Option(help="How many distances will be measured with a tape.")] = 0,
-    tape_sigma: Annotated[float, typer.Option(help="Standard deviation of such a distance (m).")] = 0.005,
-    anchors: Annotated[
-        str, typer.Option(metavar="TAG,TAG...", help="Boards that stay where they are, at known places.")
-    ] = "",
-    anchor_sigma: Annotated[float, typer.Option(help="How well those places are known (m).")] = 0.01,
-    pair_error: Annotated[float, typer.Option(help="Constant error of a pair in an arrangement (m).")] = 0.02,
-    rate: Annotated[float, typer.Option(help="Exchanges a second of all boards together.")] = 50.0,
-    as_json: AsJson = False,
-) -> None:
-    """Say how to calibrate without true distances: what to do step by step, and how well delays will be known."""
-    import calib
-
-    with waiting("planning"):
-        found = calib.plan(
-            _boards(boards),
-            on=on,
-            arrangements=arrangements,
-            size_m=None if size is None else _numbers(size, "size_m"),
-            taped=taped,
-            tape_sigma_m=tape_sigma,
-            anchors=[int(tag) for tag in _numbers(anchors, "anchors")],
-            anchor_sigma_m=anchor_sigma,
-            pair_error_m=pair_error,
-            rate_hz=rate,
-        )
-    if as_json:
-        typer.echo(json.dumps(found.to_dict(), indent=1))
-        return
-    typer.echo(str(found))
-    typer.echo("\nCommands, one after the other:")
-    for line in _commands(found):
-        typer.echo(f"  {line}")
-
-
-def _commands(found: calib.Plan) -> Iterator[str]:
-    """Yield the commands that follow the steps, a line each."""
-    for one in found.arrangements:
-        words = f"--pairs all --arrangement {one.name} --duration {found.seconds_each:.0f} -o {one.name}.uwb"
-        yield f"uwblink record PORTS {words}"
-    known = "known.toml" if found.known_beside else found.on
-    shape = f" --known {known}" if known else ""
-    yield f"calib survey {' '.join(f'{one.name}.uwb' for one in found.arrangements)}{shape} -o calibration.json"
-
-
-def _boards(text: str) -> int | list[int]:
-    found = [int(tag) for tag in _numbers(text, "boards")]
-    return found if "," in text else found[0]
-
-
-def _numbers(text: str, parameter: str) -> list[float]:
-    """Return numbers from a text with commas; raises `BadInputError`."""
-    from calib.errors import BadInputError
-
-    try:
-        return [float(part) for part in text.split(",")] if text.strip() else []
-    except ValueError:
-        raise BadInputError(f"found {text!r:.40}, expected numbers with commas", parameter=parameter) from None

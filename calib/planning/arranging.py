@@ -63,7 +63,8 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
 def _promised(choice: Choice, rate_hz: float) -> Plan:
     given, total = choice.given, choice.total
     verdict = _verdict(total, given.tags)
-    wide = TWO_SIDED * widened(_freedom(given, choice.chosen))
+    wide = _wide(given, choice.chosen)
+    after = tuple(_halves(given, choice.chosen[:count]) for count in range(1, len(choice.chosen) + 1))
     made = tuple(named(NAMES[k], layout, given.tags) for k, layout in enumerate(choice.chosen))
     pairs = len(list(combinations(given.tags, 2)))
     seconds = max(FEWEST_S, math.ceil(RANGES_A_PAIR * pairs / rate_hz / 10) * 10.0)
@@ -71,7 +72,8 @@ def _promised(choice: Choice, rate_hz: float) -> Plan:
         on=given.on,
         tags=given.tags,
         arrangements=made,
-        half_ns={tag: wide * float(s) for tag, s in zip(given.tags, verdict.std, strict=True)},
+        half_ns=after[-1],
+        after_ns=after,
         common_ns=wide * _common(verdict),
         verdict=verdict,
         next_best=tuple(_next_best(choice, total, wide)),
@@ -84,6 +86,18 @@ def _promised(choice: Choice, rate_hz: float) -> Plan:
 
 def _verdict(total: Floats, tags: tuple[int, ...]) -> Verdict:
     return judge(total * M_PER_NS**2, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+
+
+def _wide(given: Having, chosen: list[Layout]) -> float:
+    """Return the factor of a standard deviation that makes half an interval of 95 %."""
+    return TWO_SIDED * widened(_freedom(given, chosen))
+
+
+def _halves(given: Having, chosen: list[Layout]) -> dict[int, float]:
+    """Return the half interval of each delay (ns) by so many arrangements, infinite where undetermined."""
+    total = np.sum([given.information(layout) for layout in chosen], axis=0)
+    std, wide = _verdict(total, given.tags).std, _wide(given, chosen)
+    return {tag: wide * float(s) for tag, s in zip(given.tags, std, strict=True)}
 
 
 def _common(verdict: Verdict) -> float:

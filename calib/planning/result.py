@@ -39,8 +39,9 @@ class NextBest:
 class Plan:
     """A procedure in steps, and the interval (ns, half of 95 %) that each delay will have; infinite where none.
 
-    `verdict` says what the arrangements determine; `common_ns` is the half interval of what all delays share, to which
-    every absolute distance owes as much; `next_best` are the next arrangement and the next taped distance. With
+    `after_ns` has the intervals when only the first arrangement, the first two and so on are made. `verdict` says what
+    the arrangements determine; `common_ns` is the half interval of what all delays share, to which every absolute
+    distance owes as much; `next_best` are the next arrangement and the next taped distance, the better one first. With
     `known_beside`, distances or places are known that a survey must be told.
 
     >>> import calib
@@ -55,6 +56,7 @@ class Plan:
     tags: tuple[int, ...]
     arrangements: tuple[PlannedArrangement, ...]
     half_ns: Mapping[int, float]
+    after_ns: tuple[Mapping[int, float], ...]
     common_ns: float
     verdict: Verdict
     next_best: tuple[NextBest, ...]

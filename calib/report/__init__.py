@@ -7,6 +7,7 @@ from uwblink.lazy import offer
 if TYPE_CHECKING:
     from calib.report.figure_files import write_comparison_figures, write_onboard_figures, write_track_figures
     from calib.report.origin import origin_of
+    from calib.report.plans import write_plan
     from calib.report.writing import check_places
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "origin_of",
     "write_comparison_figures",
     "write_onboard_figures",
+    "write_plan",
     "write_track_figures",
 ]
 
@@ -22,6 +24,7 @@ _HOMES: Final = {
     "origin_of": "calib.report.origin",
     "write_comparison_figures": "calib.report.figure_files",
     "write_onboard_figures": "calib.report.figure_files",
+    "write_plan": "calib.report.plans",
     "write_track_figures": "calib.report.figure_files",
 }
 

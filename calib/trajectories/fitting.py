@@ -93,8 +93,8 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
         sequential=False,
         reference_power_dbm=reference_power_dbm,
     )
-    asked = _Asked(
-        usable=_checked(poses_until_s, attitudes, heading_std_deg, anchors, tuple(distances), heights),
+    asked = Asked(
+        usable=usable_of(poses_until_s, attitudes, heading_std_deg, anchors, tuple(distances), heights),
         lift=lift,
         alpha_dbm=alpha_dbm,
         fixed=fixed,
@@ -107,7 +107,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     # The same bytes on any machine; SciPy brings a linear algebra of its own, which must be there to be held.
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
-        problem, scene = _problem(scene, asked)
+        problem, scene = problem_of(scene, asked)
         begun = beginning(scene, lambda share: done(FOLLOWING * share))
         climbed = climb(begun.scene, problem, begun.state, lambda share: done(FOLLOWING + (1 - FOLLOWING) * share))
         problem = _with_distances(problem, climbed)
@@ -119,7 +119,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     return result
 
 
-def _checked(
+def usable_of(
     poses_until_s: float | None,
     attitudes: str,
     heading_std_deg: float,
@@ -127,6 +127,7 @@ def _checked(
     distances: tuple[KnownDistance, ...],
     heights: str,
 ) -> Usable:
+    """Return what of a recording may be used; raises `BadInputError` for what cannot be read."""
     check_choice("attitudes", attitudes, ATTITUDES)
     check_choice("anchors", anchors, ANCHORS)
     check_choice("heights", heights, HEIGHTS)
@@ -144,7 +145,7 @@ def _checked(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Asked:
+class Asked:
     """What a fit was asked for."""
 
     usable: Usable
@@ -161,7 +162,7 @@ class _Asked:
         return float(lift_power(np.array(self.reference_dbm), self.alpha_dbm))
 
 
-def _problem(scene: Scene, asked: _Asked) -> tuple[Problem, Scene]:
+def problem_of(scene: Scene, asked: Asked) -> tuple[Problem, Scene]:
     """Return the columns of delays and curves, without any distance in them, and the scene of their ranges."""
     # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
     numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
@@ -185,7 +186,7 @@ def _with_distances(problem: Problem, climbed: Climbed) -> Problem:
     return replace(problem, ranges=ranges, error=problem.error - ranges.truth_m)
 
 
-def _result(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked, rival: str) -> FitResult:
+def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, rival: str) -> FitResult:
     ranges, solved, covariance = problem.ranges, found.solved, found.covariance_ns2
     calibration = calibration_of(
         problem, solved, covariance, climbed.told, asked.lift, asked.alpha_dbm, asked.fixed, asked.groups
@@ -238,7 +239,7 @@ def _refuse_undetermined(found: Judged, problem: Problem, scene: Scene) -> None:
     )
 
 
-def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: _Asked) -> dict[str, Any]:
+def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: Asked) -> dict[str, Any]:
     scene, ranges, known = climbed.scene, problem.ranges, climbed.scene.places.time_s
     more: dict[str, Any] = {}
     if found.free_tags:

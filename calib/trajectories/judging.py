@@ -112,7 +112,7 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
     plain = np.linalg.pinv(_information(reduced.design, climbed.informed) + precision[:columns, :columns])
     return Judged(
         solved=solved,
-        verdict=_verdict(doubts.covariance_ns2, with_truth, problem),
+        verdict=verdict_on(doubts.covariance_ns2, with_truth, problem),
         absorbed=_absorbed(delays @ plain @ delays.T, with_truth),
         distance_std_m=spread,
         covariance_ns2=doubts.covariance_ns2,
@@ -210,7 +210,8 @@ def _slopes(
     return scores, inverse_of(scores.information() + precision, len(problem.pairs.ends), len(SPREADS)), precision
 
 
-def _verdict(covariance: Floats, with_truth: Floats, problem: Problem) -> Verdict:
+def verdict_on(covariance: Floats, with_truth: Floats, problem: Problem) -> Verdict:
+    """Return what delays of a covariance (tags, tags) are determined, beside that of a fit with known distances."""
     guess = np.maximum(GUESS_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
     information = (information + information.T) / 2

@@ -33,6 +33,7 @@ ONLY_FROM_PYTHON = {
     "information",
     "loosest",
     "boards",
+    "robots",
 }
 
 

@@ -25,6 +25,12 @@ def test_three_in_a_row_give_the_middle_delay_by_what_was_counted_by_hand():
     assert 1 / math.sqrt(values[-1]) == pytest.approx(0.02 * math.sqrt(3))
 
 
+def test_four_in_a_row_say_of_each_board_inside_its_own_delay_and_nothing_else():
+    """So eight orders, in which each of four stands inside four times, leave sqrt(2 / 4) of a pair's error, at best."""
+    information = delay_information(on_line((2, 0, 3, 1), 3.0), 0.02, 0.005)
+    assert information == pytest.approx(np.diag([0.5, 0, 0, 0.5]) / 0.02**2, abs=1e-9 / 0.02**2)
+
+
 def in_pair_errors(boards, on, count):
     found = calib.plan(boards, on=on, arrangements=count)
     half = np.array(list(found.half_ns.values()))

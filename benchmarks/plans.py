@@ -1,0 +1,129 @@
+"""Plans of flights beside fits of them: what was promised, and what errors came out over seeds; a table of planning.md.
+
+The worlds are those of `benchmarks.trajectories`, which share nothing with plan or fit. A plan is made of a recording
+of the flight (the first seed; positions and attitudes as they are recorded, ranges are not looked at), and of robots
+that fly about a room of the same size, of which nothing but numbers is known.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import calib
+from benchmarks.trajectories import WORLDS
+
+ROOT: Final = Path(__file__).parents[1]
+PAGE: Final = ROOT / "docs" / "planning.md"
+TWO_SIDED: Final = 1.959963984540054
+ROOM: Final[dict[str, Any]] = {"size_m": (7.0, 7.0, 3.0), "apart_m": 0.68, "speed_m_s": 0.7}
+FOUR: Final = (11, 12, 13, 14)
+OF_ROBOTS: Final[dict[str, dict[str, Any]]] = {
+    "sines, known for 8 of 24 s": ROOM | {"seconds": 24.0, "rate_hz": 80.0},
+    "sines, four anchors given, no known start": ROOM | {"seconds": 24.0, "rate_hz": 120.0, "anchors": FOUR},
+    "sines, four anchors sought, known for 8 s": ROOM | {"seconds": 24.0, "rate_hz": 120.0, "anchors": FOUR},
+    "sines, nothing known": ROOM | {"seconds": 24.0, "rate_hz": 80.0},
+    "icra2023 test 1, 60 s, known for 10 s": {"seconds": 60.0, "rate_hz": 160.0, "imu": "consumer"},
+}
+FEWER: Final = {"icra2023 test 1, 60 s, known for 10 s": 4}
+"""By how many times fewer seeds of a world are flown: its fits take longer."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """One fit: errors (tags,) of its delays in ps, and which it claims."""
+
+    tags: tuple[int, ...]
+    error_ps: Floats
+    claimed: tuple[bool, ...]
+
+
+def fitted(name: str, seed: int) -> Fitted:
+    """Fly, fit, and compare with what was planted."""
+    world = WORLDS[name]
+    flown = world.make(seed)
+    found = calib.fit_from_ranges(flown, minimum_norm=True, **world.given).calibration
+    tags = tuple(found.delays_ns)
+    error = [1e3 * (found.delays_ns[tag] - flown.planted["delays_ns"][str(tag)]) for tag in tags]
+    return Fitted(tags, np.array(error), tuple(bool(np.isfinite(found.delays_std_ns[tag])) for tag in tags))
+
+
+def promised(name: str) -> tuple[calib.FlightPlan, calib.FlightPlan]:
+    """Return the plan of the flight itself, and that of robots in a room."""
+    world = WORLDS[name]
+    given = dict(world.given)
+    given["anchor_places"] = given.pop("anchors", "given")
+    return calib.plan_flight(world.make(0), **given), calib.plan_flight(3, **given, **OF_ROBOTS[name])
+
+
+def row(name: str, fits: list[Fitted], plans: tuple[calib.FlightPlan, calib.FlightPlan]) -> str:
+    """Return a world's line of the table."""
+    plan, like = plans
+    tags = fits[0].tags
+    claimed = np.mean([one.claimed for one in fits], axis=0) > 0.5
+    says = [tag for tag in plan.half_ns if tag not in plan.undetermined]
+    error = np.array([one.error_ps for one in fits])
+    known = np.array([tag in says for tag in tags])
+    cells = [name, str(len(fits)), f"{len(says)}, {int(claimed.sum())} of {len(tags)}"]
+    if not known.any():
+        return f"| {' | '.join([*cells, '', '', '', ''])} |"
+    common = error[:, known].mean(axis=1)
+    apart = error[:, known] - common[:, None]
+    alike = WORLDS[name].planted_alike
+    cells += [
+        f"{1e3 * plan.apart_ns / TWO_SIDED:.0f}, {1e3 * like.apart_ns / TWO_SIDED:.0f}",
+        f"{np.sqrt(np.mean(apart**2)):.0f}",
+        f"{1e3 * plan.common_ns / TWO_SIDED:.0f}, {1e3 * like.common_ns / TWO_SIDED:.0f}",
+        f"{np.sqrt(np.mean(common**2)):.0f}" if alike else "",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+TITLES: Final = (
+    "flight",
+    "seeds",
+    "determined: planned, fitted",
+    "apart, ps: promised (of itself, of robots in a room)",
+    "came out, rms",
+    "common, ps: promised",
+    "came out, rms",
+)
+HEAD: Final = f"| {' | '.join(TITLES)} |\n{'|---' * len(TITLES)}|"
+
+
+def main(argv: list[str]) -> int:
+    """Print the table, and write it into the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=24)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args(argv)
+    lines = [HEAD]
+    with ProcessPoolExecutor(given.workers) as pool:
+        for name in OF_ROBOTS:
+            if given.only in name:
+                seeds = given.seeds // FEWER.get(name, 1)
+                lines.append(row(name, list(pool.map(fitted, [name] * seeds, range(seeds))), promised(name)))
+                sys.stdout.write(lines[-1] + "\n")
+                sys.stdout.flush()
+    if given.write:
+        page = PAGE.read_text(encoding="utf-8")
+        table = "\n".join(["<!-- plans:begin (written by `make plans`) -->", *lines, "<!-- plans:end -->"])
+        page = re.sub(r"<!-- plans:begin.*<!-- plans:end -->", lambda _: table, page, flags=re.DOTALL)
+        PAGE.write_text(page, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

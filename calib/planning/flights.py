@@ -1,0 +1,225 @@
+"""Plans of flights: how well delays will be known when distances are found together with them, and what brings more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from calib.errors import BadInputError
+from calib.estimation.arguments import check_choice
+from calib.planning.flight_result import FlightPlan
+from calib.planning.flying import flying
+from calib.planning.foresight import Errors, Flight, Foreseen, flight_of, foresee
+from calib.planning.rehearsal import Flown, rehearse
+from calib.planning.result import NextBest
+from calib.sources import Data
+from calib.surveys.scales import TWO_SIDED
+from calib.trajectories.fitting import ANCHORS, usable_of
+from calib.trajectories.given import Usable
+from uwblink.arrays import Floats
+
+GUESS_NS: Final = 1.5
+"""How far a delay is known without any data, for means over tags of which some are not determined."""
+
+MORE_KNOWN_S: Final = 10.0
+MORE_ANCHORS: Final = 4
+HEADING_DEG: Final = 0.5
+DELAY_STD_NS: Final = 0.05
+"""How well another calibration, or a survey, says the delay of one tag."""
+
+ACCELEROMETERS: Final = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
+"""Noise in m/s^2 a root of Hz, orders of magnitude of data sheets."""
+
+VIBRATION_M_S2: Final = 0.2
+"""What propellers leave of their shaking in a mean over a tenth of a second."""
+
+WINDOW_S: Final = 0.1
+TRUSTED: Final = 3.0
+"""By how much less a fit trusts an accelerometer than its residuals say."""
+
+Robots = int | Sequence[Sequence[int]]
+
+
+def plan_flight(  # noqa: PLR0913 - what somebody may have, each with its default
+    robots: Robots | Data,
+    *,
+    seconds: float = 60.0,
+    rate_hz: float = 80.0,
+    size_m: Sequence[float] = (6.0, 5.0, 2.5),
+    speed_m_s: float = 1.0,
+    apart_m: float = 0.5,
+    poses_until_s: float = 10.0,
+    attitudes: str = "poses",
+    heading_std_deg: float = 3.0,
+    imu: str | None = None,
+    anchors: Sequence[int] = (),
+    anchor_places: str = "given",
+    noise_m: float = 0.04,
+    reflected: float = 0.08,
+    delays_only: bool = False,
+    seed: int = 1,
+) -> FlightPlan:
+    """Return how well `fit_from_ranges` will know the delays of a flight, and what one more measurement would bring.
+
+    `robots` is how many there are, with two tags each, or the ids of the tags of each; or a recording of a flight with
+    poses all along (a simulated one, or an earlier one), from which motion, lever arms and powers are taken. Without a
+    recording robots fly for `seconds` about a room of `size_m` at about `speed_m_s`, tags of a robot are `apart_m` from
+    each other, and all pairs but those of two `anchors` (ids of tags about the walls) range in turn, `rate_hz` times a
+    second. Positions will be known for the first `poses_until_s`, `attitudes` come from "poses" (an attitude reference)
+    or the "imu", whose grade is "consumer", "industrial" or "tactical"; places of anchors are "given" or "sought". A
+    range has `noise_m`, and a share `reflected` is longer by 0.3 m on average. Raises `BadInputError` for what cannot
+    be, and `UnanswerableError` for a recording that no fit could use.
+
+    >>> import calib
+    >>> plan = calib.plan_flight(3, seconds=20.0)
+    >>> plan.undetermined, len(plan.half_ns)
+    ((), 6)
+    """
+    check_choice("anchor_places", anchor_places, ANCHORS)
+    usable = usable_of(poses_until_s, attitudes, heading_std_deg, anchor_places, (), "used")
+    for name, value, least, most in (("noise_m", noise_m, 1e-4, 10.0), ("reflected", reflected, 0.0, 0.9)):
+        if not (math.isfinite(value) and least <= value <= most):
+            raise BadInputError(f"found {value}, expected {least:g} to {most:g}", parameter=name)
+    if imu is not None and imu not in ACCELEROMETERS:
+        raise BadInputError(f"found {imu!r:.40}, allowed: {', '.join(ACCELEROMETERS)}", parameter="imu")
+    asked = _Asked(usable, Errors(noise_m=noise_m, reflected=reflected), not delays_only, imu)
+    # As in a fit; SciPy brings a linear algebra of its own, which must be there to be held.
+    import_module("scipy.linalg")
+    with threadpool_limits(limits=1, user_api="blas"):
+        if not isinstance(robots, int | Sequence) or isinstance(robots, str):
+            return _promise(asked, asked.flight(robots), None)
+        flown = flying(
+            robots,
+            anchors,
+            seconds=seconds,
+            rate_hz=rate_hz,
+            size_m=size_m,
+            speed_m_s=speed_m_s,
+            apart_m=apart_m,
+            inertial=imu is not None or attitudes == "imu",
+            seed=seed,
+        )
+        return _promise(asked, asked.flight(rehearse(flown)), flown)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What a fit will be given."""
+
+    usable: Usable
+    errors: Errors
+    curve: bool
+    imu: str | None
+
+    def flight(self, data: Data) -> Flight:
+        """Return the flight of a recording, or of what one would hold."""
+        force = None
+        if self.imu is not None:
+            force = TRUSTED * math.hypot(ACCELEROMETERS[self.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
+        return flight_of(data, self.usable, self.errors, curve=self.curve, force_std_m_s2=force)
+
+
+def _promise(asked: _Asked, flight: Flight, flown: Flown | None) -> FlightPlan:
+    found = foresee(flight)
+    std = found.verdict.std
+    known = np.isfinite(std)
+    which = known if known.any() else np.ones(len(std), dtype=bool)
+    covariance = found.covariance_ns2[np.ix_(which, which)]
+    count = len(covariance)
+    common = np.full(count, 1 / count)
+    apart = np.eye(count) - 1 / count
+    return FlightPlan(
+        flown=flown,
+        usable=asked.usable,
+        imu=asked.imu,
+        noise_m=asked.errors.noise_m,
+        reflected=asked.errors.reflected,
+        ranges=len(flight.scene.time_s),
+        seconds=float(np.ptp(flight.scene.time_s)),
+        source=flight.scene.source,
+        half_ns={tag: TWO_SIDED * float(s) for tag, s in zip(found.tags, std, strict=True)},
+        open_ns={
+            tag: TWO_SIDED * math.sqrt(v)
+            for tag, v in zip(found.tags, np.diag(found.covariance_ns2).tolist(), strict=True)
+        },
+        common_ns=TWO_SIDED * math.sqrt(float(common @ covariance @ common)),
+        apart_ns=TWO_SIDED * math.sqrt(float(np.trace(apart @ covariance @ apart)) / count),
+        verdict=found.verdict,
+        next_best=tuple(sorted(_more(asked, flight, flown, found), key=lambda one: one.mean_ns)),
+        path_m=flight.path_m,
+        stands=dict(flight.stands),
+        bodies=flight.scene.moving,
+    )
+
+
+def _mean_ns(covariance: Floats) -> float:
+    """Return the root mean square of half intervals, of which each is known to `GUESS_NS` at worst."""
+    information = np.linalg.pinv(covariance, hermitian=True) + np.eye(len(covariance)) / GUESS_NS**2
+    return TWO_SIDED * float(np.sqrt(np.trace(np.linalg.inv(information)) / len(covariance)))
+
+
+def _more(asked: _Asked, flight: Flight, flown: Flown | None, found: Foreseen) -> Iterator[NextBest]:
+    """Yield what one thing more would bring; intervals are of the same tags."""
+    now = _mean_ns(found.covariance_ns2)
+    for what, changed in (*_better_known(asked, flight), *_flown_otherwise(asked, flown)):
+        with_it = foresee(changed())
+        same = [with_it.tags.index(tag) for tag in found.tags]
+        mean = _mean_ns(with_it.covariance_ns2[np.ix_(same, same)])
+        if mean < now:
+            yield NextBest(what, mean, now)
+    tag, mean = _one_delay(found)
+    yield NextBest(f"the delay of tag {tag} from elsewhere, to {DELAY_STD_NS:g} ns", mean, now)
+
+
+Change = tuple[str, Callable[[], Flight]]
+
+
+def _better_known(asked: _Asked, flight: Flight) -> Iterator[Change]:
+    """Yield what might be known better of the same flight."""
+    usable = asked.usable
+    longer = (usable.poses_until_s or 0.0) + MORE_KNOWN_S
+    if longer < float(flight.scene.time_s[-1]):
+        yield f"positions known for the first {longer:g} s", lambda: flight.known_until(longer)
+    if flight.scene.sought:
+        yield "the places of the anchors, measured", flight.with_anchors_given
+    if usable.attitudes == "poses" and usable.heading_std_deg > HEADING_DEG:
+        better = math.radians(HEADING_DEG)
+        yield f"headings good to {HEADING_DEG:g} degrees", lambda: flight.with_headings(better)
+
+
+def _flown_otherwise(asked: _Asked, flown: Flown | None) -> Iterator[Change]:
+    """Yield other flights."""
+    if flown is None:
+        return
+    longer = replace(flown, seconds=2 * flown.seconds)
+    yield f"a flight of {longer.seconds:g} s", lambda: asked.flight(rehearse(longer))
+    if not flown.anchors:
+        four = replace(flown, anchors=_fresh(flown, MORE_ANCHORS))
+        fixed = replace(asked, usable=replace(asked.usable, anchors="given"))
+        yield f"{MORE_ANCHORS} anchors at known places", lambda: fixed.flight(rehearse(four))
+    elif asked.usable.anchors == "given":
+        more = replace(flown, anchors=(*flown.anchors, *_fresh(flown, 1)))
+        yield "one anchor more at a known place", lambda: asked.flight(rehearse(more))
+    if asked.imu is None and asked.usable.attitudes == "poses":
+        sensed = replace(asked, imu="consumer")
+        yield "inertial readings", lambda: sensed.flight(rehearse(replace(flown, inertial=True)))
+
+
+def _fresh(flown: Flown, count: int) -> tuple[int, ...]:
+    last = max(*(tag for robot in flown.robots for tag in robot), *flown.anchors, 0)
+    return tuple(range(last + 1, last + 1 + count))
+
+
+def _one_delay(found: Foreseen) -> tuple[int, float]:
+    """Return which tag's delay is best known from elsewhere, and the mean half interval with it."""
+    c = found.covariance_ns2
+    after = [c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2) for k in range(len(c))]
+    means = [_mean_ns(one) for one in after]
+    best = int(np.argmin(np.round(means, 6)))
+    return found.tags[best], means[best]

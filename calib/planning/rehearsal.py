@@ -1,0 +1,175 @@
+"""A flight as it might be flown, for a plan: bodies on sums of sines in a room, ranging in turn, without any error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+
+from calib.samples import stamped
+from uwblink.arrays import Floats, Ints
+from uwblink.recording.schema import Poses, Tag
+from uwblink.twr import Exchanges
+
+POSES_HZ: Final = 20.0
+IMU_HZ: Final = 50.0
+MIDDLES: Final = 0.3
+REACH: Final = 0.12
+"""Shares of the room: how far from its middle bodies fly about, and the size of each of the two sines an axis."""
+
+PERIODS: Final = (0.65, 1.7)
+TURN_RAD: Final = 1.2
+TURNS_S: Final = (11.0, 19.0)
+HANGING_M: Final = 0.05
+POWER_AT_2_M_DBM: Final = -80.0
+FADING_DB: Final = 3.0
+GRAVITY_M_S2: Final = 9.81
+EDGE: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flown:
+    """How bodies fly: tags by robot, the distance of a robot's tags, the room, speed, and anchors in its corners."""
+
+    robots: tuple[tuple[int, ...], ...]
+    apart_m: float
+    size_m: tuple[float, float, float]
+    speed_m_s: float
+    seconds: float
+    rate_hz: float
+    anchors: tuple[int, ...]
+    inertial: bool
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What a recording of the flight would hold, without errors or delays."""
+
+    exchanges: Exchanges
+    poses: Poses
+    tags: list[Tag]
+    imu: Mapping[str, Any] = field(default_factory=dict)
+
+
+def rehearse(flown: Flown) -> Rehearsal:
+    """Return a flight; the same for the same seed."""
+    rng = np.random.default_rng(flown.seed)
+    bodies = [_Body(flown, number, rng) for number in range(len(flown.robots))]
+    tags = [
+        Tag(tag, f"robot{number + 1}", tuple(arm))
+        for number, robot in enumerate(flown.robots)
+        for tag, arm in zip(robot, _arms(len(robot), flown.apart_m).tolist(), strict=True)
+    ]
+    stands = dict(zip(flown.anchors, _corners(flown), strict=True))
+    tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in stands]
+    time = np.arange(int(flown.seconds * flown.rate_hz)) / flown.rate_hz
+    pair = _in_turn(flown, len(time), rng)
+    where = _antennas(bodies, tags, stands, time)
+    number = {tag.tag: k for k, tag in enumerate(tags)}
+    ends = np.vectorize(number.__getitem__)(pair)
+    rows = np.arange(len(time))
+    distance = np.linalg.norm(where[ends[:, 0], rows] - where[ends[:, 1], rows], axis=1)
+    power = POWER_AT_2_M_DBM - 20 * np.log10(distance / 2) + rng.normal(0, FADING_DB, (2, len(time)))
+    exchanges = stamped(np.rint(time * 1e9).astype(np.int64), pair, distance, power)
+    imu = _readings(bodies, flown.seconds) if flown.inertial else {}
+    return Rehearsal(exchanges, _poses(bodies, stands, flown.seconds), tags, imu)
+
+
+class _Body:
+    """One body's motion: two sines an axis about a middle of its own, upright, turning to and fro."""
+
+    def __init__(self, flown: Flown, number: int, rng: np.random.Generator) -> None:
+        size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
+        self.name = f"robot{number + 1}"
+        self.middle = size * (0.5 + MIDDLES * np.array([np.cos(angle), np.sin(angle), 0.0]))
+        self.reach = REACH * size
+        slow = 2 * np.pi * float(np.linalg.norm(self.reach)) / flown.speed_m_s
+        self.rate = 2 * np.pi / (slow * rng.uniform(*PERIODS, (3, 2)))
+        self.phase = rng.uniform(0, 2 * np.pi, (3, 2))
+        self.turning = 2 * np.pi / rng.uniform(*TURNS_S)
+        self.heading = float(rng.uniform(-np.pi, np.pi))
+
+    def place(self, time_s: Floats, derivative: int = 0) -> Floats:
+        """Return where it is (n, 3), or a derivative of that by time."""
+        wave = np.sin(self.rate * time_s[:, None, None] + self.phase + derivative * np.pi / 2)
+        moved = self.reach * (wave * self.rate**derivative).sum(axis=2)
+        return np.asarray(moved + (self.middle if derivative == 0 else 0.0))
+
+    def yaw(self, time_s: Floats) -> Floats:
+        """Return its heading (n,)."""
+        return np.asarray(self.heading + TURN_RAD * np.sin(self.turning * time_s))
+
+    def yaw_rate(self, time_s: Floats) -> Floats:
+        """Return how fast its heading changes (n,)."""
+        return np.asarray(TURN_RAD * self.turning * np.cos(self.turning * time_s))
+
+
+def _arms(count: int, apart_m: float) -> Floats:
+    angle = 2 * np.pi * np.arange(count) / count + np.pi / 4
+    return np.column_stack([apart_m / 2 * np.cos(angle), apart_m / 2 * np.sin(angle), np.full(count, -HANGING_M)])
+
+
+def _corners(flown: Flown) -> list[Floats]:
+    """Return places of anchors around the room, high and low in turn."""
+    x, y, z = flown.size_m
+    count = len(flown.anchors)
+    angle = 2 * np.pi * np.arange(count) / max(count, 1) + np.pi / 4
+    reach = 0.5 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
+    high = np.where(np.arange(count) % 2, 1 - EDGE, EDGE)
+    return list(np.column_stack([x * (0.5 + reach * np.cos(angle)), y * (0.5 + reach * np.sin(angle)), z * high]))
+
+
+def _in_turn(flown: Flown, count: int, rng: np.random.Generator) -> Ints:
+    """Return who ranges with whom (n, 2): all pairs of bodies but two anchors, each round in another order."""
+    body = {tag: k for k, robot in enumerate(flown.robots) for tag in robot}
+    pairs = [(a, b) for a, b in combinations(body, 2) if body[a] != body[b]]
+    pairs += [(tag, anchor) for tag in body for anchor in flown.anchors]
+    rounds = [rng.permutation(pairs) for _ in range(-(-count // len(pairs)))]
+    return np.concatenate(rounds)[:count].astype(np.int64)
+
+
+def _antennas(bodies: list[_Body], tags: list[Tag], stands: Mapping[int, Floats], time_s: Floats) -> Floats:
+    """Return where each tag is at each instant (tags, n, 3)."""
+    by_name = {body.name: body for body in bodies}
+    found = np.empty((len(tags), len(time_s), 3))
+    for k, tag in enumerate(tags):
+        if tag.tag in stands:
+            found[k] = stands[tag.tag]
+            continue
+        body, (x, y, z) = by_name[tag.body], tag.lever_arm_m
+        c, s = np.cos(body.yaw(time_s)), np.sin(body.yaw(time_s))
+        found[k] = body.place(time_s) + np.column_stack([c * x - s * y, s * x + c * y, np.full(len(c), z)])
+    return found
+
+
+def _poses(bodies: list[_Body], stands: Mapping[int, Floats], seconds: float) -> Poses:
+    time = np.arange(-1.0, seconds + 1.0, 1 / POSES_HZ)
+    places = [body.place(time) for body in bodies] + [np.tile(place, (2, 1)) for place in stands.values()]
+    yaws = [body.yaw(time) for body in bodies] + [np.zeros(2) for _ in stands]
+    times = [time for _ in bodies] + [time[[0, -1]] for _ in stands]
+    names = [body.name for body in bodies] + [f"anchor{tag}" for tag in stands]
+    yaw = np.concatenate(yaws)
+    upright = np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)])
+    each = [len(some) for some in times]
+    return Poses.from_arrays(
+        np.rint(np.concatenate(times) * 1e9).astype(np.int64), np.repeat(names, each), np.concatenate(places), upright
+    )
+
+
+def _readings(bodies: list[_Body], seconds: float) -> dict[str, Any]:
+    """Return the table of inertial readings, without errors."""
+    time = np.arange(0.0, seconds + 0.5, 1 / IMU_HZ)
+    found: dict[str, list[Any]] = {name: [] for name in ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")}
+    for body in bodies:
+        c, s = np.cos(body.yaw(time)), np.sin(body.yaw(time))
+        x, y, z = body.place(time, 2).T
+        columns = (0 * c, 0 * c, body.yaw_rate(time), c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
+        found["time_ns"].append(np.rint(time * 1e9).astype(np.int64))
+        found["body"].append(np.full(len(time), body.name))
+        for name, column in zip(("wx", "wy", "wz", "ax", "ay", "az"), columns, strict=True):
+            found[name].append(column)
+    return {name: np.concatenate(parts) for name, parts in found.items()}

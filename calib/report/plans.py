@@ -1,0 +1,106 @@
+"""A plan as a page, as PDF and as figures: steps, a picture of each arrangement, intervals, and what brings more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from calib.planning.flight_result import FlightPlan
+from calib.planning.procedure import where
+from calib.planning.result import Plan
+from calib.report import figures_plan
+from calib.report.blocks import Block, Document, Heading, Listing, Picture, Table, Text
+from calib.report.writing import write_document
+
+MEAN_OF_ALL: Final = "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines."
+PLACES: Final = {"line": "on a line", "plane": "in a plane", "": "in space"}
+
+
+def write_plan(
+    plan: Plan | FlightPlan,
+    output: Path | None,
+    figures: Path | None,
+    *,
+    commands: Sequence[str] = (),
+    force: bool = False,
+) -> None:
+    """Write a plan as a page (.html or .pdf), and its figures into a folder, as PDF and SVG at two widths.
+
+    `commands` are shown as what carries it out. Raises what `check_places` raises.
+    """
+    blocks = list(_of_flight(plan) if isinstance(plan, FlightPlan) else _of_boards(plan))
+    if commands:
+        blocks += [Heading("Commands"), Listing("\n".join(commands))]
+    count = len(plan.half_ns)
+    title = (
+        f"Plan of a flight: {count} tags"
+        if isinstance(plan, FlightPlan)
+        else f"Plan: {count} boards {PLACES[plan.on]}, {len(plan.arrangements)} arrangements"
+    )
+    write_document(Document(title, blocks), output, None, figures, force=force)
+
+
+def _of_boards(plan: Plan) -> Iterator[Block]:
+    yield Text(
+        f"{_known(plan)} if the constant error of a pair is {100 * plan.pair_error_m:.1f} cm. Places are guides; "
+        "nothing but what is taped is measured.",
+        "lead",
+    )
+    for k, one in enumerate(plan.arrangements):
+        yield Heading(f"Step {k + 1}: arrangement {one.name}")
+        tapes = "".join(f" Tape the distance of {i} and {j}, antenna to antenna." for i, j in one.taped)
+        places = f"Boards {where(plan.on, one)}".replace("Boards with", "Board")
+        yield Text(f"{places}.{tapes} Record all pairs for {plan.seconds_each:.0f} s.")
+        yield Picture(
+            f"arrangement-{one.name}",
+            partial(figures_plan.arrangement, plan=plan, number=k),
+            f"Arrangement {one.name}, and the intervals of the delays when it has been made.",
+        )
+    yield from _promise(plan)
+
+
+def _of_flight(plan: FlightPlan) -> Iterator[Block]:
+    yield Text(
+        f"{_known(plan)}, and what they share to ± {plan.common_ns:.3f} ns, if ranges have "
+        f"{100 * plan.noise_m:.1f} cm of noise and {100 * plan.reflected:.0f} % are reflected.",
+        "lead",
+    )
+    yield Heading("What to do")
+    yield Listing("\n".join(plan.steps))
+    yield Picture(
+        "flight",
+        partial(figures_plan.flight, plan=plan),
+        "The flight from above and its heights, as a guide; thick where positions are known.",
+    )
+    yield Heading("What it promises")
+    yield Picture("delays", partial(figures_plan.delays, plan=plan), "Half the interval (95 %) of each delay.")
+    yield from _promise(plan)
+
+
+def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
+    if isinstance(plan, Plan):
+        yield Heading("What it promises")
+    yield Table(["tag", "delay"], [[str(tag), _half(half)] for tag, half in plan.half_ns.items()])
+    if plan.undetermined:
+        yield Text(f"Not determined: {'; '.join(direction.words for direction in plan.verdict.free)}.", "warning")
+    if plan.next_best:
+        yield Heading("What one thing more would bring")
+        yield Picture("more", partial(figures_plan.more, next_best=plan.next_best), MEAN_OF_ALL)
+
+
+def _half(half: float) -> str:
+    return f"± {half:.3f} ns" if math.isfinite(half) else "undetermined"
+
+
+def _known(plan: Plan | FlightPlan) -> str:
+    """Return the beginning of a sentence: how well delays will be known on average."""
+    known = [half for half in plan.half_ns.values() if math.isfinite(half)]
+    if not known:
+        return "No delay will be determined"
+    mean = f"known to ± {math.sqrt(sum(half**2 for half in known) / len(known)):.3f} ns on average (95 %)"
+    if len(known) == len(plan.half_ns):
+        return f"Delays will be {mean}"
+    return f"{len(known)} of {len(plan.half_ns)} delays will be {mean}"

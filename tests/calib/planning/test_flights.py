@@ -1,0 +1,213 @@
+"""Plans of flights: what counting says, what fits of flights then find, and what cannot be planned."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import calib
+from calib.cli.commands import app
+from calib.planning.foresight import Errors, flight_of, foresee
+from calib.planning.rehearsal import Flown, rehearse
+from calib.trajectories.given import Usable
+from tests.calib.trajectories.sines import flight
+
+CORNERS = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5]]
+ROBOTS = ((1, 2), (3, 4))
+THREE: Any = {"robots": (*ROBOTS, (5, 6)), "anchors": (), "rate_hz": 80.0}
+ANCHORS = (11, 12, 13, 14)
+C_M_PER_NS = 0.299702547
+
+
+def mean(plan):
+    return float(np.sqrt(np.mean(np.square(list(plan.open_ns.values())))))
+
+
+def rehearsed(**other):
+    given: Any = {"robots": ROBOTS, "anchors": ANCHORS, "inertial": False, "seconds": 10.0, "rate_hz": 50.0, "seed": 1}
+    given |= {"apart_m": 0.5, "size_m": (6.0, 5.0, 2.5), "speed_m_s": 1.0}
+    return rehearse(Flown(**(given | other)))
+
+
+def foreseen_ns(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
+    """Root mean variance of the delays, and their covariance."""
+    errors = Errors(noise_m=noise_m, reflected=reflected)
+    covariance = foresee(flight_of(seen, Usable(**usable), errors, curve=curve, force_std_m_s2=force)).covariance_ns2
+    return math.sqrt(np.trace(covariance) / len(covariance))
+
+
+def test_noise_alone_informs_by_its_inverse_variance_and_reflected_ranges_by_less():
+    plain = Errors(noise_m=0.05, reflected=0.0).informed()
+    assert plain == pytest.approx(0.05**-2, rel=1e-3)
+    # A reflected range says nearly nothing; a few that pass for direct ones blur those.
+    assert 0.6 * 0.7 * plain < Errors(noise_m=0.05, reflected=0.3).informed() < 0.7 * plain
+
+
+def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
+    """Positions known all along, exactly: the covariance is that of least squares on delays alone."""
+    seen = flight(seconds=12.0)
+    planned = flight_of(
+        seen,
+        Usable(poses_until_s=None, heading_std_deg=0.0),
+        Errors(noise_m=0.04, reflected=0.0),
+        curve=False,
+        force_std_m_s2=None,
+    )
+    exact = planned.scene.places
+    object.__setattr__(exact, "std_m", np.full(len(exact.std_m), 1e-5))
+    found = foresee(planned)
+    both = np.column_stack([planned.scene.ranges.initiator, planned.scene.ranges.target])
+    rows = 0.5 * C_M_PER_NS * (both[:, :, None] == np.array(found.tags)).sum(axis=1)
+    expected = np.linalg.inv(rows.T @ rows / 0.04**2)
+    assert found.covariance_ns2 == pytest.approx(expected, rel=0.02, abs=1e-7)
+
+
+def test_twice_the_noise_is_twice_the_interval_where_ranges_alone_say_it():
+    plain = {"heading_std_deg": 0.0, "curve": False, "reflected": 0.0}
+    seen = rehearsed()
+    one, two = (foreseen_ns(seen, noise_m=noise, **plain) for noise in (0.001, 0.002))
+    assert 1.2 < two / one < 2.0001
+
+
+def test_what_a_fit_says_is_what_was_promised():
+    """One flight: the intervals of the fit, which estimates errors and smoothness, are within a fifth."""
+    seen = flight(seconds=16.0, seed=1, wander_deg=3.0, tilt_deg=1.0, place_noise_m=0.02)
+    plan = calib.plan_flight(seen, poses_until_s=8.0)
+    fitted = calib.fit_from_ranges(seen, poses_until_s=8.0).calibration.delays_std_ns
+    said = 1.96 * np.array([fitted[tag] for tag in plan.half_ns])
+    assert plan.undetermined == ()
+    assert float(np.sqrt(np.mean(said**2))) == pytest.approx(mean(plan), rel=0.2)
+
+
+def test_a_flight_like_it_promises_about_the_same():
+    like = rehearsed(**THREE, seconds=24.0, apart_m=0.68, speed_m_s=0.7)
+    seen = foreseen_ns(flight(seconds=24.0), poses_until_s=8.0)
+    assert foreseen_ns(like, poses_until_s=8.0) == pytest.approx(seen, rel=0.2)
+
+
+def test_what_nothing_determines_is_named_and_what_would_is_ranked():
+    plan = calib.plan_flight(3, poses_until_s=0.0, seconds=16.0)
+    assert plan.undetermined == (1, 2, 3, 4, 5, 6)
+    assert all(math.isinf(half) for half in plan.half_ns.values())
+    assert plan.next_best[0].what == "positions known for the first 10 s"
+    assert [best.mean_ns for best in plan.next_best] == sorted(best.mean_ns for best in plan.next_best)
+    with_it = 1.96 * foreseen_ns(rehearsed(**THREE, seconds=16.0), poses_until_s=10.0)
+    assert with_it == pytest.approx(plan.next_best[0].mean_ns, rel=0.01)
+
+
+def test_sought_anchors_stay_open_and_given_ones_do_not():
+    seen = flight(anchors=CORNERS, rate=120)
+    sought = calib.plan_flight(seen, poses_until_s=8.0, anchor_places="sought")
+    assert sought.undetermined == (11, 12, 13, 14)
+    assert sought.next_best[0].what == "the places of the anchors, measured"
+    assert 1.96 * foreseen_ns(seen, poses_until_s=8.0) == pytest.approx(sought.next_best[0].mean_ns, rel=0.02)
+
+
+def test_better_knowledge_never_widens():
+    seen = rehearsed()
+    base = foreseen_ns(seen, poses_until_s=3.0)
+    assert foreseen_ns(seen, poses_until_s=3.0, noise_m=0.02) < 0.9 * base
+    assert foreseen_ns(seen, poses_until_s=3.0, reflected=0.0) < base
+    assert foreseen_ns(seen, poses_until_s=3.0, heading_std_deg=0.5) < base
+    assert foreseen_ns(seen, poses_until_s=6.0) < base
+    assert foreseen_ns(seen, poses_until_s=3.0, anchors="sought") > base
+    assert foreseen_ns(rehearsed(seconds=20.0), poses_until_s=3.0) < base
+
+
+def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
+    few = {"rate_hz": 12.0, "seconds": 20.0}
+    without = foreseen_ns(rehearsed(**few), poses_until_s=5.0)
+    poor, good = (foreseen_ns(rehearsed(**few, inertial=True), poses_until_s=5.0, force=std) for std in (0.6, 0.02))
+    assert good < 0.97 * without
+    assert good < poor < 1.05 * without
+
+
+def test_the_motion_that_is_rehearsed_is_one_motion():
+    """Ranges are those of poses and lever arms; readings are the second derivative of the poses."""
+    seen = rehearsed(robots=((1, 2), (7,)), anchors=(9,), inertial=True, seconds=8.0, seed=3)
+    ranges = calib.load_ranges(seen)
+    assert set(map(tuple, np.sort(np.column_stack([ranges.initiator, ranges.target])).tolist())) == {
+        (1, 7), (2, 7), (1, 9), (2, 9), (7, 9)
+    }  # fmt: skip
+    # A tick of the clock is 2 mm of range, and poses are interpolated.
+    assert np.abs(ranges.raw_m - ranges.truth_m).max() < 0.01
+    mine = seen.poses.body == "robot1"
+    time, height = seen.poses.time_ns[mine] * 1e-9, seen.poses.position_m[mine, 2]
+    bend = np.gradient(np.gradient(height, time), time)
+    read = seen.imu["body"] == "robot1"
+    force = np.interp(time, seen.imu["time_ns"][read] * 1e-9, seen.imu["az"][read]) - 9.81
+    inside = (time > 1) & (time < 7)
+    assert force[inside] == pytest.approx(bend[inside], abs=0.02)
+    assert np.ptp(seen.poses.position_m[mine], axis=0).max() < 6.0
+
+
+def test_the_command_prints_steps_and_what_a_fit_is_told():
+    words = ["plan", "1,2/5", "--on", "flight", "--seconds", "8", "--anchors", "11,12,13,14", "--rate", "40"]
+    done = CliRunner().invoke(app, [*words, "--poses-until", "0", "--heading-std", "1"])
+    assert done.exit_code == 0
+    assert "tags 1 and 2 on robot 1, 5 on robot 2." in done.stdout
+    assert done.stdout.endswith(
+        "calib fit flight.uwb --truth ranges --poses-until 0 --heading-std 1 --anchors given -o calibration.json\n"
+    )
+    told = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)
+    assert sorted(told["half_interval_ns"], key=int) == ["1", "2", "5", "11", "12", "13", "14"]
+    assert told["next_best"][0]["mean_ns"] < told["next_best"][0]["instead_of_ns"]
+
+
+@pytest.mark.parametrize(
+    ("robots", "settings", "message"),
+    [
+        (0, {}, "robots"),
+        (1, {}, "ranges with nobody"),
+        ([[1, 2], [2]], {}, "robots"),
+        ([[1], []], {}, "robots"),
+        ([[-1], [2]], {}, "robots"),
+        (3, {"anchors": [1]}, "anchors"),
+        (3, {"seconds": 1.0}, "seconds"),
+        (3, {"seconds": 3600.0}, "more than a plan takes"),
+        (3, {"rate_hz": math.nan}, "rate_hz"),
+        (3, {"speed_m_s": 0.0}, "speed_m_s"),
+        (3, {"apart_m": -1.0}, "apart_m"),
+        (3, {"size_m": (3.0, 2.0)}, "size_m"),
+        (3, {"noise_m": 0.0}, "noise_m"),
+        (3, {"reflected": 1.0}, "reflected"),
+        (3, {"imu": "good"}, "imu"),
+        (3, {"attitudes": "eyes"}, "attitudes"),
+        (3, {"anchor_places": "lost"}, "anchor_places"),
+        (3, {"poses_until_s": -1.0}, "poses_until_s"),
+        (3, {"seconds": 5.0, "rate_hz": 1.0}, "too few"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(robots, settings, message):
+    with pytest.raises(ValueError, match=message):
+        calib.plan_flight(robots, **settings)
+
+
+def test_a_flight_whose_poses_lack_is_refused_in_one_line():
+    seen = flight(seconds=12.0)
+    seen.poses = seen.poses[seen.poses.body != "robot1"]
+    with pytest.raises(calib.UnanswerableError, match="no positions of body robot1"):
+        calib.plan_flight(seen)
+
+
+@pytest.mark.parametrize(
+    ("words", "flag"),
+    [
+        (["4", "--seconds", "60"], "--seconds"),
+        (["4", "--imu", "consumer"], "--imu"),
+        (["3", "--on", "flight", "--taped", "1"], "--taped"),
+        (["3", "--on", "flight", "--pair-error", "0.02"], "--pair-error"),
+        (["a.uwb", "--on", "flight", "--seconds", "60"], "--seconds"),
+        (["three", "--on", "flight"], "COUNT"),
+        (["3", "--on", "flight", "--noise", "-1"], "--noise"),
+    ],
+)
+def test_settings_of_the_other_kind_of_plan_are_refused_by_their_flag(words, flag):
+    from calib.cli.flags import with_flags
+
+    done = CliRunner().invoke(app, ["plan", *words])
+    assert isinstance(done.exception, calib.BadInputError)
+    assert flag in with_flags(str(done.exception))
