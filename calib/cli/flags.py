@@ -11,6 +11,7 @@ FLAGS: Final = {
     "distances": "--distance",
     "robots": "COUNT",
     "noise_m": "--noise",
+    "still_s": "--still",
     "speed_m_s": "--speed",
     "apart_m": "--apart",
     "fixed_ns": "--fix",

@@ -61,6 +61,11 @@ def plan(
     rate: Annotated[
         float | None, typer.Option(help="Exchanges a second of all together; 50 by default, 80 of a flight.")
     ] = None,
+    taped: Annotated[int | None, typer.Option(help="How many distances will be measured with a tape.")] = None,
+    tape_sigma: Annotated[
+        float | None,
+        typer.Option(help="Standard deviation of such a distance (m); 0.005 by default, 0.01 of a flight."),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="The plan as a page to write (.html or .pdf).")
     ] = None,
@@ -68,13 +73,6 @@ def plan(
     arrangements: Annotated[
         int | None,
         typer.Option(rich_help_panel=STANDING, help="How many arrangements; by default as many as are worth it."),
-    ] = None,
-    taped: Annotated[
-        int | None, typer.Option(rich_help_panel=STANDING, help="How many distances will be measured with a tape.")
-    ] = None,
-    tape_sigma: Annotated[
-        float | None,
-        typer.Option(rich_help_panel=STANDING, help="Standard deviation of such a distance (m); 0.005 by default."),
     ] = None,
     anchor_sigma: Annotated[
         float | None,
@@ -130,6 +128,12 @@ def plan(
             **choice("given", "sought"),
         ),
     ] = None,
+    still: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS", rich_help_panel=FLYING, help="How long robots stand before they fly, for a tape."
+        ),
+    ] = None,
     noise: Annotated[
         float | None, typer.Option(rich_help_panel=FLYING, help="Noise of a range (m); 0.04 by default.")
     ] = None,
@@ -147,11 +151,11 @@ def plan(
         "size_m": None if size is None else _numbers(size, "size_m"),
         "anchors": None if anchors is None else [int(tag) for tag in _numbers(anchors, "anchors")],
         "rate_hz": rate,
+        "taped": taped,
+        "tape_sigma_m": tape_sigma,
     }
     standing = {
         "arrangements": arrangements,
-        "taped": taped,
-        "tape_sigma_m": tape_sigma,
         "anchor_sigma_m": anchor_sigma,
         "pair_error_m": pair_error,
     }
@@ -164,6 +168,7 @@ def plan(
         "heading_std_deg": heading_std,
         "imu": imu,
         "anchor_places": anchor_places,
+        "still_s": still,
         "noise_m": noise,
         "reflected": reflected,
         "delays_only": delays_only or None,
@@ -256,6 +261,8 @@ def _flight_commands(found: calib.FlightPlan, boards: str) -> Iterator[str]:
     words += [f"--attitudes {usable.attitudes}"] if usable.attitudes != "poses" else []
     words += [f"--heading-std {usable.heading_std_deg:g}"] if usable.heading_std_deg != 3 else []
     words += [f"--anchors {usable.anchors}"] if found.stands else []
+    when = f"@0..{found.still_s:g}" if found.still_s else ""
+    words += [f"--distance {first}-{second}=METRES{when}" for first, second in found.taped]
     yield f"calib fit {name} --truth ranges {' '.join(words)} -o calibration.json"
 
 

@@ -20,8 +20,9 @@ class FlightPlan:
 
     `open_ns` are the intervals of all, determined or not; `common_ns` is that of what all delays share, `apart_ns` that
     of a delay against the mean of all: both of the determined ones, or of all where none is. `next_best` is what one
-    measurement more would bring, the best first. `flown` is how robots fly, None where a recording says so. `path_m`
-    (k, bodies, 3) is where the moving `bodies` are, `stands` where others stand.
+    measurement more would bring, the best first. `taped` are pairs of tags whose distance is to be measured, of anchors
+    or of robots while they stand for the first `still_s`. `flown` is how robots fly, None where a recording says so.
+    `path_m` (k, bodies, 3) is where the moving `bodies` are, `stands` where others stand.
 
     >>> import calib
     >>> plan = calib.plan_flight(2, seconds=20.0, poses_until_s=0.0, anchors=[11, 12, 13, 14])
@@ -43,6 +44,8 @@ class FlightPlan:
     apart_ns: float
     verdict: Verdict
     next_best: tuple[NextBest, ...]
+    taped: tuple[tuple[int, int], ...]
+    still_s: float
     path_m: Floats
     stands: Mapping[str, Floats]
     bodies: tuple[str, ...]
@@ -86,10 +89,15 @@ class FlightPlan:
         if self.stands:
             given = self.usable.anchors == "given"
             yield f"Places of the {len(self.stands)} anchors {'are measured' if given else 'are found along'}."
+        for first, second in self.taped:
+            yield f"Tape the distance of tags {first} and {second}, antenna to antenna{self._while()}."
         if self.usable.attitudes == "imu":
             yield "Attitudes come from gyroscopes and accelerometers."
         elif self.usable.attitudes == "poses":
             yield f"Attitudes come all along, with headings good to {self.usable.heading_std_deg:g} degrees."
+
+    def _while(self) -> str:
+        return f", while robots stand for the first {self.still_s:g} s" if self.still_s else ""
 
     def _intervals(self) -> Iterator[str]:
         percent = 100 * self.reflected
@@ -114,6 +122,7 @@ class FlightPlan:
             "seconds": self.seconds,
             "noise_m": self.noise_m,
             "reflected": self.reflected,
+            "taped": [list(pair) for pair in self.taped],
             "half_interval_ns": known,
             "half_interval_all_ns": {str(tag): half for tag, half in self.open_ns.items()},
             "common_ns": self.common_ns,

@@ -15,7 +15,7 @@ from calib.errors import BadInputError
 from calib.estimation.arguments import check_choice
 from calib.planning.flight_result import FlightPlan
 from calib.planning.flying import flying
-from calib.planning.foresight import Errors, Flight, Foreseen, flight_of, foresee
+from calib.planning.foresight import Errors, Flight, Foreseen, best_tape, flight_of, foresee
 from calib.planning.rehearsal import Flown, rehearse
 from calib.planning.result import NextBest
 from calib.sources import Data
@@ -29,6 +29,8 @@ GUESS_NS: Final = 1.5
 
 MORE_KNOWN_S: Final = 10.0
 MORE_ANCHORS: Final = 4
+STANDS_S: Final = 5.0
+MOST_TAPED: Final = 10
 HEADING_DEG: Final = 0.5
 DELAY_STD_NS: Final = 0.05
 """How well another calibration, or a survey, says the delay of one tag."""
@@ -60,6 +62,9 @@ def plan_flight(  # noqa: PLR0913 - what somebody may have, each with its defaul
     imu: str | None = None,
     anchors: Sequence[int] = (),
     anchor_places: str = "given",
+    still_s: float = 0.0,
+    taped: int = 0,
+    tape_sigma_m: float = 0.01,
     noise_m: float = 0.04,
     reflected: float = 0.08,
     delays_only: bool = False,
@@ -71,10 +76,14 @@ def plan_flight(  # noqa: PLR0913 - what somebody may have, each with its defaul
     poses all along (a simulated one, or an earlier one), from which motion, lever arms and powers are taken. Without a
     recording robots fly for `seconds` about a room of `size_m` at about `speed_m_s`, tags of a robot are `apart_m` from
     each other, and all pairs but those of two `anchors` (ids of tags about the walls) range in turn, `rate_hz` times a
-    second. Positions will be known for the first `poses_until_s`, `attitudes` come from "poses" (an attitude reference)
-    or the "imu", whose grade is "consumer", "industrial" or "tactical"; places of anchors are "given" or "sought". A
-    range has `noise_m`, and a share `reflected` is longer by 0.3 m on average. Raises `BadInputError` for what cannot
-    be, and `UnanswerableError` for a recording that no fit could use.
+    second. Robots stand for the first `still_s`.
+
+    Positions will be known for the first `poses_until_s`; `attitudes` come from "poses" (an attitude reference) or the
+    "imu", whose grade is "consumer", "industrial" or "tactical"; places of anchors are "given" or "sought". `taped`
+    distances are measured to `tape_sigma_m` where they bring most: of tags of robots that stand, and of anchors whose
+    places are sought. A range has `noise_m`, and a share `reflected` is longer by 0.3 m on average.
+
+    Raises `BadInputError` for what cannot be, and `UnanswerableError` for a recording that no fit could use.
 
     >>> import calib
     >>> plan = calib.plan_flight(3, seconds=20.0)
@@ -83,12 +92,26 @@ def plan_flight(  # noqa: PLR0913 - what somebody may have, each with its defaul
     """
     check_choice("anchor_places", anchor_places, ANCHORS)
     usable = usable_of(poses_until_s, attitudes, heading_std_deg, anchor_places, (), "used")
-    for name, value, least, most in (("noise_m", noise_m, 1e-4, 10.0), ("reflected", reflected, 0.0, 0.9)):
+    for name, value, least, most in (
+        ("noise_m", noise_m, 1e-4, 10.0),
+        ("reflected", reflected, 0.0, 0.9),
+        ("still_s", still_s, 0.0, 600.0),
+        ("taped", taped, 0, MOST_TAPED),
+        ("tape_sigma_m", tape_sigma_m, 1e-4, 1.0),
+    ):
         if not (math.isfinite(value) and least <= value <= most):
             raise BadInputError(f"found {value}, expected {least:g} to {most:g}", parameter=name)
     if imu is not None and imu not in ACCELEROMETERS:
         raise BadInputError(f"found {imu!r:.40}, allowed: {', '.join(ACCELEROMETERS)}", parameter="imu")
-    asked = _Asked(usable, Errors(noise_m=noise_m, reflected=reflected), not delays_only, imu)
+    asked = _Asked(
+        usable=usable,
+        errors=Errors(noise_m=noise_m, reflected=reflected),
+        curve=not delays_only,
+        imu=imu,
+        still_s=still_s,
+        taped=taped,
+        tape_sigma_m=tape_sigma_m,
+    )
     # As in a fit; SciPy brings a linear algebra of its own, which must be there to be held.
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
@@ -102,13 +125,14 @@ def plan_flight(  # noqa: PLR0913 - what somebody may have, each with its defaul
             size_m=size_m,
             speed_m_s=speed_m_s,
             apart_m=apart_m,
+            still_s=still_s,
             inertial=imu is not None or attitudes == "imu",
             seed=seed,
         )
         return _promise(asked, asked.flight(rehearse(flown)), flown)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Asked:
     """What a fit will be given."""
 
@@ -116,13 +140,30 @@ class _Asked:
     errors: Errors
     curve: bool
     imu: str | None
+    still_s: float
+    taped: int
+    tape_sigma_m: float
 
     def flight(self, data: Data) -> Flight:
         """Return the flight of a recording, or of what one would hold."""
         force = None
         if self.imu is not None:
             force = TRUSTED * math.hypot(ACCELEROMETERS[self.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
-        return flight_of(data, self.usable, self.errors, curve=self.curve, force_std_m_s2=force)
+        flight = flight_of(data, self.usable, self.errors, curve=self.curve, force_std_m_s2=force)
+        for _ in range(self.taped):
+            flight = self.with_tape(flight) or flight
+        if len(flight.tapes) < self.taped:
+            raise BadInputError(
+                f"only {len(flight.tapes)} can be measured: of robots while they stand (`still_s`), and of anchors "
+                "whose places are sought",
+                parameter="taped",
+            )
+        return flight
+
+    def with_tape(self, flight: Flight) -> Flight | None:
+        """Return the flight with one distance more, the best one; None where there is none."""
+        best = best_tape(flight, self.still_s, self.tape_sigma_m)
+        return best and flight.taped([*flight.tapes, best], self.still_s, self.tape_sigma_m)
 
 
 def _promise(asked: _Asked, flight: Flight, flown: Flown | None) -> FlightPlan:
@@ -152,6 +193,8 @@ def _promise(asked: _Asked, flight: Flight, flown: Flown | None) -> FlightPlan:
         apart_ns=TWO_SIDED * math.sqrt(float(np.trace(apart @ covariance @ apart)) / count),
         verdict=found.verdict,
         next_best=tuple(sorted(_more(asked, flight, flown, found), key=lambda one: one.mean_ns)),
+        taped=tuple(flight.tapes),
+        still_s=asked.still_s,
         path_m=flight.path_m,
         stands=dict(flight.stands),
         bodies=flight.scene.moving,
@@ -186,6 +229,10 @@ def _better_known(asked: _Asked, flight: Flight) -> Iterator[Change]:
     longer = (usable.poses_until_s or 0.0) + MORE_KNOWN_S
     if longer < float(flight.scene.time_s[-1]):
         yield f"positions known for the first {longer:g} s", lambda: flight.known_until(longer)
+    taped = asked.with_tape(flight)
+    if taped:
+        first, second = taped.tapes[-1]
+        yield f"the distance of tags {first} and {second} by tape", lambda: taped
     if flight.scene.sought:
         yield "the places of the anchors, measured", flight.with_anchors_given
     if usable.attitudes == "poses" and usable.heading_std_deg > HEADING_DEG:
@@ -197,6 +244,10 @@ def _flown_otherwise(asked: _Asked, flown: Flown | None) -> Iterator[Change]:
     """Yield other flights."""
     if flown is None:
         return
+    if not asked.still_s:
+        stands = replace(asked, still_s=STANDS_S, taped=asked.taped + 1)
+        text = f"robots that stand for the first {STANDS_S:g} s, and the distance of two of their tags by tape"
+        yield text, lambda: stands.flight(rehearse(replace(flown, still_s=STANDS_S)))
     longer = replace(flown, seconds=2 * flown.seconds)
     yield f"a flight of {longer.seconds:g} s", lambda: asked.flight(rehearse(longer))
     if not flown.anchors:

@@ -28,6 +28,7 @@ def flying(  # noqa: PLR0913 - keyword-only, as `plan_flight` takes them
     size_m: Sequence[float],
     speed_m_s: float,
     apart_m: float,
+    still_s: float,
     inertial: bool,
     seed: int,
 ) -> Flown:
@@ -49,6 +50,7 @@ def flying(  # noqa: PLR0913 - keyword-only, as `plan_flight` takes them
         size_m=(x, y, z),
         speed_m_s=speed_m_s,
         seconds=seconds,
+        still_s=still_s,
         rate_hz=rate_hz,
         anchors=tuple(map(int, anchors)),
         inertial=inertial,

@@ -6,8 +6,9 @@ known beside them, the same unknowns of curves, anchors and biases. Only what a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -28,11 +29,13 @@ from calib.trajectories.given import Usable, scene_from
 from calib.trajectories.inertial import Inertial
 from calib.trajectories.judging import verdict_on
 from calib.trajectories.known_rows import known_rows
-from calib.trajectories.range_rows import range_rows
+from calib.trajectories.range_rows import range_rows, tape_rows
 from calib.trajectories.scene import Places, Scene
 from calib.trajectories.starting import SAMPLE_S, Followed, through
+from calib.trajectories.tapes import tapes_of
 from calib.trajectories.unknowns import Columns, State, columns_of
 from uwblink.arrays import Floats
+from uwblink.recording.schema import KnownDistance
 
 CURVE_M: Final = 0.05
 CURVE_BENDS: Final = 3.0
@@ -95,6 +98,11 @@ class Flight:
     path_m: Floats
     stands: Mapping[str, Floats]
 
+    @property
+    def tapes(self) -> list[tuple[int, int]]:
+        """The pairs of tags whose distance is measured beside."""
+        return [(one.first, one.second) for one in self.scene.tapes.told]
+
     def known_until(self, seconds: float) -> Flight:
         """Return the flight with positions known so long."""
         return replace(self, scene=replace(self.scene, places=self.known[self.known.time_s < seconds]))
@@ -102,6 +110,21 @@ class Flight:
     def with_anchors_given(self) -> Flight:
         """Return the flight with the places of all anchors known."""
         return replace(self, scene=replace(self.scene, still=dict(self.stands)))
+
+    def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> Flight:
+        """Return the flight with distances of tags measured beside, while bodies stand at first or between anchors."""
+        when = f"0..{still_s:g}" if still_s else ""
+        stated = [KnownDistance(first, second, 1.0, sigma_m, when) for first, second in pairs]
+        bodies = {tag: body for tag, (body, _) in self.scene.arms.items()}
+        tapes = tapes_of(stated, (), bodies, self.scene.still, 0, float(self.scene.time_s[-1]))
+        return replace(self, scene=replace(self.scene, tapes=tapes))
+
+    def pairs_to_tape(self, still_s: float) -> list[tuple[int, int]]:
+        """Return the pairs of tags whose distance says something: of bodies that stand where nobody knows."""
+        stand = {body for body, place in self.scene.still.items() if place is None}
+        stand |= set(self.scene.moving) if still_s else set()
+        body = {tag: one for tag, (one, _) in self.scene.arms.items() if one in stand}
+        return [(a, b) for a, b in combinations(sorted(body), 2) if body[a] != body[b]]
 
     def with_headings(self, std_rad: float) -> Flight:
         """Return the flight with headings known so well."""
@@ -175,25 +198,70 @@ def _path(truth: Scene) -> tuple[Floats, Floats]:
 
 def foresee(flight: Flight) -> Foreseen:
     """Return what a fit of the flight will say of the delays."""
-    scene, problem = flight.scene, flight.problem
-    columns = columns_of(scene, problem.design.shape[1])
-    stand = np.array([flight.stands[body] for body in scene.sought]).reshape(-1, 3)
-    state = through(scene, columns, Followed(flight.path_s, flight.path_m), stand)
-    design = problem.design.written_out()
-    rows = range_rows(scene, columns, np.zeros(len(scene.time_s)), design)
-    _, local, border = rows.linear(state)
-    informed = np.full(len(scene.time_s), flight.errors.informed())
-    known = known_rows(scene, columns, state, _jerk(columns, state)).linear(state)
-    schur = Factored(normal_of(local, border, informed) + known.normal).schur
-    ridge = _ridge(problem, schur)
-    size = columns.design
-    delays = problem.directions @ stating(problem, flight.reference)[: problem.rank]
-    covariance = delays @ np.linalg.pinv(schur + ridge, rcond=1e-13, hermitian=True)[:size, :size] @ delays.T
-    of_ranges = (design * informed[:, None]).T @ design + ridge[:size, :size]
-    with_truth = delays @ np.linalg.pinv(of_ranges, hermitian=True) @ delays.T
-    return Foreseen(
-        tags=tuple(problem.tags), covariance_ns2=covariance, verdict=verdict_on(covariance, with_truth, problem)
-    )
+    return _Linearised(flight).foreseen()
+
+
+def best_tape(flight: Flight, still_s: float, sigma_m: float) -> tuple[int, int] | None:
+    """Return the pair of tags whose taped distance narrows the delays most; None where none would say anything."""
+    pairs = [pair for pair in flight.pairs_to_tape(still_s) if pair not in flight.tapes]
+    if not pairs:
+        return None
+    near = _Linearised(flight)
+    means = [near.mean_variance_with(near.tape(pair, still_s), sigma_m) for pair in pairs]
+    return pairs[int(np.argmin(np.round(means, 9)))]
+
+
+class _Linearised:
+    """A flight near its planned trajectories: the arrow of its information, and delays as combinations of unknowns."""
+
+    def __init__(self, flight: Flight) -> None:
+        scene, problem = flight.scene, flight.problem
+        self.flight = flight
+        self.columns = columns_of(scene, problem.design.shape[1])
+        stand = np.array([flight.stands[body] for body in scene.sought]).reshape(-1, 3)
+        self.state = through(scene, self.columns, Followed(flight.path_s, flight.path_m), stand)
+        self.design = problem.design.written_out()
+        rows = range_rows(scene, self.columns, np.zeros(len(scene.time_s)), self.design)
+        _, local, border = rows.linear(self.state)
+        self.informed = np.full(len(scene.time_s), flight.errors.informed())
+        known = known_rows(scene, self.columns, self.state, _jerk(self.columns, self.state)).linear(self.state)
+        self.arrow = Factored(normal_of(local, border, self.informed) + known.normal)
+        self.ridge = _ridge(problem, self.arrow.schur)
+        self.covariance = np.linalg.pinv(self.arrow.schur + self.ridge, rcond=1e-13, hermitian=True)
+        self.delays = problem.directions @ stating(problem, flight.reference)[: problem.rank]
+
+    @property
+    def of_delays(self) -> Floats:
+        """Return the covariance (tags, tags) of the delays, ns^2."""
+        size = self.columns.design
+        return np.asarray(self.delays @ self.covariance[:size, :size] @ self.delays.T)
+
+    def foreseen(self) -> Foreseen:
+        """Return what a fit will say."""
+        problem, size = self.flight.problem, self.columns.design
+        of_ranges = (self.design * self.informed[:, None]).T @ self.design + self.ridge[:size, :size]
+        with_truth = self.delays @ np.linalg.pinv(of_ranges, hermitian=True) @ self.delays.T
+        return Foreseen(
+            tags=tuple(problem.tags),
+            covariance_ns2=self.of_delays,
+            verdict=verdict_on(self.of_delays, with_truth, problem),
+        )
+
+    def tape(self, pair: tuple[int, int], still_s: float) -> tuple[Floats, Floats]:
+        """Return the derivatives (L,) and (b,) of the distance of two tags, halfway through their standing."""
+        taped = self.flight.taped([pair], still_s, 1.0).scene
+        _, local, border = tape_rows(taped, self.columns).linear(self.state)
+        middle = local.shape[0] // 2
+        return local[[middle]].toarray()[0], border[middle]
+
+    def mean_variance_with(self, row: tuple[Floats, Floats], sigma_m: float) -> float:
+        """Return the mean variance of the delays, ns^2, when what a row stands for is known to so much."""
+        local, border = row
+        outer = self.covariance @ (border - self.arrow.reach.T @ local)
+        inner = self.arrow.inverse_on(local[:, None])[:, 0] - self.arrow.reach @ outer
+        own = float(local @ inner + border @ outer)
+        moved = self.delays @ outer[: self.columns.design]
+        return float(np.mean(np.diag(self.of_delays) - moved**2 / (own + sigma_m**2)))
 
 
 def _jerk(columns: Columns, state: State) -> float:

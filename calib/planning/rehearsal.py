@@ -28,17 +28,20 @@ POWER_AT_2_M_DBM: Final = -80.0
 FADING_DB: Final = 3.0
 GRAVITY_M_S2: Final = 9.81
 EDGE: Final = 0.05
+STARTING_S: Final = 3.0
+"""How long it takes from standing to flying."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flown:
-    """How bodies fly: tags by robot, the distance of a robot's tags, the room, speed, and anchors in its corners."""
+    """How bodies fly: tags by robot, how far apart those are, the room, speed, seconds before they start, anchors."""
 
     robots: tuple[tuple[int, ...], ...]
     apart_m: float
     size_m: tuple[float, float, float]
     speed_m_s: float
     seconds: float
+    still_s: float
     rate_hz: float
     anchors: tuple[int, ...]
     inertial: bool
@@ -80,11 +83,15 @@ def rehearse(flown: Flown) -> Rehearsal:
 
 
 class _Body:
-    """One body's motion: two sines an axis about a middle of its own, upright, turning to and fro."""
+    """One body's motion: two sines an axis about a middle of its own, upright, turning to and fro.
+
+    Until it starts it stands; then it is as fast as it will be within `STARTING_S`.
+    """
 
     def __init__(self, flown: Flown, number: int, rng: np.random.Generator) -> None:
         size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
         self.name = f"robot{number + 1}"
+        self.still_s = flown.still_s
         self.middle = size * (0.5 + MIDDLES * np.array([np.cos(angle), np.sin(angle), 0.0]))
         self.reach = REACH * size
         slow = 2 * np.pi * float(np.linalg.norm(self.reach)) / flown.speed_m_s
@@ -93,19 +100,35 @@ class _Body:
         self.turning = 2 * np.pi / rng.uniform(*TURNS_S)
         self.heading = float(rng.uniform(-np.pi, np.pi))
 
-    def place(self, time_s: Floats, derivative: int = 0) -> Floats:
-        """Return where it is (n, 3), or a derivative of that by time."""
-        wave = np.sin(self.rate * time_s[:, None, None] + self.phase + derivative * np.pi / 2)
-        moved = self.reach * (wave * self.rate**derivative).sum(axis=2)
-        return np.asarray(moved + (self.middle if derivative == 0 else 0.0))
+    def _pace(self, time_s: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return how far along its motion it is, how fast it goes on, and how that changes (n,)."""
+        if not self.still_s:
+            return time_s, np.ones_like(time_s), np.zeros_like(time_s)
+        u = np.clip((time_s - self.still_s) / STARTING_S, 0.0, 1.0)
+        along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time_s - self.still_s - STARTING_S, 0.0)
+        return along, 3 * u**2 - 2 * u**3, 6 * (u - u**2) / STARTING_S
+
+    def _wave(self, along_s: Floats, derivative: int) -> Floats:
+        wave = np.sin(self.rate * along_s[:, None, None] + self.phase + derivative * np.pi / 2)
+        return np.asarray(self.reach * (wave * self.rate**derivative).sum(axis=2))
+
+    def place(self, time_s: Floats) -> Floats:
+        """Return where it is (n, 3)."""
+        return self.middle + self._wave(self._pace(time_s)[0], 0)
+
+    def acceleration(self, time_s: Floats) -> Floats:
+        """Return the second derivative of its place (n, 3)."""
+        along, pace, change = self._pace(time_s)
+        return np.asarray(self._wave(along, 2) * pace[:, None] ** 2 + self._wave(along, 1) * change[:, None])
 
     def yaw(self, time_s: Floats) -> Floats:
         """Return its heading (n,)."""
-        return np.asarray(self.heading + TURN_RAD * np.sin(self.turning * time_s))
+        return np.asarray(self.heading + TURN_RAD * np.sin(self.turning * self._pace(time_s)[0]))
 
     def yaw_rate(self, time_s: Floats) -> Floats:
         """Return how fast its heading changes (n,)."""
-        return np.asarray(TURN_RAD * self.turning * np.cos(self.turning * time_s))
+        along, pace, _ = self._pace(time_s)
+        return np.asarray(TURN_RAD * self.turning * np.cos(self.turning * along) * pace)
 
 
 def _arms(count: int, apart_m: float) -> Floats:
@@ -166,7 +189,7 @@ def _readings(bodies: list[_Body], seconds: float) -> dict[str, Any]:
     found: dict[str, list[Any]] = {name: [] for name in ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")}
     for body in bodies:
         c, s = np.cos(body.yaw(time)), np.sin(body.yaw(time))
-        x, y, z = body.place(time, 2).T
+        x, y, z = body.acceleration(time).T
         columns = (0 * c, 0 * c, body.yaw_rate(time), c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
         found["time_ns"].append(np.rint(time * 1e9).astype(np.int64))
         found["body"].append(np.full(len(time), body.name))

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 import calib
 from calib.cli.commands import app
-from calib.planning.foresight import Errors, flight_of, foresee
+from calib.cli.planning import _commands
+from calib.planning.foresight import Errors, best_tape, flight_of, foresee
 from calib.planning.rehearsal import Flown, rehearse
 from calib.trajectories.given import Usable
 from tests.calib.trajectories.sines import flight
@@ -19,6 +20,7 @@ CORNERS = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5
 ROBOTS = ((1, 2), (3, 4))
 THREE: Any = {"robots": (*ROBOTS, (5, 6)), "anchors": (), "rate_hz": 80.0}
 ANCHORS = (11, 12, 13, 14)
+PLAIN = Errors(noise_m=0.04, reflected=0.08)
 C_M_PER_NS = 0.299702547
 
 
@@ -28,7 +30,7 @@ def mean(plan):
 
 def rehearsed(**other):
     given: Any = {"robots": ROBOTS, "anchors": ANCHORS, "inertial": False, "seconds": 10.0, "rate_hz": 50.0, "seed": 1}
-    given |= {"apart_m": 0.5, "size_m": (6.0, 5.0, 2.5), "speed_m_s": 1.0}
+    given |= {"still_s": 0.0, "apart_m": 0.5, "size_m": (6.0, 5.0, 2.5), "speed_m_s": 1.0}
     return rehearse(Flown(**(given | other)))
 
 
@@ -125,9 +127,32 @@ def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
     assert good < poor < 1.05 * without
 
 
+def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
+    free = calib.plan_flight(3, seconds=12.0, poses_until_s=0.0, still_s=4.0)
+    taped = calib.plan_flight(3, seconds=12.0, poses_until_s=0.0, still_s=4.0, taped=1)
+    assert free.common_ns > 0.7
+    assert taped.common_ns < 0.3 * free.common_ns
+    said = next(best for best in free.next_best if "by tape" in best.what)
+    (pair,) = taped.taped
+    assert said.what == f"the distance of tags {pair[0]} and {pair[1]} by tape"
+    assert said.mean_ns == pytest.approx(taped.next_best[0].instead_of_ns, rel=1e-6)
+    assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(_commands(taped, "3"))
+
+
+def test_the_best_tape_is_the_best_of_all():
+    seen = flight_of(
+        rehearsed(seconds=8.0), Usable(poses_until_s=4.0, anchors="sought"), PLAIN, curve=True, force_std_m_s2=None
+    )
+    spreads = {
+        pair: float(np.trace(foresee(seen.taped([pair], 0.0, 0.01)).covariance_ns2)) for pair in seen.pairs_to_tape(0.0)
+    }
+    assert len(spreads) == 6
+    assert best_tape(seen, 0.0, 0.01) == min(spreads, key=spreads.__getitem__)
+
+
 def test_the_motion_that_is_rehearsed_is_one_motion():
     """Ranges are those of poses and lever arms; readings are the second derivative of the poses."""
-    seen = rehearsed(robots=((1, 2), (7,)), anchors=(9,), inertial=True, seconds=8.0, seed=3)
+    seen = rehearsed(robots=((1, 2), (7,)), anchors=(9,), inertial=True, seconds=8.0, still_s=2.0, seed=3)
     ranges = calib.load_ranges(seen)
     assert set(map(tuple, np.sort(np.column_stack([ranges.initiator, ranges.target])).tolist())) == {
         (1, 7), (2, 7), (1, 9), (2, 9), (7, 9)
@@ -139,7 +164,8 @@ def test_the_motion_that_is_rehearsed_is_one_motion():
     bend = np.gradient(np.gradient(height, time), time)
     read = seen.imu["body"] == "robot1"
     force = np.interp(time, seen.imu["time_ns"][read] * 1e-9, seen.imu["az"][read]) - 9.81
-    inside = (time > 1) & (time < 7)
+    inside = (time > -0.9) & (time < 7)
+    assert np.ptp(seen.poses.position_m[mine][time < 2.0], axis=0).max() < 1e-9
     assert force[inside] == pytest.approx(bend[inside], abs=0.02)
     assert np.ptp(seen.poses.position_m[mine], axis=0).max() < 6.0
 
@@ -173,6 +199,10 @@ def test_the_command_prints_steps_and_what_a_fit_is_told():
         (3, {"apart_m": -1.0}, "apart_m"),
         (3, {"size_m": (3.0, 2.0)}, "size_m"),
         (3, {"noise_m": 0.0}, "noise_m"),
+        (3, {"taped": -1}, "taped"),
+        (3, {"taped": 1, "seconds": 8.0}, "only 0 can be measured"),
+        (3, {"still_s": -1.0}, "still_s"),
+        (3, {"tape_sigma_m": 0.0}, "tape_sigma_m"),
         (3, {"reflected": 1.0}, "reflected"),
         (3, {"imu": "good"}, "imu"),
         (3, {"attitudes": "eyes"}, "attitudes"),
@@ -198,7 +228,7 @@ def test_a_flight_whose_poses_lack_is_refused_in_one_line():
     [
         (["4", "--seconds", "60"], "--seconds"),
         (["4", "--imu", "consumer"], "--imu"),
-        (["3", "--on", "flight", "--taped", "1"], "--taped"),
+        (["3", "--on", "flight", "--arrangements", "1"], "--arrangements"),
         (["3", "--on", "flight", "--pair-error", "0.02"], "--pair-error"),
         (["a.uwb", "--on", "flight", "--seconds", "60"], "--seconds"),
         (["three", "--on", "flight"], "COUNT"),
