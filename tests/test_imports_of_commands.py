@@ -32,10 +32,9 @@ HEAVY = {
 NUMBERS = {"numpy"}
 TABLE = {"numpy", "duckdb"}
 SPECIAL = {"scipy.special"}
-SPLINES = {"scipy.interpolate", "scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"}
-"""`scipy.interpolate`, of which flights on splines and curves over power are made, and what it loads itself."""
+SEARCH = {"numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"}
+"""`scipy.optimize`, and what it loads itself."""
 
-FLIGHT = NUMBERS | SPLINES
 BOARD = {"serial"}
 DRAWS = None
 """Commands that draw a page take seconds, and everything that draws: they are tried with `--help` alone."""
@@ -74,14 +73,14 @@ COMMANDS = {
     "uwblink import miluv": Row(OTHERS_FOLDER),
     "uwblink import guess": Row("ranges.csv", TABLE),
     "uwbsim scenarios": Row("noiseless -o scenarios"),
-    "uwbsim run": Row("scenarios/noiseless.toml -o n.uwb --set run.duration_s=1", FLIGHT | TABLE | {"simpy"}),
-    "uwbsim serve": Row("scenarios/noiseless.toml --link-dir links --duration 0.01", FLIGHT | {"simpy"}),
+    "uwbsim run": Row("scenarios/noiseless.toml -o n.uwb --set run.duration_s=1", TABLE | {"simpy"}),
+    "uwbsim serve": Row("scenarios/noiseless.toml --link-dir links --duration 0.01", NUMBERS | {"simpy"}),
     "uwbsim show": Row(DRAWS),
-    "uwbsim validate": Row("scenarios/noiseless.toml", FLIGHT),
+    "uwbsim validate": Row("scenarios/noiseless.toml", NUMBERS),
     "uwbsim schema": Row("", NUMBERS),
     "uwbsim compare": Row(DRAWS),
-    "uwbsim predict": Row("--protocol ds", FLIGHT),
-    "uwbsim optimum": Row("scenarios/noiseless.toml --protocols ss", FLIGHT | {"simpy"}),
+    "uwbsim predict": Row("--protocol ds", NUMBERS),
+    "uwbsim optimum": Row("scenarios/noiseless.toml --protocols ss", SEARCH),
     "uwbsim sweep": Row(DRAWS),
     "uwbsim twin": Row(DRAWS),
     "calib sample": Row("-o sample.uwb -n 10", TABLE),
@@ -113,6 +112,8 @@ OURS = ("uwblink.importers", "uwblink.recording.contents", "calib.sources", "cal
 GIVEN: dict[frozenset[str], tuple[str, ...]] = {
     frozenset(TABLE | SPECIAL): ("duckdb", "scipy.special", *OURS),
     frozenset(TABLE): ("duckdb", *OURS),
+    frozenset(NUMBERS): ("uwbsim.scenario.loading", "uwbsim.world.world", "calib.calibration.model"),
+    frozenset(BOARD): ("serial", "uwblink.boards.connection"),
     frozenset(): (),
 }
 """What commands find there already, by what of it is heavy: what they may load need not be loaded by each anew."""
@@ -172,12 +173,16 @@ def found(tmp_path_factory):
     write_flights(folder)
     write_standing(folder)
     asked = {given: Asked(folder, *GIVEN[given]) for given in GIVEN}
+    tried = {name: row for name, row in COMMANDS.items() if row.words is not None}
+    of_boards = [name for name, row in tried.items() if "ports/" in str(row.words)]
+
+    def run(name):
+        given = next(given for given in GIVEN if given <= tried[name].loads)
+        return asked[given](f"{name} {tried[name].words}")[0]
+
     with served(link_dir=folder / "ports"):
-        answers = {
-            name: asked[next(given for given in GIVEN if given <= row.loads)](f"{name} {row.words}")[0]
-            for name, row in COMMANDS.items()
-            if row.words is not None
-        }
+        answers = {name: run(name) for name in of_boards}
+    answers |= {name: run(name) for name in tried if name not in of_boards}
     names = sorted(EVERY, key=lambda name: name.startswith(OF_IMPORTERS))
     helps = asked[frozenset()](*(f"{name} --help" for name in names))
     for given, one in asked.items():

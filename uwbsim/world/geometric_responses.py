@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Final, Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.scenario.model import Scenario
@@ -23,6 +22,7 @@ from uwbsim.world.geometric_paths import (
     paths_between,
 )
 from uwbsim.world.leading_edge import Detected, Sensing, detect
+from uwbsim.world.rotations import matrices
 from uwbsim.world.surroundings import Placed, PlacedBody, Surroundings
 from uwbsim.world.trajectories import Trajectory
 
@@ -175,4 +175,4 @@ def _chosen(legs: Legs, rows: Ints) -> Legs:
 
 
 def _pose(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
-    return path.position_m(time_s), np.asarray(Rotation.from_quat(path.quaternion(time_s)).as_matrix())
+    return path.position_m(time_s), matrices(path.quaternion(time_s))

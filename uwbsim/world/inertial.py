@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats
 from uwbsim.random_streams import stream
@@ -51,6 +50,8 @@ def _imu_of(scenario: Scenario, body: Body, path: Trajectory, imu: Imu) -> Colum
 
 def true_motion(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
     """Return angular velocity (n, 3) in rad/s and specific force (n, 3) in m/s^2, both in the axes of the body."""
+    from scipy.spatial.transform import Rotation
+
     before, after = (Rotation.from_quat(path.quaternion(time_s + sign * STEP_S)) for sign in (-1, 1))
     gyro = (before.inv() * after).as_rotvec() / (2 * STEP_S)
     early, now, late = (path.position_m(time_s + sign * STEP_S) for sign in (-1, 0, 1))

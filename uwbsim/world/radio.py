@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.interpolate import BSpline, RegularGridInterpolator
 
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
 from uwbsim.random_streams import stream
 from uwbsim.scenario.radio import AntennaTable, BiasTable, Radio, SigmaSpline, Spline
+from uwbsim.world.bsplines import BSpline
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RegularGridInterpolator
 
 ALPHA_DBM: Final = -82.0
 FPP_OFFSET_DB: Final = 121.74
@@ -75,6 +78,8 @@ def _table_gain_db(table: AntennaTable, direction: Floats) -> Floats:
 
 @lru_cache(maxsize=16)
 def _interpolator(table: AntennaTable) -> RegularGridInterpolator:
+    from scipy.interpolate import RegularGridInterpolator
+
     return RegularGridInterpolator((table.azimuth_deg, table.elevation_deg), np.array(table.gain_db))
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
-from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Floats
 from uwbsim.scenario.motion import Carried, Figure, RandomFlight, Recorded, Static, Waypoints
+from uwbsim.world.bsplines import BSpline
+from uwbsim.world.rotations import turned
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body for a purpose."""
@@ -43,8 +43,7 @@ class Trajectory:
 
     def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
         """Return where a point of the body is, shape (n, 3)."""
-        rotated = Rotation.from_quat(self.quaternion(time_s)).apply(np.array(lever_arm_m))
-        return np.asarray(self.position(time_s) + rotated)
+        return np.asarray(self.position(time_s) + turned(self.quaternion(time_s), np.array(lever_arm_m)))
 
 
 def _quaternions(angles: Floats) -> Floats:
@@ -93,6 +92,8 @@ def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory
     points = np.array(motion.points_m)
     if motion.times_s is None:
         return Trajectory(_straight(points, motion.speed_mps or 1.0, motion.acceleration_mps2), _level)
+    from scipy.interpolate import CubicSpline
+
     times = np.array(motion.times_s)
     path = CubicSpline(times, points, bc_type="clamped")
     # Before the first and after the last point the body hovers there.
@@ -146,6 +147,9 @@ def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
 
 def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
     """A monotone cubic through recorded positions, and the shortest turns between recorded attitudes."""
+    from scipy.interpolate import PchipInterpolator
+    from scipy.spatial.transform import Rotation, Slerp
+
     times = np.array(motion.times_s)
     path = PchipInterpolator(times, np.array(motion.positions_m))
     turns = Slerp(times, Rotation.from_quat(np.array(motion.quaternions)))
@@ -163,7 +167,7 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
     # One control point a leg. A B-spline stays in the convex hull of its control points, hence in
     # the box, and a cubic one has continuous acceleration.
     count = int(np.ceil(duration_s / leg_s)) + 8
-    knots = (np.arange(count + 4) - 5) * leg_s
+    knots = (np.arange(count + 4, dtype=np.float64) - 5) * leg_s
     path = BSpline(knots, draw("position").uniform(lo, hi, (count, 3)), 3)
     turns = draw("yaw")
     yaw = turns.uniform(-np.pi, np.pi) + np.cumsum(turns.normal(0, 0.8, count))
