@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -21,6 +22,7 @@ PANEL: Final = "Calibrate"
 STANDING: Final = "Boards that stand still"
 FLYING: Final = "Flights (--on flight)"
 FLIGHT: Final = "flight"
+KINDS: Final = ("line", "plane", "space", FLIGHT)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -49,7 +51,7 @@ def plan(
         str,
         typer.Option(
             help="A string (line), a table (plane), a room (space), or robots that move (flight).",
-            **choice("line", "plane", "space", FLIGHT),
+            **choice(*KINDS),
         ),
     ] = "line",
     size: Annotated[
@@ -149,7 +151,7 @@ def plan(
     """Say how to calibrate without true distances: what to do step by step, and how well delays will be known."""
     shared = {
         "size_m": None if size is None else _numbers(size, "size_m"),
-        "anchors": None if anchors is None else [int(tag) for tag in _numbers(anchors, "anchors")],
+        "anchors": None if anchors is None else _whole(anchors, "anchors"),
         "rate_hz": rate,
         "taped": taped,
         "tape_sigma_m": tape_sigma,
@@ -177,6 +179,8 @@ def plan(
         from calib.report import check_places
 
         check_places(output, None, figures, force=force)
+    if on not in KINDS:
+        raise BadInputError(f"found {on!r:.40}, allowed: {', '.join(KINDS)}", parameter="on")
     if on == FLIGHT:
         found: calib.Plan | calib.FlightPlan = _of_flight(boards, _given(shared | flying, standing, "boards stand"))
     else:
@@ -201,7 +205,7 @@ def _of_boards(boards: str, on: str, settings: dict[str, Any]) -> calib.Plan:
 
     if boards.endswith(".uwb"):
         raise BadInputError("a recording goes with plans in which robots fly (`on` flight)", parameter="boards")
-    tags = [int(tag) for tag in _numbers(boards, "boards")]
+    tags = _whole(boards, "boards")
     with waiting("planning"):
         return calib.plan(tags if "," in boards else tags[0], on=on, **settings)
 
@@ -220,8 +224,8 @@ def _robots(boards: str, settings: Mapping[str, Any]) -> Any:
                 raise BadInputError("is what the recording says", parameter=name)
         return Path(boards)
     if "/" not in boards and "," not in boards:
-        return int(_numbers(boards, "robots")[0])
-    return [[int(tag) for tag in _numbers(robot, "robots")] for robot in boards.split("/")]
+        return _whole(boards, "robots")[0]
+    return [_whole(robot, "robots") for robot in boards.split("/")]
 
 
 def _print(found: calib.Plan | calib.FlightPlan, boards: str, *, as_json: bool) -> None:
@@ -266,12 +270,17 @@ def _flight_commands(found: calib.FlightPlan, boards: str) -> Iterator[str]:
     yield f"calib fit {name} --truth ranges {' '.join(words)} -o calibration.json"
 
 
+def _whole(text: str, parameter: str) -> list[int]:
+    """Return ids or a count from a text with commas; raises `BadInputError`."""
+    found = _numbers(text, parameter)
+    if not found or not all(math.isfinite(value) and value == int(value) for value in found):
+        raise BadInputError(f"found {text!r:.40}, expected whole numbers with commas", parameter=parameter)
+    return [int(value) for value in found]
+
+
 def _numbers(text: str, parameter: str) -> list[float]:
-    """Return whole numbers or lengths from a text with commas; raises `BadInputError`."""
+    """Return numbers from a text with commas; raises `BadInputError`."""
     try:
-        found = [float(part) for part in text.split(",")] if text.strip() else []
+        return [float(part) for part in text.split(",")] if text.strip() else []
     except ValueError:
-        found = []
-    if not found and (text.strip() or parameter in ("boards", "robots")):
-        raise BadInputError(f"found {text!r:.40}, expected numbers with commas", parameter=parameter)
-    return found
+        raise BadInputError(f"found {text!r:.40}, expected numbers with commas", parameter=parameter) from None

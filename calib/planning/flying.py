@@ -41,6 +41,8 @@ def flying(  # noqa: PLR0913 - keyword-only, as `plan_flight` takes them
         raise BadInputError(
             f"{seconds * rate_hz:.0f} ranges are more than a plan takes, {MOST_RANGES}", parameter="seconds"
         )
+    if still_s > seconds / 2:
+        raise BadInputError(f"found {still_s:g}, expected at most half of the {seconds:g} s", parameter="still_s")
     if len(size_m) != 3 or not all(math.isfinite(v) and 0 < v <= 1000 for v in size_m):
         raise BadInputError(f"found {list(size_m)}, expected three lengths of a room in metres", parameter="size_m")
     x, y, z = map(float, size_m)

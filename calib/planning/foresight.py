@@ -198,7 +198,7 @@ def _path(truth: Scene) -> tuple[Floats, Floats]:
 
 def foresee(flight: Flight) -> Foreseen:
     """Return what a fit of the flight will say of the delays."""
-    return _Linearised(flight).foreseen()
+    return Linearised(flight).foreseen()
 
 
 def best_tape(flight: Flight, still_s: float, sigma_m: float) -> tuple[int, int] | None:
@@ -206,15 +206,16 @@ def best_tape(flight: Flight, still_s: float, sigma_m: float) -> tuple[int, int]
     pairs = [pair for pair in flight.pairs_to_tape(still_s) if pair not in flight.tapes]
     if not pairs:
         return None
-    near = _Linearised(flight)
+    near = Linearised(flight)
     means = [near.mean_variance_with(near.tape(pair, still_s), sigma_m) for pair in pairs]
     return pairs[int(np.argmin(np.round(means, 9)))]
 
 
-class _Linearised:
+class Linearised:
     """A flight near its planned trajectories: the arrow of its information, and delays as combinations of unknowns."""
 
     def __init__(self, flight: Flight) -> None:
+        """Linearise at the planned trajectories."""
         scene, problem = flight.scene, flight.problem
         self.flight = flight
         self.columns = columns_of(scene, problem.design.shape[1])
@@ -224,7 +225,8 @@ class _Linearised:
         rows = range_rows(scene, self.columns, np.zeros(len(scene.time_s)), self.design)
         _, local, border = rows.linear(self.state)
         self.informed = np.full(len(scene.time_s), flight.errors.informed())
-        known = known_rows(scene, self.columns, self.state, _jerk(self.columns, self.state)).linear(self.state)
+        self.jerk_m_s3 = _jerk(self.columns, self.state)
+        known = known_rows(scene, self.columns, self.state, self.jerk_m_s3).linear(self.state)
         self.arrow = Factored(normal_of(local, border, self.informed) + known.normal)
         self.ridge = _ridge(problem, self.arrow.schur)
         self.covariance = np.linalg.pinv(self.arrow.schur + self.ridge, rcond=1e-13, hermitian=True)

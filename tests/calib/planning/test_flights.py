@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import calib
 from calib.cli.commands import app
 from calib.cli.planning import _commands
-from calib.planning.foresight import Errors, best_tape, flight_of, foresee
+from calib.planning.foresight import Errors, Linearised, best_tape, flight_of, foresee
 from calib.planning.rehearsal import Flown, rehearse
 from calib.trajectories.given import Usable
 from tests.calib.trajectories.sines import flight
@@ -127,6 +127,21 @@ def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
     assert good < poor < 1.05 * without
 
 
+def test_trajectories_are_held_as_jerky_as_they_are_planned():
+    """Beside third differences of the poses."""
+    seen = rehearsed(**THREE, seconds=16.0)
+    mine = seen.poses.body == "robot1"
+    time = seen.poses.time_ns[mine] * 1e-9
+    jerks = [
+        np.diff(seen.poses.position_m[seen.poses.body == f"robot{k}"], n=3, axis=0) / np.diff(time)[0] ** 3
+        for k in (1, 2, 3)
+    ]
+    inside = (time[:-3] > 1.0) & (time[:-3] < 15.0)
+    planned = Linearised(flight_of(seen, Usable(poses_until_s=8.0), PLAIN, curve=True, force_std_m_s2=None))
+    # A spline with points 0.4 s apart takes off some of the quickest part.
+    assert planned.jerk_m_s3 == pytest.approx(math.sqrt(np.mean([j[inside] ** 2 for j in jerks])), rel=0.15)
+
+
 def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
     free = calib.plan_flight(3, seconds=12.0, poses_until_s=0.0, still_s=4.0)
     taped = calib.plan_flight(3, seconds=12.0, poses_until_s=0.0, still_s=4.0, taped=1)
@@ -202,6 +217,7 @@ def test_the_command_prints_steps_and_what_a_fit_is_told():
         (3, {"taped": -1}, "taped"),
         (3, {"taped": 1, "seconds": 8.0}, "only 0 can be measured"),
         (3, {"still_s": -1.0}, "still_s"),
+        (3, {"still_s": 40.0}, "still_s"),
         (3, {"tape_sigma_m": 0.0}, "tape_sigma_m"),
         (3, {"reflected": 1.0}, "reflected"),
         (3, {"imu": "good"}, "imu"),
@@ -232,6 +248,11 @@ def test_a_flight_whose_poses_lack_is_refused_in_one_line():
         (["3", "--on", "flight", "--pair-error", "0.02"], "--pair-error"),
         (["a.uwb", "--on", "flight", "--seconds", "60"], "--seconds"),
         (["three", "--on", "flight"], "COUNT"),
+        (["1,2/", "--on", "flight"], "COUNT"),
+        (["1.5,2"], "COUNT"),
+        (["nan"], "COUNT"),
+        (["4", "--on", "sky"], "--on"),
+        (["flight.uwb"], "COUNT"),
         (["3", "--on", "flight", "--noise", "-1"], "--noise"),
     ],
 )
