@@ -64,58 +64,58 @@ class RecordedSource:
 
     def __init__(self, recording: Recording) -> None:
         """Read from a recording, which must stay open."""
-        self._recording = recording
+        self.recording = recording
 
     @cached_property
     def exchanges(self) -> Exchanges:
         """Return the exchanges."""
-        return self._recording.exchanges()
+        return self.recording.exchanges()
 
     @cached_property
     def poses(self) -> Poses:
         """Return the poses."""
-        return self._recording.poses()
+        return self.recording.poses()
 
     @cached_property
     def tags(self) -> list[Tag]:
         """Return the tags."""
-        return self._recording.tags()
+        return self.recording.tags()
 
     @cached_property
     def planted(self) -> Mapping[str, Any] | None:
         """Return what a simulation planted, None in a real recording."""
-        found = self._recording.meta().get("planted")
+        found = self.recording.meta().get("planted")
         return found if isinstance(found, dict) else None
 
     @cached_property
     def faults(self) -> list[Fault]:
         """Return what went wrong while recording."""
-        return self._recording.faults()
+        return self.recording.faults()
 
     @cached_property
     def overheard(self) -> dict[str, NDArray[Any]]:
         """Return the columns of passively heard exchanges."""
-        return self._recording.overheard()
+        return self.recording.overheard()
 
     @cached_property
     def imu(self) -> dict[str, NDArray[Any]]:
         """Return the columns of inertial readings."""
-        return self._recording.imu()
+        return self.recording.imu()
 
     @cached_property
     def arrangements(self) -> list[Arrangement]:
         """Return the stretches of time in which boards stood still."""
-        return self._recording.arrangements()
+        return self.recording.arrangements()
 
     @cached_property
     def known_distances(self) -> list[KnownDistance]:
         """Return the distances that were measured otherwise."""
-        return self._recording.known_distances()
+        return self.recording.known_distances()
 
     @cached_property
     def height(self) -> dict[str, NDArray[Any]]:
         """Return the columns of readings of height sensors."""
-        return self._recording.heights()
+        return self.recording.heights()
 
 
 @dataclass(frozen=True, slots=True)

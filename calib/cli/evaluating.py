@@ -185,20 +185,25 @@ def doctor(
 
     import calib
     from calib.cli.flags import with_flags
+    from calib.doctor import examined_part
     from uwblink import Recording
     from uwblink.recording import clock_skews
 
     skews = {}
     with waiting("examining"):
         found = calib.examine(recordings)
+        parts = {str(path): part for path in recordings if (part := examined_part(path))}
         for path in recordings:
             with Recording.open(path) as recording:
-                skews[str(path)] = clock_skews(recording.exchanges())
+                skews[str(path)] = clock_skews(recording.exchange_blocks())
     findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
     if as_json:
         clocks = {path: [asdict(one) | {"slope": one.slope} for one in some] for path, some in skews.items()}
-        typer.echo(json.dumps({"findings": [asdict(f) for f in findings], "clock_skews": clocks}, indent=1))
+        found_all = {"findings": [asdict(f) for f in findings], "clock_skews": clocks}
+        typer.echo(json.dumps(found_all | ({"examined": parts} if parts else {}), indent=1))
         return
+    for name, part in parts.items():
+        typer.echo(f"{name}: {part}")
     if not findings:
         typer.echo(f"{', '.join(map(str, recordings))}: nothing found")
     for finding in findings:

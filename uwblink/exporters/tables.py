@@ -14,6 +14,9 @@ from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES
 
+MEMORY: Final = "400MB"
+"""What DuckDB may keep of the file that it reads; what it writes comes on top of that."""
+
 CSV_CELLS: Final = {"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"}
 
 
@@ -39,6 +42,8 @@ def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapp
             allowed = [str(recording), f"{recording}.wal", *map(str, paths.values())]
             db.execute("SET allowed_paths = ?", [allowed])
             db.execute("SET enable_progress_bar = false")
+            db.execute("SET preserve_insertion_order = true")
+            db.execute(f"SET memory_limit = '{MEMORY}'")
             db.execute("SET enable_external_access = false")
             db.execute("SET lock_configuration = true")
             db.execute(f"ATTACH {_literal(recording)} AS source (READ_ONLY)")
@@ -59,7 +64,8 @@ def _query(db: object, table: str, cells: Mapping[str, str]) -> str:
         f'{cells.get(kind, "{0}").format(f"{name!s}")} AS "{name}"' if name in present else f'NULL::{kind} AS "{name}"'
         for name, kind in TABLES[table].items()
     ]
-    return f"SELECT {', '.join(columns)} FROM source.main.{table} ORDER BY rowid"  # noqa: S608 - keys of TABLES
+    # In their order without a word, which DuckDB keeps; asked to sort them it would hold all of them.
+    return f"SELECT {', '.join(columns)} FROM source.main.{table}"  # noqa: S608 - keys of TABLES
 
 
 def _options(options: str, table: str) -> str:

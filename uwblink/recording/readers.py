@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -58,6 +59,35 @@ class TableReaders:
     def pose_windows(self) -> PoseWindows:
         """Return the poses by stretches of time, for those who need not have all of them at once."""
         return PoseWindows(self._store)
+
+    def exchanges_between(self, start_ns: int, end_ns: int) -> Exchanges:
+        """Return the exchanges from `start_ns` until before `end_ns`, in the order in which they were written."""
+        where = f"WHERE time_ns >= {int(start_ns)} AND time_ns < {int(end_ns)} ORDER BY rowid"
+        return read_exchanges(self._store, self._bits(), where)
+
+    def stretches(self, rows: int) -> list[tuple[int, int]]:
+        """Return spans of time (from, until before, in ns), one after the other, with about so many exchanges each."""
+        time = np.sort(filled(self._store.read("SELECT time_ns FROM exchanges")["time_ns"]), kind="stable")
+        edges = sorted({*time[:: max(rows, 1)].tolist(), *(time[-1:] + 1).tolist()})
+        return list(pairwise(edges))
+
+    def has_target_reports(self) -> bool:
+        """Return whether targets reported exchanges, too, of which each may then stand there twice."""
+        query = "SELECT count(*) FROM exchanges WHERE reporter = target AND initiator <> target"
+        return bool(self._store.rows(query)[0][0])
+
+    def tally(self, table: str, *columns: str) -> dict[tuple[Any, ...], int]:
+        """Return how many rows of one of `TABLES` have the same values, by these values in order.
+
+        Rows without one of the values are left out; where the file is older than a column, all are.
+        """
+        known_tables([table])
+        if not set(columns) <= self._store.columns().get(table, set()) & TABLES[table].keys():
+            return {}
+        names = ", ".join(f'"{name}"' for name in columns)
+        there = " AND ".join(f'"{name}" IS NOT NULL' for name in columns)
+        query = f"SELECT {names}, count(*) FROM {table} WHERE {there} GROUP BY ALL ORDER BY ALL"  # noqa: S608 - keys of TABLES
+        return {tuple(row[:-1]): int(row[-1]) for row in self._store.rows(query)}
 
     def _bits(self) -> int:
         bits = self.meta().get("timestamp_bits", REPORT_BITS)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uwblink.arrays import Floats
 from uwblink.protocols.table import PROTOCOLS, third_from_target
-from uwblink.twr import Exchanges, intervals
+from uwblink.twr import Exchanges, intervals, names_in
 
 FEWEST: Final = 5
 MIDDLE: Final = (16, 84)
@@ -70,32 +71,58 @@ def target_faster_ppm(exchanges: Exchanges) -> Floats:
         return np.asarray((target / initiator - 1) * 1e6)
 
 
-def clock_skews(exchanges: Exchanges) -> list[ClockSkew]:
-    """Return the skew of every pair with enough double-sided exchanges, in the pairs' order."""
-    double = [name for name in np.unique(exchanges.protocol).tolist() if PROTOCOLS[name].third_sender is not None]
-    rows = np.isin(exchanges.protocol, double) & ((exchanges.tx3 | exchanges.rx3) != 0)
-    if not rows.any():
-        return []
-    e = exchanges[rows]
-    target_faster = target_faster_ppm(e)
-    forth = np.where(e.initiator < e.target, 1.0, -1.0)
-    by_stamps, told = forth * target_faster, forth * (e.skew1_ppm - e.skew2_ppm) / 2
-    low, high = np.minimum(e.initiator, e.target), np.maximum(e.initiator, e.target)
-    good = np.isfinite(by_stamps) & (np.abs(by_stamps) < IMPOSSIBLE_PPM)
-    found = []
-    for a, b in np.unique(np.column_stack([low, high]), axis=0).tolist():
-        mine = good & (low == a) & (high == b)
-        if np.count_nonzero(mine) < FEWEST:
-            continue
-        stamps = float(np.median(by_stamps[mine]))
-        known = told[mine & np.isfinite(told)]
-        carrier = float(np.median(known)) if len(known) else None
-        spread = float(np.ptp(np.percentile(known, MIDDLE))) / 2 if len(known) else None
-        alike = None
-        if carrier is not None and abs(stamps) > CLEAR_PPM:
-            alike = bool(np.sign(stamps) == np.sign(carrier))
-        found.append(ClockSkew(f"{a}-{b}", int(np.count_nonzero(mine)), stamps, carrier, spread, alike))
-    return found
+class SkewReadings:
+    """What exchanges say of their clocks, kept as they come: twenty bytes an exchange."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._pair: list[NDArray[np.uint32]] = []
+        self._stamps: list[Floats] = []
+        self._carriers: list[Floats] = []
+
+    def add(self, exchanges: Exchanges) -> None:
+        """Take some more exchanges."""
+        double = [name for name in names_in(exchanges.protocol) if PROTOCOLS[name].third_sender is not None]
+        rows = np.isin(exchanges.protocol, double) & ((exchanges.tx3 | exchanges.rx3) != 0)
+        if not rows.any():
+            return
+        e = exchanges if rows.all() else exchanges[rows]
+        forth = np.where(e.initiator < e.target, 1.0, -1.0)
+        by_stamps, told = forth * target_faster_ppm(e), forth * (e.skew1_ppm - e.skew2_ppm) / 2
+        good = np.isfinite(by_stamps) & (np.abs(by_stamps) < IMPOSSIBLE_PPM)
+        pair = np.minimum(e.initiator, e.target) << 16 | np.maximum(e.initiator, e.target)
+        self._pair.append(pair[good].astype(np.uint32))
+        self._stamps.append(by_stamps[good])
+        self._carriers.append(told[good])
+
+    def skews(self) -> list[ClockSkew]:
+        """Return the skew of every pair with enough double-sided exchanges, in the pairs' order."""
+        if not self._pair:
+            return []
+        pair, stamps, told = (np.concatenate(parts) for parts in (self._pair, self._stamps, self._carriers))
+        found = (_skew(int(one), stamps[pair == one], told[pair == one]) for one in np.unique(pair))
+        return [one for one in found if one.count >= FEWEST]
+
+
+def clock_skews(exchanges: Exchanges | Iterable[Exchanges]) -> list[ClockSkew]:
+    """Return the skew of every pair with enough double-sided exchanges, in the pairs' order.
+
+    `exchanges` are all, or come some at a time, as from `Recording.exchange_blocks`.
+    """
+    readings = SkewReadings()
+    for some in [exchanges] if isinstance(exchanges, Exchanges) else exchanges:
+        readings.add(some)
+    return readings.skews()
+
+
+def _skew(pair: int, by_stamps: Floats, told: Floats) -> ClockSkew:
+    stamps, known = float(np.median(by_stamps)), told[np.isfinite(told)]
+    carrier = float(np.median(known)) if len(known) else None
+    spread = float(np.ptp(np.percentile(known, MIDDLE))) / 2 if len(known) else None
+    alike = None
+    if carrier is not None and abs(stamps) > CLEAR_PPM:
+        alike = bool(np.sign(stamps) == np.sign(carrier))
+    return ClockSkew(f"{pair >> 16}-{pair & 0xFFFF}", len(by_stamps), stamps, carrier, spread, alike)
 
 
 def told(skews: Sequence[ClockSkew]) -> str:

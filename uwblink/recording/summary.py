@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwblink.display import as_html, cut, first_few, printable
-from uwblink.recording.relative_clocks import ClockSkew, clock_skews, told
+from uwblink.recording.relative_clocks import ClockSkew, SkewReadings, told
 from uwblink.recording.schema import TABLES, Fault, Tag
-from uwblink.recording.target_reports import single_reports
+from uwblink.recording.target_reports import SingleReports, single_report_blocks
+from uwblink.twr import LATEST_NS, names_in
 
 if TYPE_CHECKING:
     from uwblink.recording.file import Recording
@@ -94,29 +95,65 @@ class Summary:
 
 
 def summarize(recording: Recording) -> Summary:
-    """Return what a recording holds; raises what its readers raise."""
-    reports, poses, faults = single_reports(recording.exchanges()), recording.poses(), recording.faults()
-    exchanges = reports.exchanges
-    span_s = float(np.ptp(exchanges.time_ns)) * 1e-9 if len(exchanges) else 0.0
-    done = Counter(zip(exchanges.initiator.tolist(), exchanges.target.tolist(), strict=True))
-    failed = failures_by_pair(faults)
+    """Return what a recording holds, read some of it at a time; raises what its readers raise."""
+    read = _Counted()
+    for reports, _ in single_report_blocks(recording):
+        read.add(reports)
+    span_s, done = read.span_s(), read.pairs
+    failed = recording.tally("faults", "initiator", "target")
     return Summary(
         file=recording.path.name,
         span_s=span_s,
-        counts={t: recording.count(t) for t in TABLES if t != "meta"} | {"exchanges": len(exchanges)},
+        counts={t: recording.count(t) for t in TABLES if t != "meta"} | {"exchanges": done.total()},
         tags=tuple(recording.tags()),
         pairs=tuple(
-            PairSummary(*pair, done[pair], failed.get(pair, 0), done[pair] / span_s if span_s else None)
+            PairSummary(pair[0], pair[1], done[pair], failed.get(pair, 0), done[pair] / span_s if span_s else None)
             for pair in sorted({*done, *failed})
         ),
-        protocols=_by_name(exchanges.protocol.tolist()),
-        faults=_by_name(fault.kind for fault in faults),
-        poses=_by_name(poses.body.tolist()),
+        protocols=dict(sorted(read.protocols.items())),
+        faults=_words(recording.tally("faults", "kind")),
+        poses=_words(recording.tally("poses", "body")),
         provenance={k: v for k, v in recording.meta().items() if k not in {"scenario", "planted"}},
-        reported_twice=reports.repeated,
-        contradictory=len(reports.differing),
-        skews=tuple(clock_skews(exchanges)),
+        reported_twice=read.repeated,
+        contradictory=read.contradictory,
+        skews=tuple(read.readings.skews()),
     )
+
+
+class _Counted:
+    """What is counted as exchanges are read."""
+
+    def __init__(self) -> None:
+        self.pairs: Counter[tuple[int, int]] = Counter()
+        self.protocols: Counter[str] = Counter()
+        self.readings = SkewReadings()
+        self.repeated = self.contradictory = 0
+        self._first_ns, self._last_ns = LATEST_NS, -LATEST_NS
+
+    def add(self, reports: SingleReports) -> None:
+        e = reports.exchanges
+        self.repeated += reports.repeated
+        self.contradictory += len(reports.differing)
+        if not len(e):
+            return
+        ids, counts = np.unique(e.initiator << 16 | e.target, return_counts=True)
+        self.pairs.update(
+            {(pair >> 16, pair & 0xFFFF): n for pair, n in zip(ids.tolist(), counts.tolist(), strict=True)}
+        )
+        self.protocols.update({name: int(np.count_nonzero(e.protocol == name)) for name in names_in(e.protocol)})
+        self.readings.add(e)
+        self._first_ns, self._last_ns = (
+            min(self._first_ns, int(e.time_ns.min())),
+            max(self._last_ns, int(e.time_ns.max())),
+        )
+
+    def span_s(self) -> float:
+        """Return the time from the first to the last exchange, in seconds."""
+        return max(self._last_ns - self._first_ns, 0) * 1e-9
+
+
+def _words(found: Mapping[tuple[Any, ...], int]) -> dict[str, int]:
+    return dict(sorted((str(word), count) for (word,), count in found.items()))
 
 
 def failures_by_pair(faults: list[Fault]) -> dict[tuple[int, int], int]:
@@ -128,10 +165,6 @@ def failures_by_pair(faults: list[Fault]) -> dict[tuple[int, int], int]:
 def counted(counts: Mapping[str, int]) -> str:
     """Return names with their numbers, or `none`."""
     return ", ".join(f"{printable(name)} {count}" for name, count in counts.items()) or "none"
-
-
-def _by_name(names: Any) -> dict[str, int]:
-    return dict(sorted(Counter(names).items()))
 
 
 def _hertz(pair: PairSummary) -> str:

@@ -6,13 +6,18 @@ is the exchange; what the other says otherwise is a fault, because the boards ca
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from uwblink.arrays import Bools, Ints
+from uwblink.recording.blocks import ROWS_AT_ONCE
 from uwblink.twr import STAMPS, Exchanges
+
+if TYPE_CHECKING:
+    from uwblink.recording.readers import TableReaders
 
 APART_NS: Final = 60_000_000
 """Reports of one exchange are nearer than this, and equal stamps of another one further: they wrap after 67 ms."""
@@ -26,18 +31,19 @@ KEYS: Final = ("tx1", "tx2")
 class SingleReports:
     """Exchanges with one row each, in their order: `repeated` second reports are left out, `differing` say otherwise.
 
-    `differing` (k, 2) has the rows of the given exchanges at which the two reports stand, the initiator's first.
+    `differing` (k, 2) has the rows of the given exchanges at which the two reports stand, the initiator's first;
+    `seconds` (repeated,) those of the second reports.
     """
 
     exchanges: Exchanges
     repeated: int
     differing: Ints
+    seconds: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 def single_reports(exchanges: Exchanges) -> SingleReports:
     """Return each exchange once: the initiator's report where there is one, otherwise the target's."""
-    # An exchange of a tag with itself, which a wrong import makes, is no second report of itself.
-    by_target = np.flatnonzero((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target))
+    by_target = np.flatnonzero(from_targets(exchanges))
     if not len(by_target):
         return SingleReports(exchanges, 0, np.empty((0, 2), dtype=np.int64))
     by_initiator = np.flatnonzero(exchanges.reporter == exchanges.initiator)
@@ -52,7 +58,38 @@ def single_reports(exchanges: Exchanges) -> SingleReports:
         differs |= _unequal(getattr(exchanges, name), first, second)
     keep = np.ones(len(exchanges), dtype=bool)
     keep[second] = False
-    return SingleReports(exchanges[keep], int(known.sum()), np.column_stack([first, second])[differs])
+    return SingleReports(exchanges[keep], int(known.sum()), np.column_stack([first, second])[differs], second)
+
+
+def from_targets(exchanges: Exchanges) -> Bools:
+    """Return which exchanges (n,) the target reported; one of a tag with itself is no second report of itself."""
+    return np.asarray((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target))
+
+
+def single_report_blocks(recording: TableReaders) -> Iterator[tuple[SingleReports, Exchanges]]:
+    """Yield what `single_reports` returns of a recording, some of it at a time, and what that was made of.
+
+    Where targets reported the pieces are stretches of time, which are looked at together with what is around them, for
+    both reports of an exchange may lie on either side of an edge.
+    """
+    blocks = recording.exchange_blocks(ROWS_AT_ONCE)
+    if not recording.has_target_reports():
+        for block in blocks:
+            yield SingleReports(block, 0, np.empty((0, 2), dtype=np.int64)), block
+        return
+    for start_ns, end_ns in recording.stretches(ROWS_AT_ONCE):
+        both = recording.exchanges_between(start_ns - APART_NS, end_ns + APART_NS)
+        yield _within(single_reports(both), both, start_ns, end_ns), both
+
+
+def _within(found: SingleReports, both: Exchanges, start_ns: int, end_ns: int) -> SingleReports:
+    """Return the exchanges, and the second reports, of a stretch of time."""
+    here = (found.exchanges.time_ns >= start_ns) & (found.exchanges.time_ns < end_ns)
+    second = both.time_ns[found.seconds]
+    mine = (second >= start_ns) & (second < end_ns)
+    later = both.time_ns[found.differing[:, 1]]
+    differing = found.differing[(later >= start_ns) & (later < end_ns)]
+    return SingleReports(found.exchanges[here], int(np.count_nonzero(mine)), differing, found.seconds[mine])
 
 
 def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:

@@ -1,0 +1,72 @@
+"""A long recording is looked at in stretches, and what is wrong with it shows in them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import calib
+from benchmarks.flights import Plan, fly
+from calib.doctor import examined_part, long_recordings
+from calib.sources import RecordedSource
+from uwblink import Contents, Recording
+from uwblink.recording.distances import distances_m
+
+PLAN = Plan(seconds=300, per_second=80)
+MOST, STRETCHES = 6_000, 12
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return fly(PLAN, 51)
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    monkeypatch.setattr(long_recordings, "MOST", MOST)
+    monkeypatch.setattr(long_recordings, "STRETCHES", STRETCHES)
+
+    def write(flight):
+        Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(tmp_path / "long.uwb")
+        return tmp_path / "long.uwb"
+
+    return write
+
+
+def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all_poses(flight, written):
+    with Recording.open(written(flight)) as recording:
+        looked = long_recordings.looked_at(RecordedSource(recording))
+    x, every = looked.exchanges, flight.exchanges
+    assert looked.count == len(every) == 24_000
+    assert len(x) == pytest.approx(MOST, rel=0.02)
+    gaps = np.diff(x.time_ns) > 1_000_000_000
+    assert np.count_nonzero(gaps) == STRETCHES - 1
+    assert (x.time_ns[0], x.time_ns[-1]) == (every.time_ns[0], every.time_ns[-1])
+    ends = x.initiator, x.target, x.time_ns
+    np.testing.assert_array_equal(
+        distances_m(looked.poses, looked.tags, *ends), distances_m(flight.poses, flight.tags, *ends)
+    )
+    assert len(looked.poses) < len(flight.poses)
+
+
+def test_nothing_is_found_where_nothing_was_planted_and_it_is_said_what_was_looked_at(flight, written):
+    path = written(flight)
+    assert calib.examine(path) == []
+    assert examined_part(path) == (
+        "about 6000 of its 24000 exchanges were looked at, in 12 stretches over all of its time"
+    )
+
+
+def test_poses_that_are_late_are_found_by_how_much(flight, written):
+    late = replace(flight, poses=replace(flight.poses, time_ns=flight.poses.time_ns + 400_000_000))
+    (finding,) = calib.examine(written(late))
+    assert finding.fault == "pose time offset"
+    assert "-0.400 s" in finding.evidence or "-0.39" in finding.evidence
+
+
+def test_a_short_recording_is_looked_at_as_a_whole(flight, written, monkeypatch):
+    monkeypatch.setattr(long_recordings, "MOST", 24_000)
+    path = written(flight)
+    with Recording.open(path) as recording:
+        assert len(long_recordings.looked_at(RecordedSource(recording)).exchanges) == 24_000
+    assert examined_part(path) == ""

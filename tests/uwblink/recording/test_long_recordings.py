@@ -1,0 +1,123 @@
+"""A recording that is read some rows at a time says what it says as a whole, wherever the pieces begin and end."""
+
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from uwblink import Contents, Exchanges, Recording
+from uwblink.recording import target_reports
+from uwblink.recording.relative_clocks import clock_skews
+from uwblink.recording.schema import Fault
+from uwblink.recording.target_reports import single_report_blocks, single_reports
+
+COUNT = 700
+
+
+def exchanges(seed):
+    """Double-sided exchanges of three boards, 5 ms apart, whose clocks run by different rates."""
+    rng = np.random.default_rng(seed)
+    pairs = np.array([(1, 2), (2, 1), (1, 3), (3, 2)])[rng.integers(0, 4, COUNT)]
+    start = rng.integers(0, 2**32, COUNT)
+    third = 98_000_000 + (300 * pairs[:, 1]).astype(np.int64)
+    stamps = {"tx1": start, "rx1": start + 500, "tx2": start + 20_000_500, "rx2": start + 20_001_000}
+    stamps |= {"tx3": start + 20_000_500 + third, "rx3": start + 20_001_000 + 98_000_000}
+    told: dict[str, Any] = {name: stamp % 2**32 for name, stamp in stamps.items()}
+    return Exchanges.from_arrays(
+        *pairs.T,
+        time_ns=np.sort(rng.integers(0, COUNT * 5_000_000, COUNT)),
+        skew1_ppm=rng.normal(3, 0.1, COUNT),
+        skew2_ppm=rng.normal(-3, 0.1, COUNT),
+        **told,
+    )
+
+
+def reported_by_both(whole, seed):
+    """The same with a second report of two in three, up to 50 ms later, some of which say otherwise."""
+    rng = np.random.default_rng(seed)
+    again = whole[np.flatnonzero(rng.random(COUNT) < 0.67)]
+    differs = rng.random(len(again)) < 0.1
+    second = replace(
+        again,
+        time_ns=again.time_ns + rng.integers(0, 50_000_000, len(again)),
+        reporter=again.target.copy(),
+        range_m=np.where(differs, again.range_m + 1.0, again.range_m),
+    )
+    columns: dict[str, Any] = {
+        name: np.concatenate([column, getattr(second, name)]) for name, column in whole.to_dict().items()
+    }
+    order = np.argsort(columns["time_ns"], kind="stable")
+    return Exchanges(**{name: column[order] for name, column in columns.items()}), int(np.count_nonzero(differs))
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(x, **more):
+        Contents(exchanges=x, **more).save(tmp_path / "r.uwb", force=True)
+        return tmp_path / "r.uwb"
+
+    return write
+
+
+@pytest.mark.parametrize("rows", [37, 699, 700, 5000])
+def test_blocks_of_any_size_are_all_exchanges_in_their_order(written, rows):
+    whole = exchanges(1)
+    with Recording.open(written(whole)) as recording:
+        parts = list(recording.exchange_blocks(rows))
+    assert max(map(len, parts)) <= rows
+    for name, column in whole.to_dict().items():
+        np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), column)
+
+
+@pytest.mark.parametrize("rows", [23, 101, 400])
+def test_reports_of_both_ends_are_told_apart_across_the_edges_of_stretches(written, monkeypatch, rows):
+    both, differing = reported_by_both(exchanges(2), seed=rows)
+    monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", rows)
+    at_once = single_reports(both)
+    with Recording.open(written(both)) as recording:
+        found = [(reports, of) for reports, of in single_report_blocks(recording)]
+    assert len(found) >= len(both) // rows  # there are edges at all
+    assert sum(reports.repeated for reports, _ in found) == at_once.repeated == len(both) - COUNT
+    assert sum(len(reports.differing) for reports, _ in found) == len(at_once.differing) == differing
+    kept = [zip(r.exchanges.time_ns.tolist(), r.exchanges.tx1.tolist(), strict=True) for r, _ in found]
+    alone = zip(at_once.exchanges.time_ns.tolist(), at_once.exchanges.tx1.tolist(), strict=True)
+    assert Counter(row for part in kept for row in part) == Counter(alone)
+
+
+@pytest.mark.parametrize("rows", [50, 300])
+def test_a_summary_does_not_depend_on_how_it_was_read(written, monkeypatch, rows):
+    both, _ = reported_by_both(exchanges(3), seed=7)
+    faults = [Fault(5, "1", "time-out", "", 1, 2), Fault(6, "1", "garbage", "x"), Fault(7, "2", "time-out", "", 1, 2)]
+    path = written(both, faults=faults)
+    with Recording.open(path) as recording:
+        as_one = recording.show()
+        monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", rows)
+        assert recording.show() == as_one
+    assert as_one.counts["exchanges"] == COUNT
+    assert as_one.faults == {"garbage": 1, "time-out": 2}
+    assert {(p.initiator, p.target): p.failed for p in as_one.pairs}[1, 2] == 2
+
+
+def test_clocks_of_pairs_are_the_same_from_blocks(written):
+    whole = exchanges(4)
+    with Recording.open(written(whole)) as recording:
+        assert clock_skews(recording.exchange_blocks(33)) == clock_skews(whole)
+
+
+def test_stretches_cover_each_time_once(written):
+    whole = exchanges(5)
+    with Recording.open(written(whole)) as recording:
+        spans = recording.stretches(50)
+        parts = [recording.exchanges_between(*span) for span in spans]
+    assert [len(part) for part in parts] == [50] * 14
+    assert [end for _, end in spans[:-1]] == [start for start, _ in spans[1:]]
+    np.testing.assert_array_equal(np.concatenate([part.tx1 for part in parts]), whole.tx1)
+
+
+def test_a_recording_without_exchanges_has_no_stretches(tmp_path):
+    with Recording.create(tmp_path / "empty.uwb") as recording:
+        assert recording.stretches(50) == []
+    with Recording.open(tmp_path / "empty.uwb") as recording:
+        assert recording.show().span_s == 0.0
