@@ -1,14 +1,26 @@
 """A full disk under every command that writes: one line, status 2, and no half file.
 
-The disk is full in that no file may grow beyond some length, which the system itself enforces.
+The disk is full in that no file may grow beyond some length, which the system itself enforces. A command or an output
+that is new must get a line here.
 """
 
+import importlib
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import typer
 
+import calib
+import uwblink
+import uwbsim
+from docs.site.commands import leaves
+from tests.boards import served
 from tests.in_process import run
+from uwblink.cli.guide import WRITTEN
+from uwblink.exporters import export_recording
 
 ROOT = Path(__file__).parents[1]
 NOISELESS = ROOT / "scenarios" / "noiseless.toml"
@@ -17,33 +29,115 @@ NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 @pytest.fixture(scope="module")
 def seeds(tmp_path_factory):
     folder = tmp_path_factory.mktemp("seeds")
-    assert run("uwbsim", "run", NOISELESS, "-o", folder / "f.uwb", "--set", "run.duration_s=5").status == 0
-    assert run("calib", "fit", folder / "f.uwb", "-o", folder / "c.json").status == 0
+    short = NOISELESS.read_text().replace("duration_s = 60.0", "duration_s = 2.0")
+    (folder / "s.toml").write_text(short)
+    flight = uwbsim.simulate(folder / "s.toml")
+    flight.save(folder / "f.uwb")
+    calib.fit(flight).calibration.save(folder / "c.json")
+    one_less = flight.exchanges[(flight.exchanges.initiator != 6) & (flight.exchanges.target != 6)]
+    calib.fit(uwblink.Contents(exchanges=one_less, tags=flight.tags, poses=flight.poses)).calibration.save(
+        folder / "five.json"
+    )
     shutil.copyfile(ROOT / "docs" / "examples" / "exchanges.csv", folder / "t.csv")
-    shutil.copyfile(NOISELESS, folder / "s.toml")
+    ports = uwbsim.VirtualPorts(uwbsim.load(folder / "s.toml"))
+    uwblink.record([*ports.names.values()], folder / "boards.uwb", uwblink.RangingPlan(), using=ports, duration_s=2.0)
+    uwbsim.simulate(ROOT / "scenarios/string/string.toml").save(folder / "string.uwb")
+    calib.export(calib.load_calibration(folder / "c.json"), "miluv", folder / "miluv.json")
+    for form in ("csv", "mcap", "tum"):
+        export_recording(folder / "f.uwb", folder / form, to=form)
     return folder
 
 
 COMMANDS = (
     # A log that cannot grow, a file that cannot be completed at the end, and one that cannot even be begun.
-    ("uwbsim run {s.toml} -o out.uwb --set run.duration_s=2", 40_000),
-    ("uwbsim run {s.toml} -o out.uwb --set run.duration_s=2", 300_000),
-    ("uwbsim run {s.toml} -o out.uwb --set run.duration_s=2", 4_000),
+    ("uwbsim run {s.toml} -o out.uwb", 40_000),
+    ("uwbsim run {s.toml} -o out.uwb", 300_000),
+    ("uwbsim run {s.toml} -o out.uwb", 4_000),
+    ("uwbsim show {s.toml} -o out.png", 1_000),
+    ("uwbsim compare {s.toml} -o out -n 200 --protocols ss,ds", 1_000),
+    ("uwbsim optimum {s.toml} -o out --protocols ds", 1_000),
+    ("uwbsim scenarios icra2023 -o out", 300),
+    ("uwbsim scenarios icra2023 -o out/deep/er", 1_500),
     ("uwbsim twin {f.uwb} -c {c.json} -o out.toml", 1_000),
     ("uwblink import csv {t.csv} -o out.uwb", 20_000),
+    ("uwblink import exported {csv} -o out.uwb", 20_000),
+    ("uwblink import guess {t.csv} -o out.toml", 20),
+    ("uwblink import bag {mcap/recording.mcap} -o out.uwb", 20_000),
+    ("uwblink replay {boards.uwb} -o out.uwb", 20_000),
     ("uwblink export {f.uwb} --to csv -o out", 10_000),
+    ("uwblink export {f.uwb} --to parquet -o out", 1_000),
     ("uwblink export {f.uwb} --to mcap -o out.mcap", 10_000),
+    ("uwblink export {f.uwb} --to rosbag2 -o out", 10_000),
     ("uwblink export {f.uwb} --to tum -o out", 1_000),
     ("calib fit {f.uwb} -o out.json", 1_000),
+    ("calib add-tag {f.uwb} -c {five.json} --tag 6 -o out.json", 1_000),
+    ("calib survey {string.uwb} --known line -o out.json", 100),
+    ("calib import miluv {miluv.json} -o out.json", 100),
+    ("calib sample -o out.uwb -n 100", 20_000),
     ("calib apply {f.uwb} -c {c.json} -o out.uwb", 50_000),
-    ("calib export {c.json} --to csv -o out.csv", 20),
+    *(
+        (f"calib apply {{f.uwb}} -c {{c.json}} --to {form} -o out", 1_000)
+        for form in ("csv", "parquet", "mcap", "rosbag2")
+    ),
+    *(
+        (f"calib export {{c.json}} --to {form} -o out", 20)
+        for form in ("registers", "json", "csv", "miluv", "ros-yaml")
+    ),
+    ("calib export {c.json} --to c-header -o out.h", 20),
     ("calib localize {f.uwb} -c {c.json} --tum out", 1_000),
+    ("calib compare {c.json} {five.json} --figures out", 1_000),
     ("calib report {f.uwb} -o out.html", 1_000),
 )
 
+SAME = {
+    # One function writes what is drawn (calib.report.writing), and drawing takes seconds.
+    "calib localize --figures": "calib compare --figures",
+    "calib evaluate --figures": "calib compare --figures",
+    "calib evaluate --report": "calib report --output",
+    "calib report --pdf": "calib report --output",
+    "calib report --figures": "calib compare --figures",
+    "calib survey --plot": "uwblink cir --plot",
+    # These are written as calibrations are, by `uwblink.output.write_text`.
+    "calib survey --anchors": "calib survey --output",
+    # The same function imports whatever form a source has.
+    "uwblink import miluv --output": "uwblink import csv --output",
+}
+"""Outputs that are written by the very function that another line of the table has."""
 
-def hidden(folder):
-    return [path for path in folder.rglob("*") if path.name.startswith(".") or "partial" in path.name]
+ELSEWHERE = {
+    "uwblink record --output": "uwblink/boards/test_recorder.py",
+    "uwblink stream --output": "uwblink/boards/test_recorder.py",  # by the same recorder
+    "uwbsim sweep --output": "uwbsim/sweep/test_machine_faults.py",
+    "uwblink cir --plot": "test_full_disk.py",
+}
+"""Outputs that other tests write onto a full disk: the sweep keeps what it has done, the recorder what it recorded."""
+
+
+def outputs():
+    """Return every output that commands have, as `calib fit --output`."""
+    found = set()
+    for package in ("uwblink", "uwbsim", "calib"):
+        app = importlib.import_module(f"{package}.cli.commands").app
+        for words, command in leaves(typer.main.get_command(app), (package,)):
+            written = [p for p in command.params if p.name in WRITTEN and p.type_descriptor.annotation is Path]
+            found |= {f"{' '.join(words)} {parameter.opts[-1]}" for parameter in written}
+    return found
+
+
+def of_line(line):
+    """Return the output that a line of the table writes."""
+    words = line.split()
+    flag = next(word for word in reversed(words) if word in ("-o", "--tum", "--figures"))
+    named = words[: 3 if words[1] == "import" else 2]
+    return f"{' '.join(named)} {'--output' if flag == '-o' else flag}"
+
+
+def test_every_output_of_every_command_is_written_onto_a_full_disk():
+    tested = {of_line(line) for line, _ in COMMANDS}
+    assert set(SAME.values()) <= tested | set(ELSEWHERE)
+    assert tested | set(SAME) | set(ELSEWHERE) == outputs()
+    for file in ELSEWHERE.values():
+        assert re.search("full_disk|most_bytes", (ROOT / "tests" / file).read_text()), file
 
 
 @pytest.mark.parametrize(("line", "most_bytes"), COMMANDS)
@@ -55,8 +149,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_
     assert len(said) == 1, ended
     assert said[0].startswith("error: ")
     assert "cannot be" in said[0]
-    assert hidden(tmp_path) == []
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_where_the_disk_has_room_the_same_commands_write(seeds, tmp_path):
@@ -68,3 +161,29 @@ def test_a_folder_that_vanishes_is_one_line(seeds, tmp_path):
     ended = run("calib", "export", seeds / "c.json", "--to", "csv", "-o", "no/out.csv", folder=tmp_path)
     assert ended.status == 2
     assert ended.err.count("\n") == 1
+
+
+def test_poses_for_which_the_disk_has_no_room_leave_the_recording_as_it_was(seeds, tmp_path):
+    path = tmp_path / "f.uwb"
+    flight = uwblink.load(seeds / "f.uwb")
+    replace(flight, poses=flight.poses[:0]).save(path)
+    source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
+    ended = run("uwblink", "poses", path, *source, folder=tmp_path, most_bytes=1000)
+    assert ended.status == 2, ended
+    assert ended.err.count("\n") == 1
+    assert "cannot be written" in ended.err
+    # DuckDB's log of the update that failed may lie beside it, until the recording is next written to.
+    assert {each.name for each in tmp_path.iterdir()} <= {"f.uwb", "f.uwb.wal"}
+    after = uwblink.load(path)
+    assert len(after.poses) == 0
+    assert len(after.exchanges) == len(flight.exchanges)
+
+
+def test_a_plot_of_a_board_for_which_the_disk_has_no_room(tmp_path):
+    with served() as server:
+        here, there, *_ = server.names
+        words = ["uwblink", "cir", server.names[here], there, "--plot", "out.png"]
+        ended = run(*words, folder=tmp_path, most_bytes=1000)
+    assert ended.status == 2, ended
+    assert ended.err == "error: out.png: cannot be written (File too large)\n"
+    assert list(tmp_path.iterdir()) == []

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError
+from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError, UwblinkError
 
-__all__: Final = ["check_apart", "check_output", "whole", "write_bytes", "write_text"]
+__all__: Final = ["check_apart", "check_output", "made_folder", "whole", "write_bytes", "write_files", "write_text"]
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
@@ -36,10 +36,42 @@ def whole(path: Path, *, force: bool) -> Iterator[Path]:
     try:
         yield partial
         partial.replace(path)
+    except UwblinkError:
+        raise  # of this or of another file of several
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Make a folder, and those above it, where they are missing; where the block fails, what was made goes away empty.
+
+    Raises `OutputError` where it cannot be made.
+    """
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be made ({error.strerror})") from error
+        yield
+    except BaseException:
+        for place in missing:
+            with suppress(OSError):
+                place.rmdir()
+        raise
+
+
+def write_files(folder: Path, files: Mapping[str, bytes], *, force: bool) -> None:
+    """Write files by their names into a folder, which is made where it is missing: all of them, or none.
+
+    Raises what `whole` and `made_folder` raise.
+    """
+    with made_folder(folder), ExitStack() as every:
+        for name, data in files.items():
+            every.enter_context(whole(folder / name, force=force)).write_bytes(data)
 
 
 def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ()) -> None:

@@ -15,7 +15,7 @@ from calib.evaluation.localization import PAPER_RMSE_M
 from calib.evaluation.onboard import OnboardSettings, OnboardTrack
 from calib.evaluation.tracking import Localization, Settings, Track
 from uwblink.arrays import Floats, Ints
-from uwblink.output import write_text
+from uwblink.output import write_files
 
 NAMES: Final = {"raw": "raw", "calibrated": "calibrated", "variance": "variance", "robust": "robust"}
 WIDTH: Final = 12
@@ -81,12 +81,12 @@ def localization_json(found: list[Localization]) -> dict[str, Any]:
 
 def write_tum(found: list[Localization], folder: Path, *, force: bool = False) -> None:
     """Write the trajectory of each body and filter, and the true one, into a folder, which is made if it is missing."""
-    folder.mkdir(parents=True, exist_ok=True)
+    files: dict[str, bytes] = {}
     for name, one in zip(_names(f"{one.source}-{one.body}" for one in found), found, strict=True):
         texts = {stage: as_tum(track) for stage, track in one.tracks.items()}
         texts["truth"] = as_tum(one.tracks["raw"], truth=True)
-        for stage, text in texts.items():
-            write_text(folder / f"{name}-{stage}.tum", text, force=force)
+        files |= {f"{name}-{stage}.tum": text.encode() for stage, text in texts.items()}
+    write_files(folder, files, force=force)
 
 
 def _names(texts: Iterable[str]) -> list[str]:
@@ -138,13 +138,14 @@ def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
 
 def write_onboard_tum(found: list[OnboardTrack], folder: Path, *, force: bool = False) -> None:
     """Write the trajectory of each body with its attitudes, and the true one where there is one, into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    files = {}
     for name, one in zip(_names(f"{one.source}-{one.body}-{one.model}" for one in found), found, strict=True):
-        write_text(folder / f"{name}.tum", _tum(one.time_ns, one.estimate_m, one.attitude), force=force)
+        files[f"{name}.tum"] = _tum(one.time_ns, one.estimate_m, one.attitude).encode()
         known = np.isfinite(one.truth_m).all(axis=1) & np.isfinite(one.true_attitude).all(axis=1)
         if known.any():
             text = _tum(one.time_ns[known], one.truth_m[known], one.true_attitude[known])
-            write_text(folder / f"{name}-truth.tum", text, force=force)
+            files[f"{name}-truth.tum"] = text.encode()
+    write_files(folder, files, force=force)
 
 
 def as_tum(track: Track, *, truth: bool = False) -> str:

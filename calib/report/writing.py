@@ -9,7 +9,7 @@ from typing import Final
 from calib.errors import BadInputError
 from calib.report.blocks import Document
 from calib.report.html import to_html
-from uwblink.output import check_output, write_bytes, write_text
+from uwblink.output import check_output, write_bytes, write_files, write_text
 from uwblink.pages.figures import WIDTHS, Printed, drawn
 
 PAPER_KINDS: Final = ("pdf", "svg")
@@ -101,8 +101,6 @@ def _write_figures(
     from calib.report.pdf import single_pages
 
     pages = single_pages(printed)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, widths in made.items():
-        for width, svg in widths.items():
-            write_bytes(folder / f"{name}-{width}.svg", svg, force=force)
-            write_bytes(folder / f"{name}-{width}.pdf", pages[places[name, width]], force=force)
+    drawings = {f"{name}-{width}.svg": svg for name, widths in made.items() for width, svg in widths.items()}
+    printings = {f"{name}-{width}.pdf": pages[places[name, width]] for name, widths in made.items() for width in widths}
+    write_files(folder, drawings | printings, force=force)

@@ -3,7 +3,7 @@
 import pytest
 
 from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError
-from uwblink.output import check_apart, write_bytes, write_text
+from uwblink.output import check_apart, write_bytes, write_files, write_text
 
 
 def test_text_is_utf8_and_nothing_is_left_beside_it(tmp_path):
@@ -48,3 +48,27 @@ def test_no_output_is_written_over_another_or_over_what_is_read(tmp_path):
         check_apart({"output": a, "pdf": tmp_path / "x" / ".." / "a"})
     with pytest.raises(ArgumentError, match=r"`output`: .*a: is what is read"):
         check_apart({"output": a}, [b, a])
+
+
+def test_several_files_are_all_there_or_none_and_no_folder_is_left(tmp_path, monkeypatch):
+    plain, folder = type(tmp_path).write_bytes, tmp_path / "deep" / "er"
+
+    def full(self, data):
+        if b"third" in data:
+            raise OSError(28, "No space left on device")
+        return plain(self, data)
+
+    monkeypatch.setattr(type(tmp_path), "write_bytes", full)
+    with pytest.raises(OutputError, match=r"c: cannot be written \(No space left on device\)$"):
+        write_files(folder, {"a": b"first", "b": b"second", "c": b"third"}, force=False)
+    assert list(tmp_path.iterdir()) == []
+    write_files(folder, {"a": b"first", "b": b"second"}, force=False)
+    with pytest.raises(OutputError, match="c: cannot be written"):
+        write_files(folder, {"a": b"other", "c": b"third"}, force=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {"a": b"first", "b": b"second"}
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OutputError, match=r"er: cannot be made \(Not a directory\)"):
+        write_files(tmp_path / "file" / "er", {"a": b""}, force=False)

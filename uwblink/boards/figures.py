@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from uwblink.output import write_bytes
 from uwblink.wire.messages import Cir
 
 TAP_NS = 1.0016
 AROUND = (20, 80)
 
 
-def plot_cir(cir: Cir, path: Path) -> None:
-    """Draw a channel impulse response around its first path, and write it in the format of the file's suffix."""
+def plot_cir(cir: Cir, path: Path, *, force: bool = False) -> None:
+    """Draw a channel impulse response around its first path, and write it in the format of the file's suffix.
+
+    Raises what `uwblink.output.whole` raises.
+    """
     first = cir.first_path_milli / 1000
     low, high = max(int(first) - AROUND[0], 0), min(int(first) + AROUND[1], cir.TAPS)
     figure = Figure(figsize=(8, 3.6), layout="constrained")
@@ -26,4 +31,6 @@ def plot_cir(cir: Cir, path: Path) -> None:
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=150)
+    drawn = BytesIO()
+    figure.savefig(drawn, format=path.suffix.removeprefix(".").lower(), dpi=150)
+    write_bytes(path, drawn.getvalue(), force=force)

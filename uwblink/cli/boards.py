@@ -237,7 +237,7 @@ def cir(
     if plot:
         from uwblink.boards import plot_cir
 
-        plot_cir(response, plot)
+        plot_cir(response, plot, force=force)
     index = response.first_path_milli / 1000
     if as_json:
         typer.echo(json.dumps({"first_path_index": index, "magnitudes": list(response.magnitudes), **_fields(report)}))

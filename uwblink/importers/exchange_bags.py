@@ -134,8 +134,12 @@ def _plain(value: Any) -> Any:
 def _write(path: Path, rows: Iterable[dict[str, Any]]) -> dict[str, Any] | None:
     """Write rows as JSON lines; returns the first, None where there is none."""
     first = None
-    with path.open("w", encoding="utf-8") as file:
-        for row in rows:
-            first = first or row
-            file.write(json.dumps(row, allow_nan=False) + "\n")
+    try:
+        with path.open("w", encoding="utf-8") as file:
+            for row in rows:
+                first = first or row
+                file.write(json.dumps(row, allow_nan=False) + "\n")
+    except OSError as error:
+        reason = error.strerror or error
+        raise ImportTableError(f"{path.stem}: cannot be turned into a table in {path.parent} ({reason})") from error
     return first

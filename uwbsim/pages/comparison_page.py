@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.output import write_text
+from uwblink.output import made_folder, write_text
 from uwblink.pages.html import both_widths, page_html, table_html
 from uwbsim.output import check_folder
 from uwbsim.pages import protocol_figures as figures
@@ -43,11 +43,11 @@ def write_comparison(found: Comparison, folder: Path, *, force: bool = False) ->
     """
     check_folder(folder, FILES, force=force)
     text, rows = page(found), [one.to_dict() for one in found.outcomes]
-    folder.mkdir(exist_ok=True)
     html, table, packed = (folder / name for name in FILES)
-    write_text(html, text, force=force)
-    write_csv(table, rows, force=force)
-    write_parquet(packed, rows, force=force)
+    with made_folder(folder):
+        write_text(html, text, force=force)
+        write_csv(table, rows, force=force)
+        write_parquet(packed, rows, force=force)
 
 
 def page(found: Comparison) -> str:

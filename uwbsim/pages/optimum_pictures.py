@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
-from uwblink.output import write_bytes
+from uwblink.output import write_files
 from uwblink.pages.figures import picture
 from uwbsim.output import check_folder
 from uwbsim.pages.protocol_figures import optimum_curve
@@ -25,6 +25,4 @@ def write_optima(found: Iterable[Optimum], folder: Path, *, force: bool = False)
     """
     pictures = {optimum_file(one.protocol): picture(partial(optimum_curve, found=one), "png") for one in found}
     check_folder(folder, pictures, force=force)
-    folder.mkdir(exist_ok=True)
-    for name, data in pictures.items():
-        write_bytes(folder / name, data, force=force)
+    write_files(folder, pictures, force=force)

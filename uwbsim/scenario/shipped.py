@@ -6,11 +6,12 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from uwblink.output import write_bytes
+from uwblink.output import made_folder, whole
 from uwbsim.errors import ScenarioError
 
 SUFFIX: Final = ".toml"
@@ -70,18 +71,17 @@ def copy_scenarios(names: Iterable[str], folder: Path, *, force: bool = False) -
     """Copy shipped scenarios, and the files that they name, into a folder, in the places where they lie beside another.
 
     `names` are those of `shipped_scenarios`, or of their folders; none are all. Returns what was written. Raises
-    `ScenarioError` for a name that is not there, with nothing written, and what `write_bytes` raises.
+    `ScenarioError` for a name that is not there, with nothing written, and what `whole` raises.
     """
     top = _folder().resolve()
     chosen = _chosen(list(names)).values()
     files = dict.fromkeys([*(path.resolve() for path in chosen), *(one for path in chosen for one in _linked(path))])
-    written = []
-    for path in files:
-        place = folder / path.relative_to(top)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(place, path.read_bytes(), force=force)
-        written.append(place)
-    return written
+    places = {path: folder / path.relative_to(top) for path in files}
+    with ExitStack() as every:
+        for path, place in places.items():
+            every.enter_context(made_folder(place.parent))
+            every.enter_context(whole(place, force=force)).write_bytes(path.read_bytes())
+    return [*places.values()]
 
 
 def _chosen(names: list[str]) -> Mapping[str, Path]:
