@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import BadInputError, UnanswerableError
+from calib.planted import check_planted
 from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
 from calib.recorded import FINGERPRINT, read_ranges
 from uwblink.recording.file import Recording
@@ -204,7 +205,7 @@ def _load(data: Data, need_power: bool) -> Ranges:
         exchanges = single_reports(source.exchanges).exchanges
         complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
         poses, tags = (None, []) if complete else (source.poses, source.tags)
-        planted = _planted(source)
+        planted = _planted(source, name)
     ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, planted=planted, source=name)
     ranges = replace(ranges, recordings=((name, fingerprint(exchanges)),))
     return ranges.usable(_why_no_truth(ranges, poses, tags), need_power=need_power)
@@ -222,9 +223,12 @@ def fingerprint(exchanges: Exchanges) -> str:
     return found.hexdigest()[:FINGERPRINT]
 
 
-def _planted(source: Source) -> Mapping[str, Any] | None:
+def _planted(source: Source, name: str) -> Mapping[str, Any] | None:
     found = getattr(source, "planted", None) or getattr(source, "meta", {}).get("planted")
-    return found if isinstance(found, Mapping) else None
+    if not isinstance(found, Mapping):
+        return None
+    check_planted(found, name)
+    return found
 
 
 def _why_no_truth(ranges: Ranges, poses: Poses | None, tags: Sequence[Tag]) -> str:

@@ -63,7 +63,7 @@ FLOORS = {
     ),
     "calib": (
         ("carriers", "errors", "samples", "single_sided", "spread", "tails"),
-        ("densities", "information", "long_columns"),
+        ("densities", "information", "long_columns", "planted"),
         ("error_mixture", "ranges"),
         ("recorded",),
         ("calibration", "sources"),

@@ -161,3 +161,32 @@ def test_poses_without_tags_are_said_to_lack_them():
     bare = replace(flight, tags=[], exchanges=replace(flight.exchanges, truth_m=flight.exchanges.truth_m * np.nan))
     with pytest.raises(UnanswerableError, match=r"does not say which tag sits on which body; .*--tags"):
         calib.fit(bare)
+
+
+SPLINE = {"knots": [0, 0, 1, 1], "degree": 1, "coefficients": [0.0, 0.1]}
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        {"delays_ns": "abc"},
+        {"delays_ns": []},
+        {"delays_ns": {"x": 1.0}},
+        {"delays_ns": {"1": "x"}},
+        {"delays_ns": {"1": 1e300}},
+        {"bias_curve": "abc"},
+        {"bias_curve": {"knots": [1, 2]}},
+        {"bias_curve": SPLINE | {"degree": 7}},
+        {"bias_curve": SPLINE | {"degree": "1"}},
+        {"bias_curve": SPLINE | {"coefficients": [0.0, None]}},
+        {"bias_curve": SPLINE | {"coefficients": [0.0, 1e308]}},
+        {"bias_curve": SPLINE | {"knots": [0, 1, 1, 0]}},
+        {"bias_curve": SPLINE | {"knots": [1, 1, 1, 1]}},
+        {"sigma_curve": SPLINE | {"knots": [0, 0, 1]}},
+    ],
+)
+def test_what_a_file_says_was_planted_has_its_form(planted):
+    flight = sample_flight(10)
+    assert load_ranges(replace(flight, planted={"bias_curve": SPLINE, "sigma_curve": None})).planted
+    with pytest.raises(BadInputError, match=rf"^memory: planted: {next(iter(planted))}: found "):
+        load_ranges(replace(flight, planted=planted))
