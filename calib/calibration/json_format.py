@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from typing import Any
+from typing import Any, Final
 
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from uwblink.twr import LARGEST_ID
+
+LARGEST: Final = 1e100
+"""Whatever it is of, squares and products of such numbers are numbers still."""
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -45,8 +47,8 @@ class Reader:
     def number(self, key: str) -> float:
         """Return a finite number."""
         value = self._value(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
-            raise self.wrong(key, "a finite number")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            raise self.wrong(key, f"a finite number up to {LARGEST:g}")
         return float(value)
 
     def word(self, key: str) -> str:

@@ -57,7 +57,10 @@ def _write(recording: Path, file: BinaryIO, messages: Iterator[Message]) -> int:
             channels[topic] = len(channels) + 1
             ids = struct.pack("<HH", channels[topic], list(SCHEMAS).index(schema) + 1)
             _record(file, CHANNEL, ids + _text(topic) + _text("json") + struct.pack("<I", 0))
-        data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
+        try:
+            data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
+        except ValueError as error:
+            raise RecordingError(f"{recording}: {topic}: holds a number that is none, which JSON cannot say") from error
         _record(file, MESSAGE, struct.pack("<HIQQ", channels[topic], count & 0xFFFFFFFF, time_ns, time_ns) + data)
         count += 1
     _record(file, DATA_END, struct.pack("<I", 0))

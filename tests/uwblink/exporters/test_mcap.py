@@ -111,3 +111,12 @@ def test_times_before_1970_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="before 1970"):
         export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_number_that_is_none_is_refused_in_one_line(tmp_path):
+    sample = Exchanges.from_arrays([1], [2], time_ns=[5], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    poses = Poses(np.array([5]), np.array(["drone"]), np.array([[1.0, np.nan, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
+    Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
+    with pytest.raises(RecordingError, match="holds a number that is none"):
+        export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
+    assert not (tmp_path / "out").exists()
