@@ -5,16 +5,18 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from calib.calibration.formats import programmed, read_miluv
+    from calib.calibration.formats import free_delays, programmed, read_miluv
     from calib.calibration.foundations import rests_on
 
 __all__ = [
+    "free_delays",
     "programmed",
     "read_miluv",
     "rests_on",
 ]
 
 _HOMES: Final = {
+    "free_delays": "calib.calibration.formats",
     "programmed": "calib.calibration.formats",
     "read_miluv": "calib.calibration.formats",
     "rests_on": "calib.calibration.foundations",

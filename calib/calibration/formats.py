@@ -61,9 +61,27 @@ def registers(calibration: Calibration, base: Programmed | None = None) -> dict[
     `base` is what that was (`programmed`); without it the boards' 16436 in both. The chip adds the one to transmit
     stamps and takes the other from receive stamps. A recorded stamp is the true one plus d_t = 0.44 d or
     d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md). Raises `BadInputError` for a value that
-    16 bits do not hold.
+    16 bits do not hold, and for delays that the data left free: a device ranges with any other, and its register would
+    be right with some of them alone.
     """
-    found, known = {}, base or Programmed()
+    free = free_delays(calibration)
+    if free:
+        raise BadInputError(
+            f"the data leave the delay of tag {', '.join(map(str, free))} free, so no register is right; fix one that "
+            "is known (`fixed_ns`), or fit ranges between more tags (csv and json say what is known)",
+            parameter="to",
+        )
+    return _on_top(calibration, base or Programmed())
+
+
+def free_delays(calibration: Calibration) -> list[int]:
+    """Return the tags whose delays the data left free: sums with those of some others may be known, they are not."""
+    return [tag for tag, std in sorted(calibration.delays_std_ns.items()) if not math.isfinite(std)]
+
+
+def _on_top(calibration: Calibration, known: Programmed) -> dict[int, tuple[int, int]]:
+    """Return registers by tag, whatever is known of the delays."""
+    found = {}
     for tag, delay in sorted(calibration.delays_ns.items()):
         ticks = -delay * 1e-9 / TICK_S
         tx, rx = known.of(tag)
@@ -115,7 +133,7 @@ def _ros_yaml(calibration: Calibration, base: Programmed | None = None) -> str:
     _one_curve(calibration, "ros-yaml")
     lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}"]
     lines += [f"  power_at: {calibration.power_at}", "  tags:"]
-    for tag, (tx, rx) in registers(calibration, base).items():
+    for tag, (tx, rx) in _on_top(calibration, base or Programmed()).items():
         lines += [
             f"    '{tag}':",
             f"      delay_ns: {calibration.delays_ns[tag]!r}",
@@ -196,7 +214,8 @@ def export(
     `to` is "registers" (values for the DW1000's antenna-delay registers, as CSV), "json", "csv" (delays), "miluv",
     "ros-yaml" or "c-header" (tables and a function that corrects a range). Registers are on top of `base`, what was
     programmed when the devices were recorded (`programmed`), else of the boards' own 16436. Raises `BadInputError` for
-    another form, and for a calibration with groups of tags in a form that has one curve.
+    another form, for a calibration with groups of tags in a form that has one curve, and for registers of tags whose
+    delays the data left free.
 
     >>> import calib
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[0])

@@ -14,6 +14,9 @@ from uwblink.cli.waiting import waiting
 
 PANEL: Final = "Use"
 
+WITHOUT_ERRORS: Final = ("miluv", "ros-yaml", "c-header")
+"""Forms that hold delays and not how well they are known."""
+
 MILUV: Final = "calib import miluv uwb_calib.json -o calibration.json"
 
 imports = typer.Typer(
@@ -84,10 +87,15 @@ def export(
 ) -> None:
     """Write a calibration as register values, CSV, MILUV's JSON, YAML for ROS or a C header."""
     import calib
-    from calib.calibration import programmed
+    from calib.calibration import free_delays, programmed
 
     registers = programmed(base) if base else None
-    text = calib.export(known_calibration(calibration), to, output, base=registers, force=force)
+    known = known_calibration(calibration)
+    text = calib.export(known, to, output, base=registers, force=force)
+    free = free_delays(known)
+    if free and to in WITHOUT_ERRORS:
+        tags = ", ".join(map(str, free))
+        typer.echo(f"warning: {to} does not say that the data leave the delay of tag {tags} free", err=True)
     if output is None:
         typer.echo(text, nl=False)
     else:

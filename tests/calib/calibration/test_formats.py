@@ -41,6 +41,14 @@ def test_registers_undo_the_delay(fitted):
         assert (tx - 16436) + (rx - 16436) == pytest.approx(-d, abs=1)
 
 
+def test_no_register_is_written_for_a_delay_that_the_data_left_free(fitted):
+    known = replace(fitted, delays_std_ns={**fitted.delays_std_ns, 2: math.inf, 3: math.inf})
+    with pytest.raises(BadInputError, match=r"`to`: the data leave the delay of tag 2, 3 free"):
+        calib.export(known, "registers")
+    assert "inf" in calib.export(known, "csv").splitlines()[2]
+    assert "delay_ns" in calib.export(known, "ros-yaml")
+
+
 def test_registers_go_on_top_of_what_was_programmed(tmp_path, fitted):
     known = replace(fitted, delays_ns={1: 0.25, 2: -513.5})
     single = {"configured_antenna_delay_ticks_by_tag": {"1": {"tx": 16440, "rx": 16430}}}
