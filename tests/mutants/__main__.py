@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TextIO
 
 import pytest
 
@@ -105,7 +105,7 @@ def try_room(room: Room, each: int, seed: int, matching: str) -> tuple[int, list
     """Return how many faults were tried in a room, and those that no test noticed."""
     chosen = [m for file in room.files for m in _sample(ROOT / file, each, seed, matching)]
     survivors: list[Mutant] = []
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory() as scratch, os.fdopen(os.dup(1), "w") as terminal:  # pytest captures the other
         place = Path(scratch)
         outside = [m for m in chosen if changed_functions(m) is None]
         inside = [m for m in chosen if m not in outside]
@@ -118,7 +118,8 @@ def try_room(room: Room, each: int, seed: int, matching: str) -> tuple[int, list
             def use(items: dict[str, pytest.Item]) -> None:
                 in_fork(lambda: measure(items, paths, reached), 3000)
                 reach = read_reach(reached)
-                (place / "lived").write_text("".join(f"{inside.index(m)}\n" for m in inside if lives(m, items, reach)))
+                lived = [k for k, mutant in enumerate(inside) if _told(mutant, lives(mutant, items, reach), terminal)]
+                (place / "lived").write_text("".join(f"{k}\n" for k in lived))
 
             pytest.main([*QUIET, f"--basetemp={place / 'warm'}", *tests], [Collected(use)])
             return 0 if (place / "lived").exists() else BROKEN
@@ -126,10 +127,15 @@ def try_room(room: Room, each: int, seed: int, matching: str) -> tuple[int, list
         in_fork(lambda: _silent(warm), 36_000)
         survivors += [inside[int(k)] for k in (place / "lived").read_text().split()]
         reach = read_reach(reached)
-        survivors += [m for m in outside if not _notices_anew(m, reach, place)]
-    for mutant in survivors:
-        print(f"  unnoticed  {mutant}", flush=True)
+        survivors += [m for m in outside if _told(m, not _notices_anew(m, reach, place), terminal)]
     return len(chosen), survivors
+
+
+def _told(mutant: Mutant, lived: bool, terminal: TextIO) -> bool:
+    """Print a fault that nobody noticed as soon as that is known, for a run takes long; return whether it lived."""
+    if lived:
+        print(f"  unnoticed  {mutant}", file=terminal, flush=True)
+    return lived
 
 
 def _sample(path: Path, each: int, seed: int, matching: str) -> list[Mutant]:
