@@ -190,7 +190,11 @@ class Runner:
             if worked > LONGEST_S or time.monotonic() > begun + LONGEST_WAIT_S:
                 self.close()
                 return f"more than {LONGEST_S:.0f} s of work" if worked > LONGEST_S else "waits for ever"
-        wrong, status, words = self._pipe.recv()
+        try:
+            wrong, status, words = self._pipe.recv()
+        except EOFError:  # it ended between two looks
+            self._process.join()
+            return f"died with {self._process.exitcode}"
         self.statuses[status] += 1
         return f"{wrong}   [{' '.join(words)[:150]}]" if wrong else ""
 
