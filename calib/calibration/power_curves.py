@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.bsplines import combination, derivative, matrix
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.bsplines import combination, derivative, matrix
 
 ALPHA_DBM: Final = -82.0
 DEGREE: Final = 3

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.bsplines import nonzero
 from calib.calibration.power_curves import (
     DEGREE,
     SIGMA_BINS,
@@ -25,6 +24,7 @@ from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.unknowns import Unknowns
 from calib.ranges import Ranges
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.bsplines import nonzero
 from uwblink.ticks import SPEED_OF_LIGHT
 
 FEWEST: Final = 100

@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.calibration.bsplines import combination
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.display import as_html, as_text
@@ -16,6 +15,7 @@ from calib.ranges import Ranges
 from calib.sources import Data, load_ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
+from uwblink.bsplines import combination
 from uwblink.ticks import SPEED_OF_LIGHT
 
 CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from uwblink.arrays import Floats
+from uwblink.bsplines import BSpline
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
 from uwbsim.random_streams import stream
 from uwbsim.scenario.radio import AntennaTable, BiasTable, Radio, SigmaSpline, Spline
-from uwbsim.world.bsplines import BSpline
 
 if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator

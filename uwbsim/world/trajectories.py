@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.arrays import Floats
+from uwblink.bsplines import BSpline
 from uwbsim.scenario.motion import Carried, Figure, RandomFlight, Recorded, Static, Waypoints
-from uwbsim.world.bsplines import BSpline
 from uwbsim.world.rotations import turned
 
 Draw = Callable[[str], np.random.Generator]
