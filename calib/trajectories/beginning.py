@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from calib.trajectories.headings import headed, turned_right, without_heading
 from calib.trajectories.known_rows import known_rows
 from calib.trajectories.range_losses import Cauchy
 from calib.trajectories.range_rows import range_rows
@@ -67,18 +68,18 @@ def beginning(scene: Scene, done: Callable[[float], None]) -> Beginning:
         stand = _seen_from(scene, seed)
     found, stand = follow(scene, seed, stand, lambda share: done(0.8 * share))
     columns = columns_of(scene, 0)
-    start = through(scene, columns, found, stand)
+    scene, start, unsure = turned_right(scene, through(scene, columns, found, stand))
     rows = range_rows(scene, columns, scene.ranges.raw_m, np.zeros((len(scene.time_s), 0)))
     known = known_rows(scene, columns, start)
     for scale in SCALES_M:
         start = minimise(rows, known, start, Cauchy(scale), settled=1.0).state
-    return Beginning(scene, start, rival)
+    return Beginning(scene, start, rival or unsure)
 
 
 def _first_window(scene: Scene) -> tuple[Scene, Followed, Floats, str]:
     """Return where bodies are in the first window, from many starts: the one that fits best, and what rivals it."""
     begin = float(scene.time_s[0])
-    headless = _without_heading(scene)
+    headless = without_heading(scene)
     length = max(window_s(scene), HEADED_S if headless else 0.0)
     time = np.arange(begin, begin + length + SAMPLE_S / 2, SAMPLE_S)
     window = scene.between(begin, float(time[-1]))
@@ -173,16 +174,3 @@ def _seen_from(scene: Scene, seed: Followed) -> Floats:
         better = cost < best
         best[better], stand[better] = cost[better], settled.stand[better]
     return stand
-
-
-def _without_heading(scene: Scene) -> list[str]:
-    return [body for body, known in scene.attitudes.items() if not np.isfinite(known.std_rad[2]) and not known.begun]
-
-
-def headed(scene: Scene, heading: dict[str, float]) -> Scene:
-    """Return the scene with the attitudes of some bodies turned about the vertical by their headings."""
-    if not heading:
-        return scene
-    attitudes = {body: known.headed(heading.get(body, 0.0)) for body, known in scene.attitudes.items()}
-    inertial = {body: some.headed(heading.get(body, 0.0)) for body, some in scene.inertial.items()}
-    return replace(scene, attitudes=attitudes, inertial=inertial)

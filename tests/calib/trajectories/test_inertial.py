@@ -8,6 +8,9 @@ import calib
 import uwbsim
 from calib.trajectories.attitudes import Attitude
 from calib.trajectories.given import Usable, scene_from
+from calib.trajectories.headings import headed, turned_right
+from calib.trajectories.starting import Followed, through
+from calib.trajectories.unknowns import columns_of
 
 BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
 IMU = {"grade": "consumer", "vibration_mps2": 1.0}
@@ -53,6 +56,31 @@ def test_attitudes_by_gyroscope_stay_near_those_of_motion_capture(flown):
         assert np.degrees(np.abs(off)).max() < 3.5
     felt = scene.inertial["a"]
     assert np.mean(felt.force_m_s2, axis=0) == pytest.approx([0, 0, 9.81], abs=0.5)
+
+
+def test_headings_that_are_wrong_by_a_right_angle_are_found_over_the_flight(flown):
+    scene = scene_from(flown, Usable(poses_until_s=0.0, attitudes="imu")).between(0.0, 8.0)
+    known = scene_from(flown, Usable(poses_until_s=0.0)).between(0.0, 8.0)
+    time = np.array([2.0, 5.0])
+
+    def off(turned):
+        pairs = [(turned.attitudes[body].at(time), known.attitudes[body].at(time)) for body in BOXES]
+        return np.array([[np.arctan2(*(a @ b.T)[[1, 0], 0]) for a, b in zip(*pair, strict=True)] for pair in pairs])
+
+    # Integrated from an unknown heading; "b" is put a right angle off, where a first window may have left it.
+    scene = headed(scene, {body: -off(scene)[k, 0] for k, body in enumerate(BOXES)})
+    scene = headed(scene, {"b": np.pi / 2})
+    columns = columns_of(scene, 0)
+    began = flown.exchanges.time_ns[0]
+    where = np.arange(0.0, 8.0, 0.1)
+    places = [flown.poses[flown.poses.body == body] for body in BOXES]
+    place = np.stack(
+        [[np.interp(where, (p.time_ns - began) * 1e-9, axis) for axis in p.position_m.T] for p in places]
+    ).transpose(2, 0, 1)
+    found, _, unsure = turned_right(scene, through(scene, columns, Followed(where, place), np.zeros((0, 3))))
+    assert np.degrees(np.abs(off(scene))).max() > 80
+    assert np.degrees(np.abs(off(found))).max() < 16
+    assert unsure == ""
 
 
 def test_inertial_readings_and_anchors_are_enough(flown):
