@@ -38,6 +38,7 @@ def arrangement(width_in: float, plan: Plan, number: int) -> Figure:
         _tapes(axes, one, height, on_line=on_line)
         if on_line:
             _as_string(axes, one)
+    panels[0].set_title(f"Step {number + 1}: arrangement {one.name}", loc="left")
     _intervals(panels[-1], plan.after_ns[number], plan.after_ns[number - 1] if number else {})
     legend(figure, _meant(panels))
     return figure

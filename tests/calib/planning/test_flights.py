@@ -162,6 +162,8 @@ def test_the_best_tape_is_the_best_of_all():
         pair: float(np.trace(foresee(seen.taped([pair], 0.0, 0.01)).covariance_ns2)) for pair in seen.pairs_to_tape(0.0)
     }
     assert len(spreads) == 6
+    near, pair = Linearised(seen), (11, 12)
+    assert near.mean_variance_with(near.tape(pair, 0.0), 0.01) == pytest.approx(spreads[pair] / 8, rel=1e-3)
     assert best_tape(seen, 0.0, 0.01) == min(spreads, key=spreads.__getitem__)
 
 

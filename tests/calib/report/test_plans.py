@@ -31,6 +31,7 @@ def test_boards_have_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_
     assert all(words.count(tag) == 2 for words in drawn for tag in ("7", "12", "3"))
     assert sum("distance to tape" in words for words in drawn) == 1
     assert "open" in drawn[0]
+    assert "Step 2: arrangement B" in drawn[1]
     assert "before it" in drawn[1]
     assert "Step 2: arrangement B" in page
     assert "calib survey A.uwb B.uwb --known known.toml" in page
