@@ -50,6 +50,9 @@ def survey(
     plot: Annotated[
         Path | None, typer.Option(help="Picture of where boards stood, to write (.svg, .png or .pdf).")
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Report to write: verdict, what it rests on, places (.html or .pdf).")
+    ] = None,
     fix: Fix = None,
     pair_error: Annotated[
         float | None, typer.Option(help="Constant error of a pair in an arrangement (m); by default estimated.")
@@ -66,10 +69,10 @@ def survey(
     from calib.cli.options import fixed_ns
     from uwblink.output import check_apart, check_output
 
-    for path in filter(None, (output, anchors, plot)):
+    written = {"output": output, "anchors": anchors, "plot": plot, "report": report}
+    for path in filter(None, written.values()):
         check_output(path, force=force)
-    read = [*recordings, *([Path(known)] if known.endswith(".toml") else [])]
-    check_apart({"output": output, "anchors": anchors, "plot": plot}, read)
+    check_apart(written, [*recordings, *([Path(known)] if known.endswith(".toml") else [])])
     try:
         with waiting("surveying"):
             result = calib.survey(
@@ -89,18 +92,34 @@ def survey(
             typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
         raise
     result.save(output, force=force)
+    if report:
+        _write_report(report, result, recordings, force=force)
     if as_json:
         typer.echo(json.dumps(_figures(result), indent=1))
         return
     typer.echo(f"{output}: {result.headline()}")
+    boards = f"boards of {result.arrangement(arrangement).name}" if anchors else ""
+    _tell(
+        result,
+        {boards: anchors, "where boards stood, with ellipses of 95 %": plot, "whether it is fit for use": report},
+    )
+
+
+def _tell(result: calib.SurveyResult, written: dict[str, Path | None]) -> None:
     for line in _lines(result):
         typer.echo(line)
-    if anchors:
-        typer.echo(f"{anchors}: boards of {result.arrangement(arrangement).name}")
-    if plot:
-        typer.echo(f"{plot}: where boards stood, with ellipses of 95 %")
+    for what, path in written.items():
+        if path:
+            typer.echo(f"{path}: {what}")
     for warning in result.warnings:
         typer.echo(f"warning: {with_flags(warning)}", err=True)
+
+
+def _write_report(path: Path, result: calib.SurveyResult, recordings: list[Path], *, force: bool) -> None:
+    from calib.cli.evaluating import command_line
+    from calib.report import origin_of, write_survey_report
+
+    write_survey_report(path, result.calibration, origin=origin_of(recordings, command_line()), force=force)
 
 
 def _lines(result: calib.SurveyResult) -> Iterator[str]:
@@ -123,5 +142,6 @@ def _figures(result: calib.SurveyResult) -> dict[str, Any]:
         "arrangements": [one.to_dict() for one in result.arrangements],
         "pair_error_m": result.pair_error_m,
         "findings": list(result.findings),
+        "reflected": [one.to_dict() for one in result.reflected],
         "warnings": [with_flags(text) for text in result.warnings],
     }

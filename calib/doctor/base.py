@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.schema import Arrangement, Fault, Poses, Tag
 from uwblink.twr import Exchanges
 
 PLAUSIBLE_M: Final = 1000.0
@@ -30,7 +30,7 @@ class RecordingView:
     """A recording as the examinations see it; `truth_m` (n,) is NaN where nothing says it.
 
     Each exchange is there once; `reported_twice` were reported by both ends, and `contradictions` say how two reports
-    of one differ.
+    of one differ. `arrangements` are those that the recording marks.
     """
 
     name: str
@@ -42,6 +42,12 @@ class RecordingView:
     truth_m: Floats
     reported_twice: int = 0
     contradictions: tuple[str, ...] = ()
+    arrangements: tuple[Arrangement, ...] = ()
+
+    @property
+    def standing(self) -> bool:
+        """Whether this was recorded to be surveyed: arrangements of boards, and nothing that says where they were."""
+        return bool(self.arrangements) and not len(self.poses) and not np.isfinite(self.truth_m).any()
 
     @property
     def error_m(self) -> Floats:

@@ -24,6 +24,7 @@ from calib.doctor import (
     reflected,
     several,
     steps,
+    surveys,
     timestamps,
 )
 from calib.doctor.base import Finding, RecordingView, chosen
@@ -38,9 +39,10 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
     """Return what is wrong with a recording, the surest first: each fault with its evidence and what to do about it.
 
     `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`, or several
-    of those, which are then compared, too; ranges alone do not say enough. Rows that cannot be are set aside before
-    anything else is judged, and what would only follow from a graver fault is not looked for. Of a recording with more
-    than 160,000 exchanges about so many are looked at, in 40 stretches over all of its time. Raises what
+    of those, which are then compared, too; ranges alone do not say enough. Recordings of arrangements without poses are
+    surveyed, all together. Rows that cannot be are set aside before anything else is judged, and what would only follow
+    from a graver fault is not looked for. Of a recording with more than 160,000 exchanges about so many are looked at,
+    in 40 stretches over all of its time. Raises what
     `Recording.open` raises.
 
     >>> import calib
@@ -60,6 +62,8 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
         # What moved between two recordings is no fault of either one.
         moved = any(finding.fault == several.MOVED_ANCHOR for finding in between)
         findings = [one for one in findings if not (moved and one.fault == anchors.ELSEWHERE)] + between
+    if views and len(views) == len(recordings) and all(view.standing for view in views):
+        findings += surveys.surveyed(recordings)
     return sorted(findings, key=lambda f: -f.confidence)
 
 
@@ -67,9 +71,10 @@ def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
     """Return what is wrong with one recording, and the recording without its impossible rows."""
     with opened(data) as (name, source):
         looked = looked_at(source)
+        marked = tuple(getattr(source, "arrangements", ()))
     if not looked.count:
         return [Finding("empty", "the recording holds no exchanges", "record or import some", 1.0)], None
-    view = _admitted(name, looked)
+    view = replace(_admitted(name, looked), arrangements=marked)
     findings: list[Finding] = []
     for examination in GROSS:
         findings += examination(view)

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from calib.report.figure_files import write_comparison_figures, write_onboard_figures, write_track_figures
     from calib.report.origin import origin_of
     from calib.report.plans import write_plan
+    from calib.report.survey_report import write_survey_report
     from calib.report.writing import check_places
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "write_comparison_figures",
     "write_onboard_figures",
     "write_plan",
+    "write_survey_report",
     "write_track_figures",
 ]
 
@@ -25,6 +27,7 @@ _HOMES: Final = {
     "write_comparison_figures": "calib.report.figure_files",
     "write_onboard_figures": "calib.report.figure_files",
     "write_plan": "calib.report.plans",
+    "write_survey_report": "calib.report.survey_report",
     "write_track_figures": "calib.report.figure_files",
 }
 

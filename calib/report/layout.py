@@ -74,6 +74,10 @@ def warnings(sentences: list[str]) -> list[Block]:
     return [Text(f"Warning: {sentence}", "warning") for sentence in sentences]
 
 
+SHOWN: Final = {"surveyed", "reflected"}
+"""Of a calibration's provenance what a section shows as tables and figures."""
+
+
 def provenance(calibration: Calibration, origin: Origin) -> list[Block]:
     """Return where a report and its calibration come from."""
     made = [["report", origin.made], ["version", origin.version], ["command", origin.command]]
@@ -82,7 +86,7 @@ def provenance(calibration: Calibration, origin: Origin) -> list[Block]:
     return [
         Heading("Provenance"),
         Table(["of", "what"], rows, words=True),
-        Listing(json.dumps(calibration.provenance, indent=1)),
+        Listing(json.dumps({k: v for k, v in calibration.provenance.items() if k not in SHOWN}, indent=1)),
     ]
 
 

@@ -14,6 +14,7 @@ from calib.report.blocks import Document, Heading, Text
 from calib.report.layout import provenance, warnings
 from calib.report.origin import Origin, origin_of
 from calib.report.verdict import Judged, verdict
+from calib.report.without_truth import foundations
 from calib.report.writing import check_places, html_of, write_document
 from calib.sources import Data, each, load_each
 
@@ -82,6 +83,7 @@ def _evaluated(
             *warnings(told),
             Heading("Recordings"),
             sections.recordings(recordings, None, origin.files),
+            *foundations(calibration),
             Heading("Antenna delays"),
             *sections.delays(calibration, evaluation.planted, ranges.planted or {}, {}),
             Heading("Before and after"),

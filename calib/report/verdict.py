@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -14,12 +14,9 @@ from calib.evaluation.statistics import Evaluation
 from calib.evaluation.tracking import Localization
 from calib.figures import TWO_SIDED_95
 from calib.ranges import Ranges
-from calib.report.blocks import Block, Table, Text
-
-GOOD: Final = "good"
-DOUBT: Final = "doubt"
-BAD: Final = "bad"
-MARKS: Final = {GOOD: "✓ yes", DOUBT: "! in part", BAD: "✗ no"}
+from calib.report.blocks import Block
+from calib.report.grades import BAD, DOUBT, GOOD, Criterion, graded, judgement
+from calib.report.without_truth import criteria
 
 MOST_BIAS: Final = 0.5
 """Of the spread of one range: a bias half as large adds an eighth to the error of a single range."""
@@ -36,16 +33,6 @@ MOST_CLAMPED: Final = 0.05
 WORST_CLAMPED: Final = 0.25
 LEAST_GAIN: Final = 0.05
 """Of the typical error: a calibration that takes off less is hardly worth its trouble."""
-
-
-class Criterion(NamedTuple):
-    """A question, what is asked for, what was found, how well that is (good, doubt, bad), and it in a few words."""
-
-    question: str
-    asked: str
-    found: str
-    grade: str
-    told: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,33 +54,7 @@ class Judged:
 
 def verdict(judged: Judged) -> list[Block]:
     """Return the verdict: a sentence, and the table of criteria behind it."""
-    found = [one for ask in CRITERIA for one in ask(judged)]
-    kind, text = _sentence(found)
-    rows = [[one.question, MARKS[one.grade], one.found, one.asked] for one in found]
-    return [Text(text, kind), Table(["criterion", "met", "found", "asked for"], rows, words=True)]
-
-
-def _sentence(found: Sequence[Criterion]) -> tuple[str, str]:
-    bad = [one.told for one in found if one.grade == BAD]
-    doubt = [one.told for one in found if one.grade == DOUBT]
-    if bad:
-        more = f" Also: {_listed(doubt)}." if doubt else ""
-        return BAD, f"Not fit for use. {_begun(_listed(bad))}.{more}"
-    if doubt:
-        return DOUBT, f"Fit for use, with reservations. {_begun(_listed(doubt))}."
-    return GOOD, f"Fit for use. All {len(found)} criteria are met: {_listed([one.told for one in found])}."
-
-
-def _listed(texts: Sequence[str]) -> str:
-    return "; ".join(texts)
-
-
-def _begun(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def _grade(good: bool, tolerable: bool) -> str:
-    return GOOD if good else DOUBT if tolerable else BAD
+    return judgement([one for ask in CRITERIA for one in ask(judged)])
 
 
 def _held_out(judged: Judged) -> list[Criterion]:
@@ -122,7 +83,7 @@ def _gain(judged: Judged) -> list[Criterion]:
             "Does it make ranges better?",
             f"typical error at least {100 * LEAST_GAIN:.0f} % smaller than raw",
             f"from {100 * raw:.1f} to {100 * full:.1f} cm ({-100 * less:+.0f} %); half of the errors are smaller",
-            _grade(less >= LEAST_GAIN, less >= 0),
+            graded(less >= LEAST_GAIN, less >= 0),
             f"the typical error goes from {100 * raw:.1f} to {100 * full:.1f} cm",
         )
     ]
@@ -141,7 +102,7 @@ def _bias(judged: Judged) -> list[Criterion]:
             f"median of each pair within {MOST_BIAS:g} of its spread",
             f"worst: {name} with {100 * stats.median_m:+.1f} cm, {ratio:.2f} of its spread of "
             f"{100 * stats.robust_std_m:.1f} cm",
-            _grade(ratio <= MOST_BIAS, ratio <= WORST_BIAS),
+            graded(ratio <= MOST_BIAS, ratio <= WORST_BIAS),
             f"no pair keeps a bias beyond {100 * abs(stats.median_m):.1f} cm"
             if ratio <= MOST_BIAS
             else f"pair {name} keeps a bias of {100 * stats.median_m:+.1f} cm",
@@ -160,14 +121,14 @@ def _interval(judged: Judged) -> list[Criterion]:
             "Does it say rightly how far ranges can be off?",
             f"{100 * low:.0f} to {100 * high:.1f} % of errors within their 95 % intervals",
             f"{100 * share:.1f} % ({of_what})",
-            _grade(low <= share <= high, share >= INTERVAL_LEAST),
+            graded(low <= share <= high, share >= INTERVAL_LEAST),
             f"{100 * share:.0f} % of the errors lie within their 95 % intervals",
         )
     ]
 
 
-def _settled(judged: Judged) -> list[Criterion]:
-    known = judged.calibration
+def settled(known: Calibration) -> list[Criterion]:
+    """Return whether the antenna delays of a calibration are known well enough; nothing where pairs have constants."""
     if known.pair_offsets:
         return []
     free = known.provenance.get("undetermined", [])
@@ -189,7 +150,7 @@ def _settled(judged: Judged) -> list[Criterion]:
             question,
             asked,
             f"widest: tag {tag}, ± {measured[tag]:.3f} ns",
-            _grade(fine, measured[tag] <= 3 * MOST_DELAY_NS),
+            graded(fine, measured[tag] <= 3 * MOST_DELAY_NS),
             f"delays are known to ± {measured[tag]:.3f} ns or better"
             if fine
             else f"the delay of tag {tag} is known to ± {measured[tag]:.2f} ns only",
@@ -204,7 +165,7 @@ def _powers(judged: Judged) -> list[Criterion]:
             "Was the curve fitted at such powers?",
             f"at most {100 * MOST_CLAMPED:.0f} % of the ranges beyond them",
             f"{100 * share:.1f} % beyond",
-            _grade(share <= MOST_CLAMPED, share <= WORST_CLAMPED),
+            graded(share <= MOST_CLAMPED, share <= WORST_CLAMPED),
             f"{100 * share:.1f} % of the ranges have powers that the fit has not seen",
         )
     ]
@@ -219,7 +180,7 @@ def _positions(judged: Judged) -> list[Criterion]:
             "Do positions become better?",
             "RMSE of the position not larger than with raw ranges",
             f"from {raw:.3f} to {best:.3f} m over {len(judged.tracks)} tracks",
-            _grade(best < raw, False),
+            graded(best < raw, False),
             f"positions go from {100 * raw:.0f} to {100 * best:.0f} cm RMSE",
         )
     ]
@@ -244,9 +205,10 @@ CRITERIA: Final[tuple[Callable[[Judged], list[Criterion]], ...]] = (
     _gain,
     _bias,
     _interval,
-    _settled,
+    lambda judged: settled(judged.calibration),
     _powers,
     _positions,
+    lambda judged: criteria(judged.calibration),
     _doubts,
 )
 """What makes a calibration fit for use, in the order in which it is told."""

@@ -43,11 +43,12 @@ LIFT_M: Final = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What may be wrong: in words, the network without it, a start, and by how much more unlikely it is beforehand.
+    """What may be wrong: its kind, in words, the network without it, a start, and how much more unlikely it is before.
 
     That brings what is known of its size (-2 log), where the network without it knows nothing of it.
     """
 
+    kind: str
     text: str
     instead: Network
     start: Floats
@@ -98,7 +99,7 @@ def _distances(found: Adjusted, names: tuple[str, ...]) -> Iterator[Doubt]:
         # The rows go, and with them what they say of likelihood: as if the tape were wrong by some half a metre.
         std = np.append(known.distance_std_m[rows][1:], WRONG_TAPE_M)
         beforehand = 2 * float(np.log(std).sum()) + (off / WRONG_TAPE_M) ** 2
-        yield Doubt(text, replace(network, known=less), found.x, beforehand)
+        yield Doubt("distance", text, replace(network, known=less), found.x, beforehand)
 
 
 def _shapes(found: Adjusted) -> Iterator[Doubt]:
@@ -123,7 +124,7 @@ def _shapes(found: Adjusted) -> Iterator[Doubt]:
             f"{place.name} is said to be a {shape} and is none: its ranges fit if boards, {odd} first of all, stand up "
             f"to {_cm(float(np.ptp(away)), sign=False)} beside it; put them {who}, or do not say so"
         )
-        yield Doubt(text, freed, x)
+        yield Doubt("shape", text, freed, x)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +161,7 @@ def _exchanged(found: Adjusted) -> Iterator[Doubt]:
         changed = replace(network, known=instead)
         start = first_start(changed, found.x[network.delay_columns])
         text = f"what is known fits if {one} and {other} are exchanged: look at the labels of these two boards"
-        yield Doubt(text, changed, start)
+        yield Doubt("labels", text, changed, start)
 
 
 def _cm(length_m: float, *, sign: bool = True) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from io import BytesIO
 from typing import TYPE_CHECKING, Final
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 ACROSS: Final = 3
 PANEL_IN: Final = 3.0
 LINE_IN: Final = 1.1
+NARROWEST_IN: Final = 2.2
 CHI_SQUARE_95: Final = 5.991
 """95 % quantile of chi-square with two degrees of freedom."""
 
@@ -34,18 +36,24 @@ def board_picture(arrangements: tuple[SurveyedArrangement, ...], form: str) -> b
 
     Ellipses too small to be seen are drawn ten times as large and dashed.
     """
-    across = min(ACROSS, len(arrangements))
+    figure = board_figure(arrangements, PANEL_IN * min(ACROSS, len(arrangements)))
+    out = BytesIO()
+    figure.savefig(out, format=form, dpi=150, metadata={"Date": None} if form == "svg" else None)
+    return out.getvalue()
+
+
+def board_figure(arrangements: Sequence[SurveyedArrangement], width_in: float) -> Figure:
+    """Return the same as a figure of a width in inches: as many panels beside each other as are 2.2 inch wide."""
+    across = max(1, min(ACROSS, len(arrangements), int(width_in / NARROWEST_IN)))
     down = -(-len(arrangements) // across)
-    tall = LINE_IN if all(one.known == "line" for one in arrangements) else PANEL_IN
-    figure = Figure(figsize=(PANEL_IN * across, (tall + 0.4) * down), layout="constrained")
+    tall = LINE_IN if all(one.known == "line" for one in arrangements) else min(PANEL_IN, width_in / across)
+    figure = Figure(figsize=(width_in, (tall + 0.4) * down), layout="constrained")
     panels = figure.subplots(down, across, squeeze=False).ravel()
     for axes, one in zip(panels, arrangements, strict=False):
         draw_boards(axes, one)
     for axes in panels[len(arrangements) :]:
         axes.set_visible(False)
-    out = BytesIO()
-    figure.savefig(out, format=form, dpi=150, metadata={"Date": None} if form == "svg" else None)
-    return out.getvalue()
+    return figure
 
 
 def draw_boards(axes: Axes, one: SurveyedArrangement) -> Axes:

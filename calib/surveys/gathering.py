@@ -14,6 +14,7 @@ from calib.ranges import Ranges, concatenate
 from calib.sources import Data, each, opened
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.pair_means import PairMeans, pair_means
+from calib.surveys.result import Contradiction
 from calib.surveys.stillness import moved, stretches_ns
 from uwblink.arrays import Ints
 from uwblink.recording.schema import Arrangement, KnownDistance
@@ -31,7 +32,7 @@ class Gathered:
     distances: tuple[KnownDistance, ...]
     sources: tuple[str, ...]
     exchanges: int
-    findings: tuple[str, ...]
+    findings: tuple[Contradiction, ...]
     warnings: tuple[str, ...]
 
 
@@ -47,7 +48,7 @@ def gather(data: Data | Iterable[Data], knowledge: Knowledge) -> Gathered:
     found: list[Arrangement] = []
     parts: list[tuple[Ranges, Ints]] = []
     distances: list[KnownDistance] = []
-    findings: list[str] = []
+    findings: list[Contradiction] = []
     for ranges, marked, stated in recordings:
         mine = _stretches(ranges, marked, knowledge, several=several)
         number = np.full(len(ranges), -1)
@@ -112,16 +113,17 @@ def _stretches(ranges: Ranges, marked: list[Arrangement], knowledge: Knowledge, 
     return [Arrangement(f"{stem}-{k}" if several else str(k), *span) for k, span in enumerate(found, start=1)]
 
 
-def _moved(one: Arrangement, ranges: Ranges) -> list[str]:
+def _moved(one: Arrangement, ranges: Ranges) -> list[Contradiction]:
     motion = moved(ranges)
     if motion is None:
         return []
     steps = ", ".join(f"{100 * step:+.0f} cm to {tag}" for tag, step in sorted(motion.steps_m.items()))
     after_s = (motion.time_ns - int(ranges.time_ns.min())) * 1e-9
-    return [
+    text = (
         f"{one.name}: board {motion.tag} was moved {after_s:.0f} s after its beginning (ranges changed by {steps}); "
         "record that arrangement again, or end it before"
-    ]
+    )
+    return [Contradiction("moved", text)]
 
 
 def _check_names(found: list[Arrangement]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from calib.surveys.frames import framed
 from calib.surveys.gathering import Gathered
 from calib.surveys.pair_means import LIFT
 from calib.surveys.power import PowerModel
-from calib.surveys.result import ReflectedPair, SurveyedArrangement, SurveyedBoard
+from calib.surveys.result import SurveyedArrangement, SurveyedBoard
 from calib.surveys.scales import M_PER_NS
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -30,10 +31,12 @@ def calibration_of(
     verdict: Verdict,
     widened: float,
     warnings: list[str],
-    arrangements: tuple[SurveyedArrangement, ...],
-    reflected: tuple[ReflectedPair, ...],
+    more: Mapping[str, Any],
 ) -> Calibration:
-    """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on."""
+    """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on.
+
+    `more` goes into its provenance.
+    """
     network = found.network
     known = verdict.determined
     tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
@@ -55,11 +58,7 @@ def calibration_of(
         speed_of_light=SPEED_OF_LIGHT,
         bias_curve=curve,
         sigma_curve=flat_curve(sigma, span),
-        provenance=_provenance(gathered, found, verdict, warnings, curve)
-        | {
-            "surveyed": [one.to_dict() for one in arrangements],
-            "reflected": [one.to_dict() for one in reflected],
-        },
+        provenance=_provenance(gathered, found, verdict, warnings, curve) | dict(more),
         uncertainty=Uncertainty(tuple(tags), _rows(covariance), _rows(curve_covariance), _rows(variance)),
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,12 +51,30 @@ class SurveyedArrangement:
             {
                 "tag": board.tag,
                 "position_m": [round(value, 5) for value in board.position_m],
-                "covariance_m2": board.covariance_m2.tolist(),
+                "covariance_m2": [[float(f"{value:.4g}") for value in line] for line in board.covariance_m2.tolist()],
                 "determined": board.determined,
             }
             for board in self.boards
         ]
         return {"name": self.name, "known": self.known, "frame": self.frame, "boards": boards}
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> SurveyedArrangement:
+        """Return the arrangement that `to_dict` wrote."""
+        boards = []
+        for one in row["boards"]:
+            x, y, z = map(float, one["position_m"])
+            covariance = np.array(one["covariance_m2"], dtype=float)
+            boards.append(SurveyedBoard(int(one["tag"]), (x, y, z), covariance, bool(one["determined"])))
+        return cls(str(row["name"]), str(row["known"]), tuple(boards), str(row["frame"]))
+
+
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """What contradicts the ranges: "shape" (a line that is none), "distance", "labels" or "moved", and it in words."""
+
+    kind: str
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +105,8 @@ class SurveyResult:
     """A calibration from boards that stood still, and where they stood.
 
     `pair_error_m` is the constant error that a pair has in an arrangement, as a standard deviation; `verdict` says what
-    of the delays (in ns) is determined; `findings` are contradictions between the ranges and what was said to be known;
-    `warnings` what a user should know. `second_best` is the best other solution, `reflected` are
+    of the delays (in ns) is determined; `contradictions` are those between the ranges and what was said to be
+    known; `warnings` what a user should know. `second_best` is the best other solution, `reflected` are
     pairs that are, or may be, reflected.
 
     >>> import calib
@@ -102,9 +120,14 @@ class SurveyResult:
     verdict: Verdict
     pair_error_m: float
     second_best: SecondBest | None
-    findings: tuple[str, ...]
+    contradictions: tuple[Contradiction, ...]
     warnings: tuple[str, ...]
     reflected: tuple[ReflectedPair, ...] = ()
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """The contradictions in words."""
+        return tuple(one.text for one in self.contradictions)
 
     def __repr__(self) -> str:
         """Return the calibration as a table, below what it rests on, above the warnings."""

@@ -21,7 +21,7 @@ from calib.surveys.knowledge import Knowledge, load_knowledge
 from calib.surveys.minima import SecondBest, best
 from calib.surveys.network import Network
 from calib.surveys.outcome import arrangements_of, calibration_of
-from calib.surveys.result import SurveyResult
+from calib.surveys.result import Contradiction, SurveyResult
 from calib.surveys.saying import believed_reflected, reflections_in_words, said_of, verdict_of
 from calib.surveys.scales import widened as student
 from uwblink.recording.schema import SHAPES
@@ -69,7 +69,8 @@ def survey(
         settled = _without_doubts(network, names, pair_error_m)
         findings = (*gathered.findings, *settled.findings)
         if findings and not regardless:
-            raise UnanswerableError(f"{'; '.join(findings)} (`regardless` surveys all the same)")
+            told = "; ".join(one.text for one in findings)
+            raise UnanswerableError(f"{told} (`regardless` surveys all the same)")
         return _result(gathered, settled, findings)
 
 
@@ -79,7 +80,7 @@ class _Settled:
 
     found: Adjusted
     second: SecondBest | None
-    findings: tuple[str, ...]
+    findings: tuple[Contradiction, ...]
 
 
 def _knowledge(known: Knowledge | str | os.PathLike[str]) -> Knowledge:
@@ -102,17 +103,17 @@ def _fixed(fixed_ns: Mapping[int, float] | None) -> dict[int, float]:
 def _without_doubts(network: Network, names: tuple[str, ...], pair_error_m: float | None) -> _Settled:
     """Return the best solution, less what contradicts the rest, one thing after the other."""
     found, second = best(network, pair_std_m=pair_error_m)
-    findings: list[str] = []
+    findings: list[Contradiction] = []
     most = max(1, int(MOST_DOUBTS * len(network.means)))
     while len(findings) < most and (doubted := worst(found, names, pair_error_m)):
-        findings.append(doubted[0].text)
+        findings.append(Contradiction(doubted[0].kind, doubted[0].text))
         found = doubted[1]
     if findings:
         found, second = best(found.network, pair_std_m=pair_error_m)
     return _Settled(averaged(found), second, tuple(findings))
 
 
-def _result(gathered: Gathered, settled: _Settled, findings: tuple[str, ...]) -> SurveyResult:
+def _result(gathered: Gathered, settled: _Settled, findings: tuple[Contradiction, ...]) -> SurveyResult:
     found = settled.found
     verdict = verdict_of(found)
     free = verdict.named("delay")
@@ -125,19 +126,25 @@ def _result(gathered: Gathered, settled: _Settled, findings: tuple[str, ...]) ->
     reflected = believed_reflected(found)
     warnings = [
         *gathered.warnings,
-        *findings,
+        *(one.text for one in findings),
         *reflections_in_words(reflected),
         *said_of(found, settled.second, verdict),
     ]
     widened = student(found.freedom)
     arrangements = arrangements_of(found, widened)
+    more = {
+        "surveyed": [one.to_dict() for one in arrangements],
+        "reflected": [one.to_dict() for one in reflected],
+        "findings": [one.text for one in findings],
+        "second_best": None if settled.second is None else round(settled.second.worse, 2),
+    }
     return SurveyResult(
-        calibration=calibration_of(gathered, found, verdict, widened, warnings, arrangements, reflected),
+        calibration=calibration_of(gathered, found, verdict, widened, warnings, more),
         arrangements=arrangements,
         verdict=verdict,
         pair_error_m=found.pair_std_m,
         second_best=settled.second,
-        findings=findings,
+        contradictions=findings,
         warnings=tuple(warnings),
         reflected=reflected,
     )
