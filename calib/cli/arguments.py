@@ -178,3 +178,10 @@ Heights = Annotated[
         **choice("used", "ignored"),
     ),
 ]
+CurveFrom = Annotated[
+    Path | None,
+    typer.Option(
+        rich_help_panel=UNKNOWN,
+        help="Calibration whose curve over power is taken as it is (.json): for flights short of ranges or powers.",
+    ),
+]

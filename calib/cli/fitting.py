@@ -16,6 +16,7 @@ from calib.cli.arguments import (
     Attitudes,
     CalibrationFile,
     Constants,
+    CurveFrom,
     DelaysFrom,
     DelaysOnly,
     Distances,
@@ -84,6 +85,7 @@ def fit(
     anchors: Anchors = None,
     distance: Distances = None,
     heights: Heights = None,
+    curve_from: CurveFrom = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -115,6 +117,7 @@ def fit(
             "anchors": anchors,
             "distances": distance,
             "heights": heights,
+            "curve_from": curve_from,
         },
     )
     check_output(output, force=force)

@@ -10,12 +10,12 @@ from calib.errors import BadInputError
 from calib.ranges import Ranges
 
 
-def imported(delays_from: Calibration | str | os.PathLike[str] | None) -> Calibration | None:
-    """Return the calibration whose delays are taken over."""
-    if delays_from is None:
+def imported(source: Calibration | str | os.PathLike[str] | None, parameter: str = "delays_from") -> Calibration | None:
+    """Return the calibration from which something is taken over; `parameter` is named where it is none."""
+    if source is None:
         return None
-    known = load_calibration(delays_from) if isinstance(delays_from, str | os.PathLike) else delays_from
-    require_calibration(known, "delays_from")
+    known = load_calibration(source) if isinstance(source, str | os.PathLike) else source
+    require_calibration(known, parameter)
     return known
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -12,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import uwblink
+from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
 from calib.errors import BadInputError, UnanswerableError
@@ -30,6 +32,7 @@ from calib.trajectories.climbing import Climbed, climb
 from calib.trajectories.given import Usable, scene_from
 from calib.trajectories.judging import Judged, judged
 from calib.trajectories.scene import Scene
+from calib.trajectories.taken_curve import curve_source, less_curve, with_curve
 from uwblink.recording.schema import KnownDistance
 
 ATTITUDES: Final = ("poses", "imu", "none")
@@ -49,6 +52,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     anchors: str = "given",
     distances: Iterable[KnownDistance] = (),
     heights: str = "used",
+    curve_from: Calibration | str | os.PathLike[str] | None = None,
     fixed_ns: Mapping[int, float] | None = None,
     groups: Mapping[str, tuple[int, ...]] | None = None,
     lift: str = "mean-of-lifted",
@@ -68,7 +72,8 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
 
     `distances` were measured otherwise, beside those that the recording states: between anchors, or between moving
     bodies while they stood still, in an arrangement of the recording or a span of seconds since the first range
-    ("2..8"). `heights` of the recording's sensors are "used" or "ignored".
+    ("2..8"). `heights` of the recording's sensors are "used" or "ignored". `curve_from` is a calibration, or its path,
+    whose curve is taken as it is, with its lift and reference power; what is unsure of it is in the delays' intervals.
 
     The result is what `fit` returns; the truth of its `ranges` is the distances that were found. What the ranges do not
     determine is named: `UnanswerableError` is raised where no delay is determined, unless `minimum_norm` asks for those
@@ -83,6 +88,10 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     """
     fixed = {int(tag): float(delay) for tag, delay in (fixed_ns or {}).items()}
     groups = {name: tuple(map(int, tags)) for name, tags in (groups or {}).items()}
+    known = curve_source(curve_from, "delays_only" if delays_only else "groups" if groups else "")
+    if known is not None:
+        lift, alpha_dbm = known.lift, known.alpha_dbm
+        reference_power_dbm = known.provenance.get("reference_power_dbm", alpha_dbm)
     check_fit(
         loss=MIXTURE,
         scale_ns=None,
@@ -100,7 +109,8 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
         fixed=fixed,
         groups=groups,
         reference_dbm=alpha_dbm if reference_power_dbm is None else reference_power_dbm,
-        curve=not delays_only,
+        curve=not delays_only and known is None,
+        known=known,
     )
     done = progress or (lambda _: None)
     scene = scene_from(data, asked.usable, need_power=not delays_only)
@@ -111,7 +121,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
         begun = beginning(scene, lambda share: done(FOLLOWING * share))
         climbed = climb(begun.scene, problem, begun.state, lambda share: done(FOLLOWING + (1 - FOLLOWING) * share))
         problem = _with_distances(problem, climbed)
-        found = judged(climbed, problem, asked.reference)
+        found = judged(climbed, problem, asked.reference, asked.known)
         result = _result(climbed, problem, found, asked, begun.rival)
     done(1.0)
     if not minimum_norm:
@@ -155,6 +165,7 @@ class Asked:
     groups: Mapping[str, tuple[int, ...]]
     reference_dbm: float
     curve: bool
+    known: Calibration | None = None
 
     @property
     def reference(self) -> float:
@@ -177,7 +188,10 @@ def problem_of(scene: Scene, asked: Asked) -> tuple[Problem, Scene]:
     )
     rows = problem.ranges.truth_m
     bare = replace(problem.ranges, truth_m=np.zeros(len(rows)))
-    return replace(problem, ranges=bare, error=problem.error + rows), scene.only(rows.astype(np.int64))
+    problem = replace(problem, ranges=bare, error=problem.error + rows)
+    if asked.known is not None:
+        problem = less_curve(problem, asked.known)
+    return problem, scene.only(rows.astype(np.int64))
 
 
 def _with_distances(problem: Problem, climbed: Climbed) -> Problem:
@@ -191,6 +205,8 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, riv
     calibration = calibration_of(
         problem, solved, covariance, climbed.told, asked.lift, asked.alpha_dbm, asked.fixed, asked.groups
     )
+    if asked.known is not None:
+        calibration = with_curve(calibration, asked.known)
     std = calibration.delays_std_ns | dict.fromkeys(found.free_tags, math.inf)
     calibration = replace(calibration, delays_std_ns=std)
     applied = replace(calibration, errors=None).apply(ranges)
@@ -271,5 +287,6 @@ def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: Asked)
         "converged": climbed.settled,
         "reference_power_dbm": asked.reference_dbm,
         "standard_errors": f"sandwich over {found.solved.lasting.stretches:.0f} independent stretches of time",
-        "gauge": f"the bias curve is zero at {asked.reference_dbm:g} dBm; the delays carry the constant",
+        "gauge": f"the bias curve{' was taken, and' if asked.known else ''} is zero at {asked.reference_dbm:g} dBm; "
+        "the delays carry the constant",
     }

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.calibration.model import Calibration
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
 from calib.estimation.pair_mixture import SPREADS
@@ -22,6 +23,7 @@ from calib.trajectories.climbing import Climbed
 from calib.trajectories.coarseness import coarseness
 from calib.trajectories.contradictions import contradictions
 from calib.trajectories.doubts import Taken, doubted
+from calib.trajectories.taken_curve import unsure_of_curve
 from uwblink.arrays import Floats
 
 PRIOR_NS: Final = 2.0
@@ -87,10 +89,10 @@ class Judged:
         return f": known to ± {1.96 * max(std):.2f} ns (95 %) at worst"
 
 
-def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judged:
+def judged(climbed: Climbed, problem: Problem, reference: float | None, curve: Calibration | None = None) -> Judged:
     """Return intervals and verdict of a solution whose delays are stated at the lifted power `reference`.
 
-    `problem` has the distances that were found.
+    `problem` has the distances that were found; `curve` is the calibration whose curve was taken.
     """
     reduced = _reduced(climbed)
     solved, precision = _solved(climbed, problem, reduced, reference)
@@ -106,16 +108,18 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None) -> Judge
             covariance_ns2=np.zeros((0, 0)),
             doubts=sentences,
         )
-    columns, delays = climbed.columns.design, solved.delays
+    columns, delays, covariance = climbed.columns.design, solved.delays, doubts.covariance_ns2
+    if curve is not None:
+        covariance = covariance + unsure_of_curve(problem, curve, solved, climbed.informed)
     ridge = climbed.ridge[:columns, :columns]
     with_truth = delays @ np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + ridge) @ delays.T
     plain = np.linalg.pinv(_information(reduced.design, climbed.informed) + precision[:columns, :columns])
     return Judged(
         solved=solved,
-        verdict=verdict_on(doubts.covariance_ns2, with_truth, problem),
+        verdict=verdict_on(covariance, with_truth, problem),
         absorbed=_absorbed(delays @ plain @ delays.T, with_truth),
         distance_std_m=spread,
-        covariance_ns2=doubts.covariance_ns2,
+        covariance_ns2=covariance,
         doubts=sentences,
     )
 

@@ -1,5 +1,6 @@
 """Delays planted in flights whose distances nobody knows: sums of sines, seen by their ranges alone after a while."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,30 @@ def test_it_corrects_ranges_of_another_flight_as_any_calibration(fitted):
     # Reflected ranges aside, what is left of the bias is far below that of raw ones.
     assert abs(np.median(applied.corrected_m - truth)) < 0.012
     assert abs(np.median(applied.raw_m - truth)) > 0.012
+
+
+def test_a_curve_is_taken_from_another_calibration_with_what_is_unsure_of_it(fitted):
+    known = fitted[0].calibration
+    flown = flight(seconds=10.0, seed=3)
+    found = calib.fit_from_ranges(flown, poses_until_s=5.0, heading_std_deg=0.0, curve_from=known).calibration
+    assert found.bias_curve == known.bias_curve
+    assert (found.lift, found.alpha_dbm) == (known.lift, known.alpha_dbm)
+    std = np.array([found.delays_std_ns[tag] for tag in DELAYS_NS])
+    assert np.abs(np.array([found.delays_ns[tag] - delay for tag, delay in DELAYS_NS.items()]) / std).max() < 3.5
+    exact = replace(known, uncertainty=None)
+    surer = calib.fit_from_ranges(flown, poses_until_s=5.0, heading_std_deg=0.0, curve_from=exact).calibration
+    assert all(surer.delays_std_ns[tag] < found.delays_std_ns[tag] for tag in DELAYS_NS)
+
+
+def test_a_curve_that_cannot_be_taken_is_named(flown, fitted):
+    known = fitted[0].calibration
+    wrongs: tuple[dict[str, Any], ...] = ({"delays_only": True}, {"groups": {"all": (1, 2, 3, 4, 5, 6)}})
+    for wrong in wrongs:
+        with pytest.raises(calib.BadInputError, match="does not go with") as raised:
+            calib.fit_from_ranges(flown, curve_from=known, **wrong)
+        assert raised.value.parameter == "curve_from"
+    with pytest.raises(calib.BadInputError, match="a curve of each reception"):
+        calib.fit_from_ranges(flown, curve_from=replace(known, power_at="reception"))
 
 
 def test_nearly_exact_ranges_give_nearly_exact_delays():
