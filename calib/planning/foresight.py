@@ -44,6 +44,7 @@ CURVE_BENDS: Final = 3.0
 EDGE: Final = 4
 STEADIEST_M_S3: Final = 0.2
 GRID: Final = 4001
+ROUNDING: Final = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,7 +230,7 @@ class Linearised:
         known = known_rows(scene, self.columns, self.state, self.jerk_m_s3).linear(self.state)
         self.arrow = Factored(normal_of(local, border, self.informed) + known.normal)
         self.ridge = _ridge(problem, self.arrow.schur)
-        self.covariance = np.linalg.pinv(self.arrow.schur + self.ridge, rcond=1e-13, hermitian=True)
+        self.covariance = _covariance(self.arrow.schur + self.ridge)
         self.delays = problem.directions @ stating(problem, flight.reference)[: problem.rank]
 
     @property
@@ -242,7 +243,7 @@ class Linearised:
         """Return what a fit will say."""
         problem, size = self.flight.problem, self.columns.design
         of_ranges = (self.design * self.informed[:, None]).T @ self.design + self.ridge[:size, :size]
-        with_truth = self.delays @ np.linalg.pinv(of_ranges, hermitian=True) @ self.delays.T
+        with_truth = self.delays @ _covariance(of_ranges) @ self.delays.T
         return Foreseen(
             tags=tuple(problem.tags),
             covariance_ns2=self.of_delays,
@@ -264,6 +265,14 @@ class Linearised:
         own = float(local @ inner + border @ outer)
         moved = self.delays @ outer[: self.columns.design]
         return float(np.mean(np.diag(self.of_delays) - moved**2 / (own + sigma_m**2)))
+
+
+def _covariance(information: Floats) -> Floats:
+    """Return the inverse of an information matrix; what it hardly says is hardly known, not left out."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
+    spread = vectors / np.sqrt(np.maximum(values, ROUNDING * float(values[-1])))
+    return np.asarray(spread @ spread.T * scale[:, None] * scale)
 
 
 def _jerk(columns: Columns, state: State) -> float:

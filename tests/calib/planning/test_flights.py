@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import calib
 from calib.cli.commands import app
 from calib.cli.planning import _commands
+from calib.planning import foresight
 from calib.planning.foresight import Errors, Linearised, best_tape, flight_of, foresee
 from calib.planning.rehearsal import Flown, rehearse
 from calib.trajectories.given import Usable
@@ -34,10 +35,14 @@ def rehearsed(**other):
     return rehearse(Flown(**(given | other)))
 
 
-def foreseen_ns(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
-    """Root mean variance of the delays, and their covariance."""
+def covariance_ns2(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
     errors = Errors(noise_m=noise_m, reflected=reflected)
-    covariance = foresee(flight_of(seen, Usable(**usable), errors, curve=curve, force_std_m_s2=force)).covariance_ns2
+    return foresee(flight_of(seen, Usable(**usable), errors, curve=curve, force_std_m_s2=force)).covariance_ns2
+
+
+def foreseen_ns(seen, **given):
+    """Root mean variance of the delays."""
+    covariance = covariance_ns2(seen, **given)
     return math.sqrt(np.trace(covariance) / len(covariance))
 
 
@@ -96,16 +101,24 @@ def test_what_nothing_determines_is_named_and_what_would_is_ranked():
     assert all(math.isinf(half) for half in plan.half_ns.values())
     assert plan.next_best[0].what == "positions known for the first 10 s"
     assert [best.mean_ns for best in plan.next_best] == sorted(best.mean_ns for best in plan.next_best)
+    told = {best.what: best.mean_ns for best in plan.next_best}
+    elsewhere = next(what for what in told if what.startswith("the delay of tag"))
+    tag = int(elsewhere.split()[4])
+    # 1.5 ns of every delay, and 0.05 ns of this one, are known.
+    guess = np.eye(6) / 1.5**2 + np.diag([0.05**-2 if one == tag else 0.0 for one in range(1, 7)])
+    alone = covariance_ns2(rehearsed(**THREE, seconds=16.0), poses_until_s=0.0)
+    left = np.trace(np.linalg.inv(np.linalg.inv(alone) + guess)) / 6
+    assert told[elsewhere] == pytest.approx(1.96 * math.sqrt(left), rel=1e-3)
     with_it = 1.96 * foreseen_ns(rehearsed(**THREE, seconds=16.0), poses_until_s=10.0)
     assert with_it == pytest.approx(plan.next_best[0].mean_ns, rel=0.01)
 
 
 def test_sought_anchors_stay_open_and_given_ones_do_not():
-    seen = flight(anchors=CORNERS, rate=120)
-    sought = calib.plan_flight(seen, poses_until_s=8.0, anchor_places="sought")
+    seen = flight(seconds=12.0, anchors=CORNERS, rate=80)
+    sought = calib.plan_flight(seen, poses_until_s=4.0, anchor_places="sought")
     assert sought.undetermined == (11, 12, 13, 14)
     assert sought.next_best[0].what == "the places of the anchors, measured"
-    assert 1.96 * foreseen_ns(seen, poses_until_s=8.0) == pytest.approx(sought.next_best[0].mean_ns, rel=0.02)
+    assert 1.96 * foreseen_ns(seen, poses_until_s=4.0) == pytest.approx(sought.next_best[0].mean_ns, rel=0.02)
 
 
 def test_better_knowledge_never_widens():
@@ -142,9 +155,17 @@ def test_trajectories_are_held_as_jerky_as_they_are_planned():
     assert planned.jerk_m_s3 == pytest.approx(math.sqrt(np.mean([j[inside] ** 2 for j in jerks])), rel=0.15)
 
 
+def test_trajectories_of_few_ranges_that_nothing_holds_tell_less(monkeypatch):
+    """A curve that so few ranges cannot tell is held with a weight of 1e15, beside which nothing may be lost."""
+    seen = rehearsed(rate_hz=8.0, seconds=20.0)
+    held = foreseen_ns(seen, poses_until_s=5.0)
+    monkeypatch.setattr(foresight, "_jerk", lambda *_: 50.0)
+    assert 1.1 * held < foreseen_ns(seen, poses_until_s=5.0) < 2 * held
+
+
 def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
-    free = calib.plan_flight(3, seconds=12.0, poses_until_s=0.0, still_s=4.0)
-    taped = calib.plan_flight(3, seconds=12.0, poses_until_s=0.0, still_s=4.0, taped=1)
+    given: Any = {"seconds": 12.0, "rate_hz": 50.0, "poses_until_s": 0.0, "still_s": 4.0}
+    free, taped = calib.plan_flight(3, **given), calib.plan_flight(3, taped=1, **given)
     assert free.common_ns > 0.7
     assert taped.common_ns < 0.3 * free.common_ns
     said = next(best for best in free.next_best if "by tape" in best.what)
@@ -165,6 +186,15 @@ def test_the_best_tape_is_the_best_of_all():
     near, pair = Linearised(seen), (11, 12)
     assert near.mean_variance_with(near.tape(pair, 0.0), 0.01) == pytest.approx(spreads[pair] / 8, rel=1e-3)
     assert best_tape(seen, 0.0, 0.01) == min(spreads, key=spreads.__getitem__)
+
+
+def test_a_grade_is_noise_of_a_tenth_of_a_second_and_what_propellers_leave():
+    few: Any = {"rate_hz": 15.0, "seconds": 10.0}
+    plan = calib.plan_flight(2, anchors=ANCHORS, imu="consumer", poses_until_s=5.0, **few)
+    force = 3 * math.hypot(3e-3 / math.sqrt(0.1), 0.2)
+    seen = rehearsed(**few, inertial=True)
+    assert mean(plan) == pytest.approx(1.96 * foreseen_ns(seen, poses_until_s=5.0, force=force), rel=1e-4)
+    assert mean(plan) > 1.001 * 1.96 * foreseen_ns(seen, poses_until_s=5.0, force=force / 10)
 
 
 def test_the_motion_that_is_rehearsed_is_one_motion():
