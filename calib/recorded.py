@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calib.carriers import Asked
 from calib.long_columns import ROWS_AT_ONCE, empty, let_go
+from calib.planted import check_planted
 from calib.ranges import COLUMNS, Ranges, columns_of, usable_rows
 from calib.single_sided import Terms, left_in, skew_terms
 from uwblink.recording.file import Recording
@@ -120,9 +121,11 @@ class _Reading:
         self._excluded.update(usable.excluded)
 
     def ranges(self, name: str) -> Ranges | None:
-        """Return what can be used of all that was taken, None where nothing can."""
+        """Return what can be used of all that was taken, None where nothing can; raises what `check_planted` raises."""
         if not self._columns.length:
             return None
+        if self._planted is not None:
+            check_planted(self._planted, name)
         found = self._times
         for begin in range(0, self._count, ROWS_AT_ONCE):
             found.update(np.ascontiguousarray(self._range_m[begin : min(begin + ROWS_AT_ONCE, self._count)]).data)

@@ -123,7 +123,7 @@ def fields_of(text: str, where: str) -> dict[str, Any]:
 
 def _reader(text: str, where: str) -> Reader:
     try:
-        table = json.loads(text)
+        table = json.loads(text, parse_float=_finite, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
         raise BadInputError(f"{where}: not JSON ({error})") from error
     if not isinstance(table, dict) or "schema_version" not in table:
@@ -134,6 +134,14 @@ def _reader(text: str, where: str) -> Reader:
             f"{', '.join(map(str, VERSIONS[:-1]))} and {VERSIONS[-1]}"
         )
     return Reader(table, where)
+
+
+def _finite(text: str) -> float:
+    """Return a number of JSON; raises `ValueError` for one that is none, which nothing could write again."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no finite number")
+    return value
 
 
 def _one_of(read: Reader, key: str, allowed: Collection[str], where: str) -> str:

@@ -21,7 +21,7 @@ def pairs_of(initiator: Ints, target: Ints, tags: list[int]) -> Pairs:
     """Number the pairs of ranges (n,) between `tags`, in order of their lower tags, then of their higher ones."""
     known, (first, second) = np.array(tags), places_of(tags, initiator, target)
     key = np.minimum(first, second) * len(tags) + np.maximum(first, second)
-    there = np.bincount(key, minlength=len(tags) ** 2) > 0
+    there = np.bincount(key) > 0
     low, high = np.divmod(np.flatnonzero(there), len(tags))
     return Pairs((np.cumsum(there) - 1)[key], np.column_stack([known[low], known[high]]))
 

@@ -185,8 +185,15 @@ SPLINE = {"knots": [0, 0, 1, 1], "degree": 1, "coefficients": [0.0, 0.1]}
         {"sigma_curve": SPLINE | {"knots": [0, 0, 1]}},
     ],
 )
-def test_what_a_file_says_was_planted_has_its_form(planted):
+def test_what_a_file_says_was_planted_has_its_form(planted, tmp_path):
     flight = sample_flight(10)
     assert load_ranges(replace(flight, planted={"bias_curve": SPLINE, "sigma_curve": None})).planted
     with pytest.raises(BadInputError, match=rf"^memory: planted: {next(iter(planted))}: found "):
         load_ranges(replace(flight, planted=planted))
+    # From a file, which is read in pieces.
+    with Recording.create(tmp_path / "f.uwb", meta={"planted": planted}) as recording:
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(flight.exchanges)
+    with pytest.raises(BadInputError, match=rf"^f\.uwb: planted: {next(iter(planted))}: found "):
+        load_ranges(tmp_path / "f.uwb")

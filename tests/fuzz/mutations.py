@@ -91,7 +91,7 @@ def leaf(data: bytes, rng: random.Random) -> bytes | None:
     """Change, remove or add a value of a JSON document, at any depth."""
     try:
         document = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     place: Any = document
     while isinstance(place, dict | list) and place:

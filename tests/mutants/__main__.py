@@ -77,7 +77,16 @@ ROOMS: Final = {
         ),
         tuple(
             f"tests/calib/estimation/test_{name}.py"
-            for name in ("solver", "solver_parts", "identifiability", "robust", "smoothing", "result")
+            for name in (
+                "solver",
+                "solver_parts",
+                "sigma_curve",
+                "pairs",
+                "identifiability",
+                "robust",
+                "smoothing",
+                "result",
+            )
         ),
     ),
 }

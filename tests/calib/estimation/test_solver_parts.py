@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimation import robust
+from calib.estimation import robust, solver
 from calib.estimation.fitting import fit
 from calib.estimation.identifiability import UNDETERMINED, identifiable_directions
 from calib.estimation.losses import LOSSES
 from calib.estimation.robust import quadratic_model, robust_fit, sandwich
 from calib.estimation.smoothing import reml_penalty
-from calib.estimation.solver import PILOT, _pilot, solve
+from calib.estimation.solver import PILOT, _first_ridge, _pilot, solve
 from tests.calib.estimation.test_solver import problem_of
 from tests.calib.synthetic import ranges
 
@@ -69,6 +69,37 @@ def test_a_fit_that_is_cut_short_says_so(monkeypatch, rng):
         assert not solve(problem, "cauchy", None, sequential=sequential).success
     cut = robust_fit(np.ones((50, 1)), rng.normal(size=50), "cauchy")
     assert (cut.success, cut.steps) == (False, 1)
+
+
+@pytest.mark.parametrize("cut", [1, 3])
+def test_either_step_of_a_fit_one_after_the_other_that_is_cut_short_makes_it_so(cut, monkeypatch):
+    """Delays are the first search, a start of the curve the second, the curve the third."""
+    calls, plain = [], solver.robust_fit
+
+    def search(*given, **settings):
+        calls.append(1)
+        found = plain(*given, **settings)
+        return replace(found, success=found.success and len(calls) != cut)
+
+    monkeypatch.setattr(solver, "robust_fit", search)
+    assert not solve(problem_of(ranges(3000)), "cauchy", None, sequential=True).success
+    assert len(calls) == 3
+
+
+def test_the_first_penalty_is_a_share_of_what_ranges_say_and_holds_curves_alone():
+    problem = problem_of(ranges(3000))
+    (rough,), rank = problem.penalties(), problem.rank
+    found = _first_ridge(problem, 500)
+    assert not found[:rank].any()
+    expected = 500 * (1e-6 * rough / np.trace(rough) + 1e-9 * np.diag(np.arange(len(rough)) >= rank))
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=0)
+
+
+def test_without_a_curve_there_is_nothing_to_come_after_the_delays():
+    r = ranges(3000)
+    known = {sequential: fit(r, delays_only=True, sequential=sequential, loss="cauchy") for sequential in (False, True)}
+    assert known[True].calibration.delays_ns == known[False].calibration.delays_ns
+    assert known[True].calibration.delays_std_ns == known[False].calibration.delays_std_ns
 
 
 def test_the_sample_sees_all_of_a_recording_whatever_its_order():
