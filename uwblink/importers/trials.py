@@ -80,7 +80,8 @@ class Sample:
             time_ns=none, initiator=none, target=none + 1, reporter=none, bits=reading.bits,
             protocol=np.full(count, reading.protocol), **stamps, **dict.fromkeys(levels, unknown),
         )  # fmt: skip
-        ranges = raw_range(exchanges)
+        raw = raw_range(exchanges)
+        ranges = np.where(np.isfinite(raw), raw, np.nan)  # no time between the last two messages makes them infinite
         good = self._plausible(ranges, exchanges)
         low, high = np.nanpercentile(ranges, [5, 95]) if np.isfinite(ranges).any() else (np.nan, np.nan)
         return Trial(reading, float(np.mean(good)), float(low), float(high), self._scatter_m(ranges))

@@ -1,5 +1,7 @@
 """Exchanges in bags of ROS 1, ROS 2 and MCAP, of messages that are defined here, by a map of their fields."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 
@@ -145,7 +147,7 @@ def test_a_kind_that_the_bag_does_not_define_is_named(tmp_path):
     bag = ros2(tmp_path / "b", EXCHANGES, StoragePlugin.SQLITE3)
     import sqlite3
 
-    with sqlite3.connect(bag / "b.db3") as db:
+    with closing(sqlite3.connect(bag / "b.db3")) as db, db:
         db.execute("DELETE FROM message_definitions")
     with pytest.raises(ImportTableError, match="does not say what a uwb_msgs/msg/Exchange is"):
         read_source(bag, importer="bag")

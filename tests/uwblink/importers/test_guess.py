@@ -156,3 +156,9 @@ def test_places_that_cannot_be_used_are_left_out_and_it_is_said(tmp_path):
         found = read_table(path, tmp_path / "map.toml")
         assert found.exchanges.range_m[0] == pytest.approx(3.0)
         assert not len(found.poses)
+
+
+def test_a_table_without_time_between_the_last_messages_is_guessed_in_peace(tmp_path):
+    """Of which some ranges are infinite; as in commands, a warning of NumPy would be an error."""
+    rows = [row | ({"tx3": row["tx2"]} if k % 2 else {}) for k, row in enumerate(wrapped(flights()))]
+    assert "tx3" in guess_map(write(tmp_path / "t.csv", rows, ",")).text
