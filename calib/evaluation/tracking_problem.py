@@ -34,7 +34,7 @@ class Problem:
 
 
 def problems(flight: Flight) -> list[Problem]:
-    """Return a problem for every body of a flight that moves and ranges."""
+    """Return a problem for every body of a flight that moves, and ranges while its place is known."""
     return [problem for body in flight.moving_bodies() if (problem := _problem(flight, body)) is not None]
 
 
@@ -53,6 +53,8 @@ def _problem(flight: Flight, body: str) -> Problem | None:
     antenna = antennas_m(flight.poses, flight.tags, own, time)
     away = antennas_m(flight.poses, flight.tags, other, time)
     known = np.isfinite(place).all(axis=1) & np.isfinite(antenna).all(axis=1) & np.isfinite(away).all(axis=1)
+    if not known.any():
+        return None
     return Problem(
         body=body,
         rows=rows[known],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,6 +19,10 @@ PLACE_M: Final = 0.01
 """Standard deviation of each coordinate of a position where none is stated."""
 
 LARGEST_ID: Final = 254
+FARTHEST_M: Final = 1e6
+LEAST_SIGMA_M: Final = 1e-6
+"""From a micrometre to a thousand kilometres, squares and weights are numbers that can be computed with."""
+
 LATEST_S: Final = 1e9
 """Of seconds within a recording: thirty years either way."""
 
@@ -170,13 +173,20 @@ def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
         raise BadInputError(f"found {bad[0]!r:.40}, allowed: line, plane", parameter="known")
     for d in knowledge.distances:
         _check_tags((d.first, d.second), d.arrangement, tags, f"a distance of {d.first} and {d.second}")
-        if not (math.isfinite(d.distance_m) and d.distance_m > 0 and math.isfinite(d.sigma_m) and d.sigma_m > 0):
-            text = f"a distance of {d.first} and {d.second} of {d.distance_m} ± {d.sigma_m} m, expected more than 0"
+        if not (0 < d.distance_m <= FARTHEST_M and _is_sigma(d.sigma_m)):
+            text = (
+                f"a distance of {d.first} and {d.second} of {d.distance_m} ± {d.sigma_m} m, expected more than 0, and "
+                f"up to {FARTHEST_M:g} m ± {LEAST_SIGMA_M:g} m or more"
+            )
             raise BadInputError(text, parameter="known")
     for p in knowledge.positions:
         _check_tags((p.tag,), p.arrangement, tags, f"a position of {p.tag}")
-        if not all(map(math.isfinite, (*p.position_m, p.sigma_m))) or p.sigma_m <= 0:
+        if not all(abs(x) <= FARTHEST_M for x in p.position_m) or not _is_sigma(p.sigma_m):
             raise BadInputError(f"a position of {p.tag} that is no number, or without sigma", parameter="known")
+
+
+def _is_sigma(value: float) -> bool:
+    return LEAST_SIGMA_M <= value <= FARTHEST_M
 
 
 def _check_tags(ids: tuple[int, ...], name: str, tags: dict[str, set[int]], what: str) -> None:

@@ -61,6 +61,19 @@ def test_the_filter_is_consistent_on_clean_ranges(flights):
     assert found.nees_inside == pytest.approx(0.95, abs=0.03)
 
 
+def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights):
+    flight, calibration = clean(flights["test1"])
+    bodies = sorted({tag.body for tag in flight.tags})
+    last = flight.ranges.time_ns.max()
+    # One body's poses come after all ranges.
+    late = flight.poses.body == bodies[0]
+    time = np.where(late, flight.poses.time_ns + last, flight.poses.time_ns)
+    order = np.argsort(time, kind="stable")
+    poses = replace(flight.poses, time_ns=time)[order]
+    found = localize(replace(flight, poses=poses), calibration, Settings(seeds=1))
+    assert {one.body for one in found} == set(bodies[1:])
+
+
 def test_a_filter_that_trusts_its_ranges_too_much_is_found_out(flights):
     flight, calibration = clean(flights["test1"])
     sure = replace(calibration, sigma_curve=flat(0.05))
