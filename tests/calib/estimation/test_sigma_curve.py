@@ -6,10 +6,11 @@ from scipy.optimize import lsq_linear
 
 from calib.errors import UnanswerableError
 from calib.estimation.fitting import fit
-from calib.estimation.sigma_curve import FEWEST, SMOOTHNESSES, _above, _penalised
+from calib.estimation.sigma_curve import FEWEST, _above, _penalised
 from tests.calib.synthetic import ranges
 
 FLOOR = 0.1
+TRIED = 10.0 ** np.arange(-6.0, 2.5, 0.5)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -50,7 +51,7 @@ def bumps(rng, count=60):
 def by_rule(design, aim, weight, penalty):
     """Generalised cross-validation, written out with hat matrices: coefficients, covariance, chosen smoothness."""
     root, tries = np.sqrt(weight)[:, None] * design, []
-    for smoothness in SMOOTHNESSES * len(aim):
+    for smoothness in TRIED * len(aim):
         whole = root.T @ root + smoothness * penalty
         hat = root @ np.linalg.solve(whole, root.T)
         left = np.sum((np.sqrt(weight) * aim - hat @ (np.sqrt(weight) * aim)) ** 2)
@@ -66,7 +67,7 @@ def test_the_smoothness_is_that_of_generalised_cross_validation(seed):
     # Far above the floor: an even curve of 2 with other shapes around zero would be held there.
     shifted = (case[0] + 0.0, case[1], case[2], case[3])
     expected, covariance, chosen = by_rule(*shifted)
-    assert SMOOTHNESSES[0] < chosen < SMOOTHNESSES[-1]
+    assert TRIED[0] < chosen < TRIED[-1]
     found, found_covariance = _penalised(*shifted)
     np.testing.assert_allclose(found_covariance, covariance, rtol=1e-5, atol=1e-12)
     free = expected > found.min() + 1e-6
@@ -80,12 +81,15 @@ def test_the_smoothness_is_that_of_generalised_cross_validation(seed):
     np.testing.assert_allclose(found, bounded, atol=1e-5)
 
 
-def test_what_no_bin_and_no_penalty_holds_is_unsure_beyond_measure():
+def test_what_no_bin_and_no_penalty_holds_is_held_by_a_billionth_of_what_bins_hold():
     design, aim, weight, penalty = bumps(np.random.default_rng(4))
     apart = np.zeros((11, 11))
     apart[:10, :10] = penalty
     _, covariance = _penalised(np.column_stack([design, np.zeros(len(aim))]), aim, weight, apart)
-    assert covariance[10, 10] > 1e6 * covariance.diagonal()[:10].max()
+    _, known, chosen = by_rule(design, aim, weight, penalty)
+    square = design.T @ (weight[:, None] * design)
+    dispersion = known[0, 0] / np.linalg.inv(square + chosen * len(aim) * penalty)[0, 0]
+    assert covariance[10, 10] == pytest.approx(dispersion / (1e-9 * np.trace(square) / 11), rel=1e-3)
 
 
 @pytest.mark.parametrize("count", [FEWEST - 1, FEWEST])

@@ -74,7 +74,7 @@ def test_a_fit_that_is_cut_short_says_so(monkeypatch, rng):
 @pytest.mark.parametrize("cut", [1, 3])
 def test_either_step_of_a_fit_one_after_the_other_that_is_cut_short_makes_it_so(cut, monkeypatch):
     """Delays are the first search, a start of the curve the second, the curve the third."""
-    calls, plain = [], solver.robust_fit
+    calls, plain = [], robust_fit
 
     def search(*given, **settings):
         calls.append(1)
