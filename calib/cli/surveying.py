@@ -58,6 +58,9 @@ def survey(
         float | None, typer.Option(help="Constant error of a pair in an arrangement (m); by default estimated.")
     ] = None,
     delays_only: DelaysOnly = False,
+    curve_from: Annotated[
+        Path | None, typer.Option(help="Calibration whose curve over power is taken over (.json).")
+    ] = None,
     regardless: Annotated[
         bool, typer.Option("--regardless", help="Survey even where ranges contradict what is said to be known.")
     ] = False,
@@ -72,7 +75,9 @@ def survey(
     written = {"output": output, "anchors": anchors, "plot": plot, "report": report}
     for path in filter(None, written.values()):
         check_output(path, force=force)
-    check_apart(written, [*recordings, *([Path(known)] if known.endswith(".toml") else [])])
+    check_apart(
+        written, [*recordings, *([Path(known)] if known.endswith(".toml") else []), *filter(None, [curve_from])]
+    )
     try:
         with waiting("surveying"):
             result = calib.survey(
@@ -81,6 +86,7 @@ def survey(
                 fixed_ns=fixed_ns(fix or ()),
                 pair_error_m=pair_error,
                 delays_only=delays_only,
+                curve_from=curve_from,
                 regardless=regardless,
             )
         if anchors:

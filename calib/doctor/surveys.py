@@ -86,6 +86,6 @@ def _powers(recordings: list[Data]) -> Iterator[Finding]:
             "powers that hardly vary",
             f"mean powers of pairs lie within {np.ptp(in_dbm(lifted)):.1f} dB, and a curve over power needs "
             f"{NARROWEST_DB:g}",
-            "make arrangements with nearer and farther boards; until then delays hold what power does there",
+            "make arrangements with nearer and farther boards, or take the curve of another calibration (`curve_from`)",
             0.8,
         )

@@ -21,6 +21,7 @@ from calib.surveys.pair_means import LIFT
 from calib.surveys.power import PowerModel
 from calib.surveys.result import SurveyedArrangement, SurveyedBoard
 from calib.surveys.scales import M_PER_NS
+from calib.surveys.taken_curve import TakenCurve
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -32,10 +33,11 @@ def calibration_of(
     widened: float,
     warnings: list[str],
     more: Mapping[str, Any],
+    taken: TakenCurve | None,
 ) -> Calibration:
     """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on.
 
-    `more` goes into its provenance.
+    `more` goes into its provenance; a curve that was `taken` over is its curve.
     """
     network = found.network
     known = verdict.determined
@@ -46,7 +48,7 @@ def calibration_of(
     covariance = verdict.covariance[np.ix_(known, known)] * widened**2
     noise = float(np.sqrt(np.average(network.means.noise_m**2, weights=network.means.count)))
     sigma = math.hypot(noise, found.pair_std_m)
-    curve, curve_covariance, span = _curve(found, widened)
+    curve, curve_covariance, span = _curve(found, widened, taken)
     variance = np.full((DEGREE + 1,) * 2, (0.5 * sigma / math.sqrt(max(found.freedom, 1.0))) ** 2)
     return Calibration(
         delays_ns={tag: delays[tag] for tag in tags},
@@ -63,8 +65,10 @@ def calibration_of(
     )
 
 
-def _curve(found: Adjusted, widened: float) -> tuple[Curve, Floats, tuple[float, float]]:
+def _curve(found: Adjusted, widened: float, taken: TakenCurve | None) -> tuple[Curve, Floats, tuple[float, float]]:
     """Return the curve, the covariance of its coefficients, and the lifted powers between which it holds."""
+    if taken is not None:
+        return taken.curve, taken.covariance_m2, taken.curve.range
     power: PowerModel | None = found.network.power
     lifted = found.network.means.lifted
     if power is None:
@@ -99,6 +103,8 @@ def _provenance(
     gauge = "no curve; the delays carry the constant"
     if not curve.flat:
         gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
+    if not curve.flat and network.power is None:
+        gauge = "that of the calibration whose curve was taken over"
     more = {"fixed_ns": {str(t): d / M_PER_NS for t, d in sorted(network.fixed_m.items())}} if network.fixed_m else {}
     return more | {
         "writer": f"uwbcal {uwblink.__version__}",

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Final
 
 from threadpoolctl import threadpool_limits
 
+from calib.calibration.model import Calibration
 from calib.errors import BadInputError, UnanswerableError
 from calib.sources import Data
 from calib.surveys.adjustment import Adjusted, averaged
@@ -24,6 +25,7 @@ from calib.surveys.outcome import arrangements_of, calibration_of
 from calib.surveys.result import Contradiction, SurveyResult
 from calib.surveys.saying import believed_reflected, reflections_in_words, said_of, verdict_of
 from calib.surveys.scales import widened as student
+from calib.surveys.taken_curve import TakenCurve, corrected, taken_curve, widened_by
 from uwblink.recording.schema import SHAPES
 
 MOST_DOUBTS: Final = 0.15
@@ -36,6 +38,7 @@ def survey(
     fixed_ns: Mapping[int, float] | None = None,
     pair_error_m: float | None = None,
     delays_only: bool = False,
+    curve_from: Calibration | str | os.PathLike[str] | None = None,
     regardless: bool = False,
 ) -> SurveyResult:
     """Return the delays, the power curve and the places of boards that stood still, from their ranges alone.
@@ -45,7 +48,7 @@ def survey(
     moves. `known` is "line" or "plane" for all arrangements, the path of a TOML file (`load_knowledge`), or a
     `Knowledge`: shapes, distances and positions, which stay what they are within their sigmas. `fixed_ns` are delays
     that are known, `pair_error_m` is the constant error of a pair in an arrangement, estimated by default.
-    `delays_only` looks for no curve over power.
+    `delays_only` looks for no curve over power; `curve_from` is a calibration, or its path, whose curve is taken over.
 
     The result holds only delays that the arrangements determine. Raises `UnanswerableError` where none is, with the
     reason, and where ranges contradict what is said to be known (a line that is none, a board that was moved, exchanged
@@ -61,17 +64,25 @@ def survey(
     fixed = _fixed(fixed_ns)
     if pair_error_m is not None and not (math.isfinite(pair_error_m) and pair_error_m > 0):
         raise BadInputError(f"found {pair_error_m}, expected a positive number of metres", parameter="pair_error_m")
+    taken = taken_curve(curve_from)
+    if taken is not None and delays_only:
+        raise BadInputError("a curve is taken over, and `delays_only` asks for none", parameter="curve_from")
     gathered = gather(data, knowledge)
+    if taken is not None:
+        means, said = corrected(gathered.means, taken)
+        gathered = replace(gathered, means=means, warnings=(*gathered.warnings, *said))
     import_module("scipy.special")
     # Small matrices: several threads make them slower, and the last digits another.
     with threadpool_limits(limits=1, user_api="blas"):
-        network, names = assembled(gathered, knowledge, fixed, delays_only=delays_only)
+        network, names = assembled(gathered, knowledge, fixed, delays_only=delays_only or taken is not None)
         settled = _without_doubts(network, names, pair_error_m)
         findings = (*gathered.findings, *settled.findings)
         if findings and not regardless:
             told = "; ".join(one.text for one in findings)
             raise UnanswerableError(f"{told} (`regardless` surveys all the same)")
-        return _result(gathered, settled, findings)
+        if taken is not None:
+            settled = replace(settled, found=widened_by(settled.found, taken))
+        return _result(gathered, settled, findings, taken)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +124,9 @@ def _without_doubts(network: Network, names: tuple[str, ...], pair_error_m: floa
     return _Settled(averaged(found), second, tuple(findings))
 
 
-def _result(gathered: Gathered, settled: _Settled, findings: tuple[Contradiction, ...]) -> SurveyResult:
+def _result(
+    gathered: Gathered, settled: _Settled, findings: tuple[Contradiction, ...], taken: TakenCurve | None
+) -> SurveyResult:
     found = settled.found
     verdict = verdict_of(found)
     free = verdict.named("delay")
@@ -139,7 +152,7 @@ def _result(gathered: Gathered, settled: _Settled, findings: tuple[Contradiction
         "second_best": None if settled.second is None else round(settled.second.worse, 2),
     }
     return SurveyResult(
-        calibration=calibration_of(gathered, found, verdict, widened, warnings, more),
+        calibration=calibration_of(gathered, found, verdict, widened, warnings, more, taken),
         arrangements=arrangements,
         verdict=verdict,
         pair_error_m=found.pair_std_m,

@@ -321,3 +321,49 @@ def test_the_command_says_what_is_not_determined_and_writes_nothing(recording, t
 def test_two_arrangements_of_one_name_are_refused(recording):
     with pytest.raises(BadInputError, match="two arrangements are called 'A'"):
         calib.survey([recording[0], recording[0]])
+
+
+def test_a_curve_is_taken_over_where_powers_do_not_vary():
+    # Boards some 2.5 m apart: powers within 3 dB, and a bias of several cm that delays would swallow.
+    corners = np.array([[0.0, 0.0, 0.0], [2.3, 0.0, 0.0], [1.1, 2.1, 0.0], [1.2, 0.7, 1.9]])
+    near = [corners, corners[[1, 2, 3, 0]], corners[[2, 0, 3, 1]]]
+    wide = [0.6 * near[0], 1.5 * near[1], 3.0 * near[2]]
+
+    def taped(places):
+        apart = {
+            (k, i, j): np.linalg.norm(p[i] - p[j]) for k, p in enumerate(places) for i in range(4) for j in range(i)
+        }
+        lengths = (KnownDistance(j + 1, i + 1, float(d), 0.003, str(k + 1)) for (k, i, j), d in apart.items())
+        spans = {str(k + 1): (70.0 * k, 70.0 * k + 60.0) for k in range(len(places))}
+        return calib.Knowledge(spans_s=spans, distances=tuple(lengths))
+
+    def world(places):
+        return standing_boards(8, boards=4, places=places, bias_size_m=0.1, pair_error_m=0.005)
+
+    # The same boards' curve, from a survey in which distances vary and are known.
+    known = calib.survey(world(wide).ranges, known=taped(wide)).calibration
+    assert not known.bias_curve.flat
+    ranges, planted = world(near).ranges, world(near).delays_ns
+    alone = calib.survey(ranges, known=taped(near), delays_only=True).calibration
+    result = calib.survey(ranges, known=taped(near), curve_from=known)
+    assert result.calibration.bias_curve == known.bias_curve
+    off = [np.mean([c.delays_ns[t] - planted[t] for t in planted]) for c in (alone, result.calibration)]
+    assert abs(off[1]) < 0.5 * abs(off[0])
+    assert max(map(abs, scores(result, planted).values())) < 3.5
+    # The curve's own errors are in the intervals.
+    sure = calib.survey(ranges, known=taped(near), curve_from=replace(known, uncertainty=None)).calibration
+    assert all(sure.delays_std_ns[t] < result.calibration.delays_std_ns[t] for t in planted)
+
+
+def test_a_curve_that_cannot_be_taken_over_is_refused():
+    ranges = calib.sample_arrangements(2)
+    flat = calib.survey(calib.sample_arrangements(6), known="line").calibration
+    with pytest.raises(BadInputError, match="it has no curve"):
+        calib.survey(ranges, known="line", curve_from=flat)
+    flight = calib.fit(calib.sample_flight()).calibration
+    with pytest.raises(UnanswerableError, match="pairs have no power"):
+        calib.survey(ranges, known="line", curve_from=flight)
+    with pytest.raises(BadInputError, match="a curve is taken over"):
+        calib.survey(ranges, known="line", curve_from=flight, delays_only=True)
+    with pytest.raises(BadInputError, match="lifts powers by"):
+        calib.survey(ranges, known="line", curve_from=replace(flight, alpha_dbm=-80.0))
