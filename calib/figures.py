@@ -107,13 +107,44 @@ def _centre(error_m: Floats, loss: str) -> tuple[float, float]:
     return core.location_m, float(core.sigma_m[0])
 
 
+@dataclass(frozen=True, slots=True)
+class OverPower:
+    """Errors by lifted power, of each pair by name and of all ranges."""
+
+    pairs: dict[str, Binned]
+    everything: Binned
+
+
+def over_power(ranges: Ranges, lifted: Floats, error_m: Floats, loss: str) -> OverPower:
+    """Return what errors (n,) come to by lifted power (n,): pair by pair in a few bins, and all in more."""
+    pairs = {name: binned(lifted[rows], error_m[rows], loss, BINS_OF_PAIR) for name, rows in pair_rows(ranges).items()}
+    return OverPower(pairs, binned(lifted, error_m, loss, BINS))
+
+
+def biases(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> OverPower:
+    """Return the delay-corrected errors over power, which `bias_over_power` draws."""
+    return over_power(ranges, applied.lifted, applied.delay_corrected_m - ranges.truth_m, calibration.loss)
+
+
+def sigmas(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> OverPower:
+    """Return the calibrated errors over power, which `sigma_over_power` draws."""
+    return over_power(ranges, applied.lifted, applied.corrected_m - ranges.truth_m, calibration.loss)
+
+
 def bias_over_power(
-    ranges: Ranges, applied: CorrectedRanges, calibration: Calibration, axes: Axes | None = None
+    ranges: Ranges,
+    applied: CorrectedRanges,
+    calibration: Calibration,
+    axes: Axes | None = None,
+    *,
+    found: OverPower | None = None,
 ) -> Axes:
-    """Centre of the delay-corrected errors' core over lifted power: every pair, all, fitted, planted; and medians."""
+    """Centre of the delay-corrected errors' core over lifted power: every pair, all, fitted, planted; and medians.
+
+    What is `found` by `biases` already need not be found again.
+    """
     axes = axes or new_axes()
-    error = applied.delay_corrected_m - ranges.truth_m
-    everything = _over_power(axes, ranges, applied.lifted, error, calibration.loss, "centre_m")
+    everything = _over_power(axes, found or biases(ranges, applied, calibration), calibration.loss, "centre_m")
     if calibration.loss != "l2":
         axes.plot(
             everything.lifted, 100 * everything.median_m, "_", color=MUTED, ms=6, label="medians, reflections included"
@@ -130,11 +161,16 @@ def bias_over_power(
 
 
 def sigma_over_power(
-    ranges: Ranges, applied: CorrectedRanges, calibration: Calibration, axes: Axes | None = None
+    ranges: Ranges,
+    applied: CorrectedRanges,
+    calibration: Calibration,
+    axes: Axes | None = None,
+    *,
+    found: OverPower | None = None,
 ) -> Axes:
-    """Standard deviation of the calibrated errors' core over lifted power, likewise."""
+    """Standard deviation of the calibrated errors' core over lifted power, likewise; `found` by `sigmas`."""
     axes = axes or new_axes()
-    _over_power(axes, ranges, applied.lifted, applied.corrected_m - ranges.truth_m, calibration.loss, "std_m")
+    _over_power(axes, found or sigmas(ranges, applied, calibration), calibration.loss, "std_m")
     _curve(axes, calibration, "sigma")
     grid = np.linspace(*calibration.sigma_curve.range, 300)
     planted = planted_curve(ranges, "sigma_curve", grid)
@@ -145,14 +181,13 @@ def sigma_over_power(
     return _explained(axes)
 
 
-def _over_power(axes: Axes, ranges: Ranges, lifted: Floats, error_m: Floats, loss: str, what: str) -> Binned:
-    shown = []
-    for name, rows in pair_rows(ranges).items():
-        own = binned(lifted[rows], error_m[rows], loss, BINS_OF_PAIR)
+def _over_power(axes: Axes, found: OverPower, loss: str, what: str) -> Binned:
+    shown: list[Floats] = []
+    for name, own in found.pairs.items():
         shown.append(100 * getattr(own, what))
         (line,) = axes.plot(own.lifted, shown[-1], color=PALE, lw=0.8, label="" if len(shown) > 1 else "each pair")
         mark(line, f"pair {name}")
-    everything = binned(lifted, error_m, loss, BINS)
+    everything = found.everything
     name = "mean of all pairs" if loss == "l2" else "core of all pairs"
     axes.plot(everything.lifted, 100 * getattr(everything, what), "o", color=INK, ms=3, label=name, zorder=4)
     keep_strays_out(axes, np.concatenate([*shown, 100 * getattr(everything, what)]))

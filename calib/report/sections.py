@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -176,9 +176,11 @@ def sensitivity(calibration: Calibration, refits: dict[float, Calibration]) -> l
 
 
 def curves(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
-    """Return the curves over power, with bands and data."""
+    """Return the curves over power, with bands and data, which are found once for all widths."""
     from calib import figures
 
+    known = (ranges, applied, calibration)
+    biases, sigmas = cache(partial(figures.biases, *known)), cache(partial(figures.sigmas, *known))
     return [
         Heading("Bias and standard deviation over power"),
         Text(FOLLOWS.get(calibration.loss, FOLLOWS_CORE), "note"),
@@ -196,12 +198,12 @@ def curves(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -
         ),
         Picture(
             "bias",
-            partial(figures.alone, partial(figures.bias_over_power, ranges, applied, calibration)),
+            lambda width: figures.alone(partial(figures.bias_over_power, *known, found=biases()), width),
             "Bias over power: what the delay-corrected errors centre on, and the curve with its 95 % band.",
         ),
         Picture(
             "sigma",
-            partial(figures.alone, partial(figures.sigma_over_power, ranges, applied, calibration)),
+            lambda width: figures.alone(partial(figures.sigma_over_power, *known, found=sigmas()), width),
             "Standard deviation over power: that of the calibrated errors' noise, and the curve with its 95 % band.",
         ),
     ]
