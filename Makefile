@@ -69,8 +69,12 @@ notebooks: setup ## run the notebooks and store what they print and draw
 picture: setup ## draw the README's picture
 	$(BIN)/python -m benchmarks.picture
 
-bench: setup ## measure speed and memory; prints the first table of docs/speed.md
+bench: setup ## measure speed and memory, and beside plain scripts; prints the first two tables of docs/speed.md
 	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks.ratios
+
+ratios: setup ## fail where the packages take far longer than plain scripts (1 minute)
+	$(BIN)/python -m benchmarks.ratios --check
 
 bench-large: setup ## measure a calibration of 3.8 million exchanges (two minutes, 2 GB)
 	$(BIN)/python -m benchmarks.large
