@@ -18,6 +18,7 @@ from calib.ranges import Ranges
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
 from uwblink.recording.file import Recording
+from uwblink.recording.pieces import READING_MB, exchanges_with_poses
 from uwblink.twr import Exchanges
 
 NUMBERS: Final = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
@@ -74,23 +75,25 @@ def apply(
 
 def _write(source: str | os.PathLike[str], calibration: Calibration, output: Path, *, force: bool) -> Applied:
     check_output(output, force=force)
-    with Recording.open(source) as recording:
+    with Recording.open(source, memory_mb=READING_MB) as recording:
         if "calibration" in recording.meta():
             raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")
-        exchanges = recording.exchanges()
-        ranges = Ranges.from_exchanges(
-            exchanges, poses=recording.poses(), tags=recording.tags(), source=Path(source).name
-        )
-        applied = calibration.apply(ranges)
-        table = _table(exchanges, applied)
-        recording.copy(
-            output,
-            replacing={"exchanges": replace(exchanges, range_m=table["corrected_m"]), "corrected": table},
-            meta={"calibration": calibration.provenance},
-            force=force,
-        )
-    powered = np.isfinite(applied.lifted)
-    return Applied(len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered)))
+        tags, counts = recording.tags(), np.zeros(3, dtype=np.int64)
+        meta = {"calibration": calibration.provenance}
+        with recording.copying(output, without=("exchanges", "corrected"), meta=meta, force=force) as written:
+            for exchanges, poses in exchanges_with_poses(recording):
+                ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, source=Path(source).name)
+                counts += _append(written, exchanges, calibration.apply(ranges))
+    return Applied(*counts.tolist())
+
+
+def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) -> tuple[int, int, int]:
+    """Add corrected exchanges; returns how many there are, how many are clamped, how many have no power."""
+    table, powered = _table(exchanges, applied), np.isfinite(applied.lifted)
+    with written.transaction():
+        written.append_exchanges(replace(exchanges, range_m=table["corrected_m"]))
+        written.append_columns("corrected", table)
+    return len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered))
 
 
 def _table(exchanges: Exchanges, applied: CorrectedRanges) -> dict[str, NDArray[Any]]:

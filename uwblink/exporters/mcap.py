@@ -18,7 +18,9 @@ import numpy as np
 from uwblink.errors import RecordingError
 from uwblink.exporters.corrections import corrections
 from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
-from uwblink.recording.contents import Contents, load
+from uwblink.recording.contents import Contents
+from uwblink.recording.file import Recording
+from uwblink.recording.pieces import READING_MB, pieces
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x0F
@@ -34,12 +36,15 @@ Message = tuple[int, str, str, dict[str, Any]]
 
 def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
     """Write `recording.mcap`; returns its messages. Times before 1970 cannot be written and raise `RecordingError`."""
-    held = load(recording)
-    parts = (_poses(held), _ranges(held), _imu(held), _heights(held), _temperatures(held), _faults(held))
-    messages = merge(*parts, key=lambda message: message[0])
-    with (folder / "recording.mcap").open("wb") as file:
-        count = _write(recording, file, messages)
+    with Recording.open(recording, memory_mb=READING_MB) as opened, (folder / "recording.mcap").open("wb") as file:
+        count = _write(recording, file, _messages(opened))
     return {"recording.mcap": count}
+
+
+def _messages(recording: Recording) -> Iterator[Message]:
+    for held in pieces(recording):
+        parts = (_poses(held), _ranges(held), _imu(held), _heights(held), _temperatures(held), _faults(held))
+        yield from merge(*parts, key=lambda message: message[0])
 
 
 def _write(recording: Path, file: BinaryIO, messages: Iterator[Message]) -> int:

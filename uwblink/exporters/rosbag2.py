@@ -17,7 +17,9 @@ import numpy as np
 
 from uwblink.errors import RecordingError
 from uwblink.exporters.corrections import variances
-from uwblink.recording.contents import Contents, load
+from uwblink.recording.contents import Contents
+from uwblink.recording.file import Recording
+from uwblink.recording.pieces import READING_MB, pieces
 
 WORLD: Final = "world"
 WARN: Final = 30
@@ -44,16 +46,14 @@ def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise RecordingError("writing bags needs rosbags; pip install 'uwbcal[bags]'") from error
-    held = load(recording)
     store = get_typestore(Stores.ROS2_JAZZY)
     made = _Messages(store.types)
-    parts = (
-        made.poses(held), made.ranges(held), made.imu(held), made.heights(held), made.temperatures(held),
-        made.faults(held),
-    )  # fmt: skip
     count, known = 0, dict[str, Any]()
-    with Writer(folder / "rosbag2", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag:
-        for time_ns, topic, kind, message in merge(*parts, key=lambda row: row[0]):
+    with (
+        Recording.open(recording, memory_mb=READING_MB) as opened,
+        Writer(folder / "rosbag2", version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP) as bag,
+    ):
+        for time_ns, topic, kind, message in (row for held in pieces(opened) for row in made.all(held)):
             if time_ns < 0:
                 raise RecordingError(f"{recording}: has times before 1970, which bags cannot hold")
             if topic not in known:
@@ -74,6 +74,14 @@ class _Messages:
 
     def __init__(self, types: Any) -> None:
         self._types = types
+
+    def all(self, held: Contents) -> Iterator[Message]:
+        """Yield all messages of a piece of a recording in order of time."""
+        parts = (
+            self.poses(held), self.ranges(held), self.imu(held), self.heights(held), self.temperatures(held),
+            self.faults(held),
+        )  # fmt: skip
+        return merge(*parts, key=lambda row: row[0])
 
     def _new(self, kind: str, *values: Any) -> Any:
         package, name = kind.split("/")

@@ -7,7 +7,8 @@ docs/architecture.md.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -29,6 +30,9 @@ from uwblink.recording.writers import TableWriters
 
 if TYPE_CHECKING:
     from uwblink.recording.summary import Summary
+
+COPYING_MB: Final = 300
+"""Of a file that is written again so much is kept in memory; without a limit, all of it."""
 
 
 class Recording(TableWriters, TableReaders):
@@ -63,10 +67,12 @@ class Recording(TableWriters, TableReaders):
         meta: Mapping[str, Any] | None = None,
         force: bool = False,
         live: bool = False,
+        memory_mb: int | None = None,
     ) -> Self:
         """Start a recording beside `path`; it takes that name when the `with` block ends well.
 
-        A `live` one has its name from the start, and what was appended stays whatever happens. Raises
+        A `live` one has its name from the start, and what was appended stays whatever happens. Of what was
+        written no more than `memory_mb` is kept in memory, for those who write a long one some rows at a time. Raises
         `RecordingExistsError` if `path` is there and not `force`, `RecordingError` where it cannot be written. When
         the block raises, nothing is left behind of one that is not live.
         """
@@ -77,7 +83,7 @@ class Recording(TableWriters, TableReaders):
         place = final if live else final.with_name(f".{final.name}.{os.getpid()}.partial")
         _remove(place)
         try:
-            recording = cls(Store.create(place, final), None if live else place)
+            recording = cls(Store.create(place, final, memory_mb), None if live else place)
             recording.append_meta(standard_meta() | dict(meta or {}))
             if live:
                 # So that the tables are in the file itself, and only rows ever in the log beside it.
@@ -175,12 +181,36 @@ class Recording(TableWriters, TableReaders):
         known_tables(instead)
         entries = instead.pop("meta", None)
         entries = self.meta() if entries is None else entries
-        with type(self).create(path, meta=entries | dict(meta or {}), force=force) as written:
+        with self._copying(path, entries | dict(meta or {}), instead, force=force) as written:
+            for table in instead:
+                _APPENDERS[table](written, instead[table])
+
+    @contextmanager
+    def copying(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        without: Collection[str],
+        meta: Mapping[str, Any] | None = None,
+        force: bool = False,
+    ) -> Iterator[Self]:
+        """Yield a copy in the making: all tables but those `without`, to which the block appends what it likes.
+
+        What the block appends need not be in memory at once. Raises what `copy` raises.
+        """
+        known_tables(without)
+        with self._copying(path, self.meta() | dict(meta or {}), without, force=force) as written:
+            yield written
+
+    @contextmanager
+    def _copying(
+        self, path: str | os.PathLike[str], meta: Mapping[str, Any], without: Collection[str], *, force: bool
+    ) -> Iterator[Self]:
+        with type(self).create(path, meta=meta, force=force, memory_mb=COPYING_MB) as written:
             for table in TABLES:
-                if table in instead:
-                    _APPENDERS[table](written, instead[table])
-                elif table != "meta":
+                if table != "meta" and table not in without:
                     written._store.take(self._store, table)
+            yield written
 
     def _check_version(self) -> None:
         version = self.meta().get("format_version")

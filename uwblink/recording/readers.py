@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.arrays import Ints
 from uwblink.display import printable
 from uwblink.errors import RecordingError
 from uwblink.recording.blocks import ROWS_AT_ONCE, PoseWindows, exchange_blocks, filled, read_exchanges
@@ -20,6 +21,9 @@ from uwblink.ticks import REPORT_BITS
 from uwblink.twr import BITS, Exchanges
 
 _EMPTY: Final = {"BIGINT": np.int64, "BOOLEAN": np.bool_, "DOUBLE": np.float64, "USMALLINT": np.uint16}
+
+SAMPLED: Final = 16
+"""Rows that are looked at for each time of `some_times`."""
 
 
 class TableReaders:
@@ -96,9 +100,9 @@ class TableReaders:
             raise RecordingError(f"{self.path}: meta timestamp_bits is {printable(bits):.40}, expected {listed}")
         return int(bits)
 
-    def poses(self) -> Poses:
+    def poses(self, start_ns: int | None = None, end_ns: int | None = None) -> Poses:
         """Return all poses in order of time."""
-        r = self._store.read("SELECT * FROM poses ORDER BY time_ns, body")
+        r = self._store.read(f"SELECT * FROM poses {_within(start_ns, end_ns)} ORDER BY time_ns, body")  # noqa: S608 - numbers
         return Poses(
             time_ns=filled(r["time_ns"]),
             body=np.asarray(r["body"], dtype=np.str_),
@@ -106,8 +110,30 @@ class TableReaders:
             quaternion=np.column_stack([filled(r[c]) for c in ("qx", "qy", "qz", "qw")]),
         )
 
-    def columns(self, table: str) -> dict[str, NDArray[Any]]:
+    def some_times(self, table: str, rows: int) -> Ints:
+        """Return times of about every so many `rows` of one of `TABLES`, in order; none of one with fewer."""
+        known_tables([table])
+        if self.count(table) <= rows:
+            return np.empty(0, dtype=np.int64)
+        step = max(rows // SAMPLED, 1)
+        found = self._store.read(f"SELECT time_ns FROM {table} WHERE rowid % {step} = 0")  # noqa: S608 - a key of TABLES
+        return np.unique(np.sort(filled(found["time_ns"]))[:: max(rows // step, 1)])
+
+    def column_blocks(
+        self, table: str, columns: Iterable[str], rows: int = ROWS_AT_ONCE
+    ) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield columns of numbers of one of `TABLES` in the order of its rows, so many `rows` at once."""
+        known_tables([table])
+        names = ", ".join(f'"{name}"' for name in columns if name in TABLES[table])
+        for start in range(0, self.count(table), rows):
+            piece = f"rowid >= {start} AND rowid < {start + rows} ORDER BY rowid"
+            found = self._store.read(f"SELECT {names} FROM {table} WHERE {piece}")  # noqa: S608 - keys of TABLES
+            yield {name: filled(column) for name, column in found.items()}
+
+    def columns(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, NDArray[Any]]:
         """Return one of `TABLES` as columns in the order of its rows, masked where a value is missing.
+
+        Of a table with `time_ns` only what is from `start_ns` until before `end_ns`, where these are given.
 
         Columns that an older file does not have are left out; of a table that it does not have, all are empty. Raises
         `RecordingError` for a table that recordings do not have.
@@ -117,7 +143,7 @@ class TableReaders:
         if present is None:
             return {name: np.empty(0, dtype=_EMPTY.get(kind, object)) for name, kind in TABLES[table].items()}
         names = ", ".join(f'"{name}"' for name in TABLES[table] if name in present)
-        return self._store.read(f"SELECT {names} FROM {table} ORDER BY rowid")  # noqa: S608 - keys of TABLES
+        return self._store.read(f"SELECT {names} FROM {table} {_within(start_ns, end_ns)} ORDER BY rowid")  # noqa: S608 - keys of TABLES
 
     def frames(self) -> list[FrameRow]:
         """Return all raw bytes in order of time."""
@@ -141,19 +167,19 @@ class TableReaders:
         rows = self._store.read(f"SELECT {', '.join(TABLES['overheard'])} FROM overheard ORDER BY time_ns")  # noqa: S608
         return {name: filled(column) for name, column in rows.items()}
 
-    def corrected(self) -> dict[str, NDArray[Any]]:
+    def corrected(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, NDArray[Any]]:
         """Return what a calibration said of each exchange, in their order, as columns of the table `corrected`.
 
         NaN where it said nothing; recordings whose ranges are as they were measured have no rows.
         """
-        found = self.columns("corrected")
+        found = self.columns("corrected", start_ns, end_ns)
         flags = ("clamped", "outlier")
         numbers = {name: filled(column) for name, column in found.items() if name not in flags}
         return numbers | {name: np.ma.filled(found[name], False).astype(bool) for name in flags}
 
-    def faults(self) -> list[Fault]:
+    def faults(self, start_ns: int | None = None, end_ns: int | None = None) -> list[Fault]:
         """Return all faults in order of time."""
-        r = self._store.read("SELECT * FROM faults ORDER BY time_ns, rowid")
+        r = self._store.read(f"SELECT * FROM faults {_within(start_ns, end_ns)} ORDER BY time_ns, rowid")  # noqa: S608 - numbers
         none = np.ma.array(np.zeros(len(r["time_ns"]), np.int64), mask=True)
         ends = (r.get(name, none).tolist() for name in ("initiator", "target"))
         rows = zip(r["time_ns"], r["board"], r["kind"], r["detail"], *ends, strict=True)
@@ -180,16 +206,16 @@ class TableReaders:
                 raise RecordingError(f"{self.path}: table {table}: a row with nothing in one of its columns, {row}")
         return rows
 
-    def imu(self) -> dict[str, NDArray[Any]]:
+    def imu(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, NDArray[Any]]:
         """Return inertial readings as columns of the table `imu`, in order of time (rad/s, m/s^2, axes of the body)."""
-        return self._readings("imu")
+        return self._readings("imu", start_ns, end_ns)
 
-    def heights(self) -> dict[str, NDArray[Any]]:
+    def heights(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, NDArray[Any]]:
         """Return what height sensors read as columns of the table `height`, in order of time."""
-        return self._readings("height")
+        return self._readings("height", start_ns, end_ns)
 
-    def _readings(self, table: str) -> dict[str, NDArray[Any]]:
-        found = self.columns(table)
+    def _readings(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, NDArray[Any]]:
+        found = self.columns(table, start_ns, end_ns)
         order = np.argsort(filled(found["time_ns"]), kind="stable")
         as_words = {"body": np.ma.filled(found.pop("body"), "").astype(np.str_)}
         numbers = {name: filled(column) for name, column in found.items()}
@@ -199,15 +225,15 @@ class TableReaders:
         """Return the total powers of exchanges as columns of the table `powers`, in order of time; NaN where none."""
         return self._numbers("powers")
 
-    def temperatures(self) -> dict[str, NDArray[Any]]:
+    def temperatures(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, NDArray[Any]]:
         """Return what tags read of themselves as columns of the table `temperature`, in order of time.
 
         Temperature in degrees Celsius and supply voltage in volts; NaN where there is none.
         """
-        return self._numbers("temperature")
+        return self._numbers("temperature", start_ns, end_ns)
 
-    def _numbers(self, table: str) -> dict[str, NDArray[Any]]:
-        found = {name: filled(column) for name, column in self.columns(table).items()}
+    def _numbers(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, NDArray[Any]]:
+        found = {name: filled(column) for name, column in self.columns(table, start_ns, end_ns).items()}
         order = np.argsort(found["time_ns"], kind="stable")
         return {name: column[order] for name, column in found.items()}
 
@@ -217,3 +243,10 @@ def known_tables(names: Iterable[str]) -> None:
     for name in names:
         if name not in TABLES:
             raise RecordingError(f"no table {name!r} in a recording; there are {', '.join(TABLES)}")
+
+
+def _within(start_ns: int | None, end_ns: int | None) -> str:
+    """Return the clause of a query for a span of time, of which either end may be open."""
+    ends = ((">=", start_ns), ("<", end_ns))
+    said = [f"time_ns {sign} {int(time_ns)}" for sign, time_ns in ends if time_ns is not None]
+    return f"WHERE {' AND '.join(said)}" if said else ""

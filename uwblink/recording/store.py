@@ -51,13 +51,15 @@ class Store:
         self._longest_read_s = longest_read_s(size)
 
     @classmethod
-    def create(cls, place: Path, path: Path) -> Self:
+    def create(cls, place: Path, path: Path, memory_mb: int | None = None) -> Self:
         """Make a file at `place` with empty tables, for a recording that is called `path`; raises `RecordingError`."""
         import duckdb
 
         try:
             store = cls(duckdb.connect(str(place)), path, hidden=place != path)
             # Snapshots are written beside the recording, and nothing ever elsewhere.
+            if memory_mb is not None:
+                store.execute(f"SET memory_limit = '{memory_mb}MB'")
             store.execute("SET allowed_directories = ?", [[str(place.absolute().parent)]])
             for setting in _LOCKED:
                 store.execute(f"SET {setting}")

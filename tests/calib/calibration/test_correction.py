@@ -118,3 +118,13 @@ def test_ranges_without_power_are_counted_apart(corrected):
     assert (done.count, done.unpowered) == (600, 7)
     assert done.unpowered == np.count_nonzero(np.isnan(unpowered))
     assert done.clamped == np.count_nonzero(beyond[np.isfinite(unpowered)])
+
+
+@pytest.mark.parametrize("size", [37, 599])
+def test_blocks_of_any_size_are_corrected_alike(corrected, tmp_path, monkeypatch, size):
+    folder, _, known, done = corrected
+    blocks = Recording.exchange_blocks
+    monkeypatch.setattr(Recording, "exchange_blocks", lambda recording: blocks(recording, size))
+    assert calib.apply(folder / "f.uwb", known, tmp_path / "c.uwb") == done
+    for table in ("exchanges", "corrected", "poses", "cirs"):
+        assert repr(rows(tmp_path / "c.uwb", table)) == repr(rows(folder / "c.uwb", table))
