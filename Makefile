@@ -85,6 +85,10 @@ bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 bench-stream: setup ## measure how late streamed ranges are (15 s)
 	$(BIN)/python -m benchmarks.streaming
 
+bench-long: setup ## record eight hours in virtual time, then all commands on 5.8 million exchanges (half an hour, 2 GB of disk)
+	$(BIN)/python -m benchmarks.long record
+	$(BIN)/python -m benchmarks.long commands
+
 bench-import: setup ## measure how long tables and poses take to come in (2 minutes, 1 GB)
 	$(BIN)/python -m benchmarks.importing
 

@@ -31,6 +31,9 @@ from uwblink.wire.messages import IdReport, Message, RangeCommand, RangeReport, 
 LONGEST_WAIT_S: Final = 0.05
 NOBODY_READY_S: Final = 0.005
 WATCH_EVERY_S: Final = 0.25
+FILE_MB: Final = 200
+"""Of the file so much is kept in memory; without a limit all of it would be, and a recording of hours is long."""
+
 MOST_FAULT_TEXT: Final = 200
 EXPECTED_TEXTS: Final = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
 """Lines that every ranging brings; any other one is noted as a fault."""
@@ -87,7 +90,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     check_output(path, force=force)
     found = identify(ports, using)
     turns = plan.turns(sorted(found))
-    with Recording.create(path, meta=_meta(found, plan, turns, passive), force=force, live=True) as recording:
+    meta = _meta(found, plan, turns, passive)
+    with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
         seats = {tag.tag: tag for tag in plan.tags}
         recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
         with RecordingWriter(recording) as writer:

@@ -1,0 +1,275 @@
+"""Eight hours of recording at 200 exchanges a second, in virtual time: memory, latency and the commands on the file.
+
+`python -m benchmarks.long record [HOURS]` records from boards that answer at once and cost nothing, so that what is
+measured is the recorder; `python -m benchmarks.long commands [EXCHANGES]` measures show, doctor, fit, apply and export
+on a flight of that many exchanges with poses, each in a process of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from benchmarks.flights import Plan, fly
+from benchmarks.large import peak_mb
+from uwblink.boards import writer
+from uwblink.boards.listeners import Heard
+from uwblink.boards.ports import Transport
+from uwblink.boards.progress import Progress
+from uwblink.boards.ranging_plan import RangingPlan
+from uwblink.boards.recorder import record
+from uwblink.recording.contents import Contents
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import FrameRow
+from uwblink.wire.codec import Decoder, encode
+from uwblink.wire.messages import REPORTS, GetId, IdReport, RangeCommand, RangeReport
+
+HOURS: Final = 8.0
+RATE_HZ: Final = 200.0
+EXCHANGES: Final = 5_760_000
+ANSWER_NS: Final = 4_000_000
+BANK: Final = 4_000
+"""Different reports that the boards have; they come again."""
+
+COMMANDS: Final = (
+    ("uwblink", "show", "long.uwb"),
+    ("calib", "doctor", "long.uwb"),
+    ("calib", "fit", "long.uwb", "-o", "long.json", "--force"),
+    ("calib", "apply", "long.uwb", "-c", "long.json", "-o", "corrected.uwb", "--force"),
+    *(("uwblink", "export", "long.uwb", "--to", to, "-o", to, "--force") for to in ("parquet", "csv", "tum", "mcap")),
+)
+
+
+class AnsweringPort:
+    """A board that answers every command after `ANSWER_NS` of virtual time."""
+
+    def __init__(self, ports: AnsweringPorts, name: str) -> None:
+        """Belong to ports."""
+        self._ports, self.name = ports, name
+        self.board = int(name)
+        self.due: deque[tuple[int, bytes]] = deque()
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return what is due, waiting for it no longer than that."""
+        if not self.due or self.due[0][0] > self._ports.time_ns:
+            self._ports.wait(timeout_s)
+        found = b""
+        while self.due and self.due[0][0] <= self._ports.time_ns:
+            found += self.due.popleft()[1]
+        return found
+
+    def write(self, data: bytes) -> None:
+        """Take a command."""
+        self.due.append((self._ports.time_ns + ANSWER_NS, self._ports.answer(self.board, data)))
+
+    def now_s(self) -> float:
+        """Return the virtual time."""
+        return self._ports.now_s()
+
+    def close(self) -> None:
+        """Forget what was not read."""
+        self.due.clear()
+
+
+class AnsweringPorts:
+    """Ports of such boards; time passes only while somebody waits. Reports are those of a flight, again and again."""
+
+    def __init__(self, seed: int = 1) -> None:
+        """Make the reports."""
+        self.time_ns = 0
+        self._open: dict[str, AnsweringPort] = {}
+        e = fly(Plan(seconds=BANK / 160, per_second=160), seed).exchanges
+        self._reports: dict[bytes, deque[bytes]] = {}
+        for k in range(len(e)):
+            report = RangeReport(
+                int(e.target[k]), float(e.range_m[k]),
+                *(int(getattr(e, name)[k]) for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")),
+                *(float(getattr(e, name)[k]) for name in ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")),
+            )  # fmt: skip
+            self._reports.setdefault(self._key(int(e.initiator[k]), int(e.target[k])), deque()).append(encode(report))
+        self.pairs = tuple(sorted((i, j) for i, j in (map(int, key.split()) for key in self._reports) if i < j))
+        self.names = [str(board) for board in sorted({*e.initiator.tolist(), *e.target.tolist()})]
+
+    def answer(self, board: int, data: bytes) -> bytes:
+        """Return what a board says to a command."""
+        if data == encode(GetId()):
+            return encode(IdReport(board))
+        target = int(data.split(b"|")[1])
+        bank = self._reports[self._key(board, target)]
+        bank.rotate(-1)
+        return bank[0]
+
+    @staticmethod
+    def _key(board: int, target: int) -> bytes:
+        return b"%d %d" % (board, target)
+
+    def open(self, name: str) -> AnsweringPort:
+        """Return a port."""
+        self._open[name] = AnsweringPort(self, name)
+        return self._open[name]
+
+    def close(self, port: Transport) -> None:
+        """Close a port."""
+        self._open.pop(port.name, None)
+
+    def wait(self, timeout_s: float) -> Sequence[AnsweringPort]:
+        """Let time pass until something is due, or the time is over."""
+        until = self.time_ns + int(timeout_s * 1e9) + 1
+        due = min((port.due[0][0] for port in self._open.values() if port.due), default=until)
+        self.time_ns = max(self.time_ns, min(due, until))
+        return [port for port in self._open.values() if port.due and port.due[0][0] <= self.time_ns]
+
+    def now_s(self) -> float:
+        """Return the virtual time in seconds."""
+        return self.time_ns * 1e-9
+
+    def host_ns(self) -> int:
+        """Return the virtual time in nanoseconds."""
+        return self.time_ns
+
+    def moved(self, name: str, _number: str | None) -> str | None:
+        """Return the same name: nobody unplugs these."""
+        return name
+
+
+class TimedBatch(writer.Batch):
+    """A batch that notes how long its commit took, and when it ended."""
+
+    __slots__ = ()
+    commits: Final[list[tuple[float, float]]] = []
+
+    def write(self, recording: Recording) -> None:
+        """Append everything in one transaction."""
+        begin = time.monotonic()
+        super().write(recording)
+        self.commits.append((begin, time.monotonic()))
+
+
+def recording(hours: float) -> None:
+    """Record in virtual time; prints a line for each tenth of it. *: by processor time."""
+    writer.Batch = TimedBatch  # type: ignore[misc]
+    ports, lines = AnsweringPorts(), _Lines(hours * 3600 / 10)
+    print("| hour | exchanges | file | memory | commit, median (99 %) | message to row, 99 % | times real time* |")
+    print("|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        lines.path = Path(folder) / "long.uwb"
+        plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ)
+        record(ports.names, lines.path, plan, duration_s=hours * 3600, using=ports, watch=lines.watch)
+
+
+class _Lines:
+    """Prints what was measured since the last line."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s = self._next_s = every_s
+        self._began = time.process_time()
+        self.path = Path()
+
+    def watch(self, progress: Progress) -> None:
+        if progress.time_s < self._next_s:
+            return
+        commits = np.array(TimedBatch.commits)
+        TimedBatch.commits.clear()
+        taken = np.diff(commits, axis=1)[:, 0]
+        # What came right after a batch was taken waits until the next one is committed.
+        late = commits[1:, 1] - commits[:-1, 0]
+        pages = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        now = time.process_time()
+        print(
+            f"| {progress.time_s / 3600:.1f} | {progress.exchanges} | {self.path.stat().st_size / 1e6:.0f} MB | "
+            f"{pages / 1e6:.0f} MB | {1e3 * np.median(taken):.0f} ms ({1e3 * np.percentile(taken, 99):.0f}) | "
+            f"{1e3 * np.percentile(late, 99):.0f} ms | {self._every_s / (now - self._began):.0f} |",
+            flush=True,
+        )
+        self._began = now
+        self._next_s += self._every_s
+
+
+def growth(path: Path) -> None:
+    """Print how long commits of a second's messages take, into an empty recording and into one that is there."""
+    print("| exchanges in the file | commit of a second, median (99 %) |")
+    print("|---|---|")
+    second = _a_second()
+    with tempfile.TemporaryDirectory() as folder, Recording.create(Path(folder) / "new.uwb", live=True) as empty:
+        print(f"| none | {_commits(empty, second)} |", flush=True)
+    with Recording.open(path, update=True) as long:
+        print(f"| {long.count('exchanges')} | {_commits(long, second)} |", flush=True)
+
+
+def _a_second() -> writer.Batch:
+    """Return what a recorder writes in a second: reports and their bytes."""
+    ports, batch, decoder = AnsweringPorts(), writer.Batch(), Decoder(REPORTS)
+    for k in range(int(RATE_HZ)):
+        board, target = ports.pairs[k % len(ports.pairs)]
+        command = encode(RangeCommand(target))
+        answer = ports.answer(board, command)
+        batch.frames += [FrameRow(k, str(board), "out", command), FrameRow(k, str(board), "in", answer)]
+        for event in decoder.feed(answer):
+            batch.add(Heard(k, board, event))
+    return batch
+
+
+def _commits(recording: Recording, batch: writer.Batch) -> str:
+    taken = []
+    for _ in range(200):
+        begin = time.thread_time()
+        batch.write(recording)
+        taken.append(time.thread_time() - begin)
+    return f"{1e3 * np.median(taken):.1f} ms ({1e3 * np.percentile(taken, 99):.1f})"
+
+
+def commands(exchanges: int) -> None:
+    """Write a flight of so many exchanges, and measure each command on it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "long.uwb"
+        subprocess.run([sys.executable, "-m", "benchmarks.long", "write", str(exchanges), str(path)], check=True)
+        growth(path)
+        print("| command | processor time | largest memory |")
+        print("|---|---|---|")
+        for words, seconds, memory_mb in measured(Path(folder)):
+            print(f"| `{words}` | {seconds:.1f} s | {memory_mb:.0f} MB |", flush=True)
+
+
+def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
+    """Yield each command, its processor time, and the most memory that it had."""
+    for words in COMMANDS:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *words], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        _, status, used = os.wait4(process.pid, 0)
+        if os.waitstatus_to_exitcode(status):
+            sys.exit(f"{' '.join(words)}: ended with {os.waitstatus_to_exitcode(status)}")
+        yield " ".join(words), used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+
+
+def write(exchanges: int, path: Path) -> None:
+    """Write a flight of three bodies with two tags each, and their poses fifty times a second."""
+    flight = fly(Plan(seconds=exchanges / RATE_HZ, per_second=RATE_HZ), 1)
+    Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(path)
+    print(f"{len(flight.exchanges)} exchanges, {len(flight.poses)} poses, made with {peak_mb():.0f} MB", flush=True)
+
+
+def main(words: list[str]) -> None:
+    """Do what the first word says."""
+    what, *rest = words or ["record"]
+    if what == "write":
+        write(int(rest[0]), Path(rest[1]))
+    elif what == "growth":
+        growth(Path(rest[0]))
+    elif what == "commands":
+        commands(int(rest[0]) if rest else EXCHANGES)
+    else:
+        recording(float(rest[0]) if rest else HOURS)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
