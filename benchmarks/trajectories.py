@@ -9,12 +9,13 @@ with motion capture of the same flight.
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
 import tomllib
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -70,6 +71,12 @@ WORLDS: Final = {
         lambda seed: _scenario("icra2023/test2.toml", seed, 60.0),
         {"poses_until_s": 10.0, "attitudes": "imu"},
         False,
+    ),
+    "lasting reflections, 40 s, known for 10 s": World(
+        lambda seed: _scenario("lasting_reflections/hall.toml", seed, 40.0), {"poses_until_s": 10.0}, False
+    ),
+    "room, 40 s, known for 10 s": World(
+        lambda seed: _scenario("room/room.toml", seed, 40.0), {"poses_until_s": 10.0}, False
     ),
 }
 
@@ -177,20 +184,43 @@ TITLES: Final = (
 HEAD: Final = f"| {' | '.join(TITLES)} |\n{'|---' * len(TITLES)}|"
 
 
+def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> list[Outcome]:
+    """Return a world's outcomes; those that stand in a file of results are taken from there, new ones are added."""
+    stored = {} if results is None else _stored(name, results)
+    missing = [seed for seed in range(seeds) if seed not in stored]
+    for seed, outcome in zip(missing, pool.map(one, [name] * len(missing), missing), strict=True):
+        stored[seed] = outcome
+        if results is not None:
+            line = {"world": name, "seed": seed, **asdict(outcome), "scores": outcome.scores.tolist()}
+            with results.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
+    return [stored[seed] for seed in range(seeds)]
+
+
+def _stored(name: str, results: Path) -> dict[int, Outcome]:
+    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
+    found = {}
+    for line in map(json.loads, lines):
+        if line.pop("world") == name:
+            seed, scores = line.pop("seed"), np.array(line.pop("scores"), dtype=np.float64)
+            found[seed] = Outcome(scores=scores, **line)
+    return found
+
+
 def main(argv: list[str]) -> int:
     """Print the table, and write it into the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--only", default="")
+    parser.add_argument("--results", type=Path, help="file of outcomes, a line each: what it has is not flown again")
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args(argv)
     lines = [HEAD]
     with ProcessPoolExecutor(given.workers) as pool:
         for name in WORLDS:
             if given.only in name:
-                found = list(pool.map(one, [name] * given.seeds, range(given.seeds)))
-                lines.append(row(name, found))
+                lines.append(row(name, outcomes_of(name, given.seeds, given.results, pool)))
                 sys.stdout.write(lines[-1] + "\n")
                 sys.stdout.flush()
     if given.write:
