@@ -1,6 +1,9 @@
 """The recorder while its machine misbehaves: clocks are set, the process is stopped, its file or folder goes away."""
 
+import os
 import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -132,6 +135,34 @@ def test_a_file_that_is_removed_under_the_recorder_is_told_within_a_second(tmp_p
         record(server.names.values(), path, RangingPlan(), duration_s=60.0, listeners=[After(t20=remove)])
     assert time.monotonic() < begun[0] + 20.0  # a second on a machine that has nothing else to do
     assert not replaced or path.read_text() == "mine"
+
+
+NOBODY = 65534
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give its rights away, and take a folder's from another")
+def test_a_folder_made_read_only_under_the_recorder_takes_nothing_away():
+    """By an ordinary user, whose right to the folder goes while it records: all is in the file and its log."""
+    with TemporaryDirectory(dir="/tmp") as place:
+        folder, path = Path(place), Path(place) / "f.uwb"
+        folder.chmod(0o777)
+
+        def lock():
+            os.seteuid(0)
+            folder.chmod(0o555)
+            os.seteuid(NOBODY)
+
+        ports = VirtualPorts(bench_scenario())
+        os.seteuid(NOBODY)
+        try:
+            after = After(t20=lock)
+            done = record(ports.names.values(), path, RangingPlan(), using=ports, duration_s=2.0, listeners=[after])
+            exchanges, kinds = exchanges_of(path)
+        finally:
+            os.seteuid(0)
+            folder.chmod(0o777)
+        assert len(exchanges) == done.exchanges > 500
+        assert kinds == []
 
 
 def test_two_recorders_cannot_have_one_file(tmp_path):
