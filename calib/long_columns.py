@@ -10,19 +10,20 @@ from __future__ import annotations
 import mmap
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from calib.errors import UnanswerableError
-from uwblink.arrays import Bools, Ints
 
 MANY: Final = 1_000_000
 """Rows from which a column lies in a file."""
 
 ROWS_AT_ONCE: Final = 1 << 20
+WIDE: Final = 1 << 31
+"""Rows whose numbers take eight bytes."""
 
 
 def empty(rows: int, dtype: DTypeLike = np.float64, *, each: tuple[int, ...] = ()) -> NDArray[Any]:
@@ -54,6 +55,23 @@ def _take_room(file: int, size: int) -> None:
         os.ftruncate(file, size)
 
 
+def spans(rows: int) -> Iterator[slice]:
+    """Yield slices of so many rows together, as many as are worked on at once."""
+    for begin in range(0, rows, ROWS_AT_ONCE):
+        yield slice(begin, min(begin + ROWS_AT_ONCE, rows))
+
+
+def computed(rows: int, of: Callable[[slice], NDArray[Any]], dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """Return the column (rows,) that a function of slices of rows makes, some at once if there are many."""
+    if rows < MANY:
+        return np.asarray(of(slice(0, rows)), dtype)
+    found = empty(rows, dtype)
+    for some in spans(rows):
+        found[some] = of(some)
+        let_go(found)
+    return found
+
+
 def let_go(*columns: NDArray[Any] | None) -> None:
     """Take the pages of columns that lie in files out of memory; what is in them stays."""
     for column in columns:
@@ -65,18 +83,18 @@ def let_go(*columns: NDArray[Any] | None) -> None:
             place.madvise(mmap.MADV_DONTNEED)
 
 
-def picked(column: NDArray[Any], rows: Bools | Ints | slice) -> NDArray[Any]:
+def picked(column: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
     """Return some rows of a column (n,), as `column[rows]` does; one value for all of them stays one."""
     if column.strides == (0,) and len(column):
         return np.broadcast_to(np.asarray(column[0]), np.arange(len(column))[rows].shape)
     if len(column) < MANY or isinstance(rows, slice):
         return np.asarray(column[rows])
-    where = np.flatnonzero(rows) if rows.dtype == bool else rows
+    where = np.flatnonzero(rows).astype(np.int32 if len(column) < WIDE else np.int64) if rows.dtype == bool else rows
     found = empty(len(where), column.dtype)
-    for begin in range(0, len(where), ROWS_AT_ONCE):
-        some = slice(begin, begin + ROWS_AT_ONCE)
+    for some in spans(len(where)):
         found[some] = column[where[some]]
-        let_go(found, column)
+        let_go(found)
+    let_go(column)
     return found
 
 

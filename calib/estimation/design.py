@@ -8,6 +8,7 @@ leaves out pinned delays, takes the splines' averages off and shares curves betw
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
@@ -15,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.long_columns import empty, let_go, picked
 from uwblink.arrays import Bools, Floats, Ints
 
 Order = NDArray[np.signedinteger[Any]]
@@ -27,6 +29,8 @@ MANY: Final = 64
 """Rows a block from which blocks are worth a product of matrices each."""
 
 DIGIT: Final = 1 << 16
+PIECES_AT_ONCE: Final = 128
+"""Pieces after which entries that lie in files are let go of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +44,14 @@ class Runs:
         """Return sums of columns (k, n) over the rows of each run (runs, k)."""
         return np.vstack([np.add.reduceat(some, self.starts[:-1], axis=-1) for some in stacked]).T
 
+    @property
+    def lengths(self) -> Ints:
+        """Return the number of rows of each run (runs,)."""
+        return np.diff(self.starts)
+
     def rows(self, values: Ints) -> Ints:
         """Return what rows (n,) have, of what runs have (runs,)."""
-        return np.repeat(values, np.diff(self.starts))
+        return np.repeat(values, self.lengths)
 
 
 @dataclass(frozen=True)
@@ -91,16 +100,25 @@ class Design:
             first = last
         return found
 
+    def passing(self) -> Iterator[tuple[slice, slice]]:
+        """Yield the same in turn; of entries that lie in files no more than a few pieces' are in memory."""
+        for k, piece in enumerate(self.pieces):
+            yield piece
+            if k % PIECES_AT_ONCE == PIECES_AT_ONCE - 1:
+                let_go(self.values)
+        let_go(self.values)
+
     def kept(self, given: NDArray[Any]) -> NDArray[Any]:
         """Return values of rows (n,) in the order in which rows are kept."""
-        return given if self.order is None else given[self.order]
+        return given if self.order is None else picked(given, self.order)
 
     def given(self, kept: NDArray[Any]) -> NDArray[Any]:
         """Return values of kept rows (n,) in the order in which rows were given."""
         if self.order is None:
             return kept
-        found = np.empty_like(kept)
+        found = empty(len(kept), kept.dtype)
         found[self.order] = kept
+        let_go(found)
         return found
 
     def __matmul__(self, x: Floats) -> Floats:
@@ -109,8 +127,8 @@ class Design:
 
     def times(self, x: Floats) -> Floats:
         """Return the matrix times parameters (m,), in the order of kept rows."""
-        found = np.empty(len(self))
-        for blocks, rows in self.pieces:
+        found = empty(len(self))
+        for blocks, rows in self.passing():
             found[rows] = self.piece_times(x, blocks, rows)
         return found
 
@@ -134,18 +152,20 @@ class Design:
     def pull(self, kept: Floats) -> Floats:
         """Return the sum over kept rows (n,) of values times rows of the matrix (m,)."""
         sums = np.empty(self.columns.shape)
-        for blocks, rows in self.pieces:
+        for blocks, rows in self.passing():
             weighed = self.values[:, rows] * kept[rows]
             sums[blocks] = np.add.reduceat(weighed, self.starts[blocks] - rows.start, axis=1).T
+        let_go(kept)
         raw = np.bincount(self.columns.ravel(), sums.ravel(), len(self.turn))
         return np.asarray(raw @ self.turn)
 
-    def normal(self, kept: Floats) -> Floats:
-        """Return the sum over kept rows of weights (n,), of either sign, times outer squares of rows (m, m)."""
+    def normal(self, kept: Floats | None = None) -> Floats:
+        """Return the sum over kept rows of weights (n,), of either sign, 1 by default, times outer squares of rows."""
         squares = np.empty((*self.columns.shape, self.columns.shape[1]))
-        for blocks, rows in self.pieces:
+        for blocks, rows in self.passing():
             values = self.values[:, rows]
-            self._products(values * kept[rows], values, blocks, rows, squares)
+            self._products(values if kept is None else values * kept[rows], values, blocks, rows, squares)
+        let_go(kept)
         return self.squared(squares)
 
     def _products(self, left: Floats, right: Floats, blocks: slice, rows: slice, into: Floats) -> None:
@@ -187,10 +207,11 @@ class Design:
         """Return kept values (n,) times rows of the matrix, summed by group of kept rows (n,): (count, m)."""
         size = len(self.turn)
         raw = np.zeros(count * size)
-        for blocks, rows in self.pieces:
+        for blocks, rows in self.passing():
             weight, own, counts = kept[rows], group[rows] * size, self.counts[blocks]
             for column, value in zip(self.columns[blocks].T, self.values[:, rows], strict=True):
                 raw += np.bincount(own + np.repeat(column, counts), weight * value, count * size)
+        let_go(kept, group)
         return np.asarray(raw.reshape(count, size) @ self.turn)
 
     def like(self, matrix: Floats) -> Design:
@@ -219,9 +240,11 @@ class Design:
         order = None if self.order is None else (np.cumsum(chosen) - 1)[self.order[keep]]
         starts = np.searchsorted(keep, self.starts)
         there = np.diff(starts) > 0
-        return Design(
-            self.values[:, keep], order, np.append(starts[:-1][there], len(keep)), self.columns[there], self.turn
-        )
+        values = empty(len(keep), each=(len(self.values),))
+        for into, column in zip(values, self.values, strict=True):
+            np.take(column, keep, out=into)
+            let_go(values, column)
+        return Design(values, order, np.append(starts[:-1][there], len(keep)), self.columns[there], self.turn)
 
     def blocked(self, place: Ints) -> Design:
         """Return the same matrix, with one place of given rows (n,) in each block."""
@@ -246,6 +269,11 @@ class Design:
             return self
         old = np.searchsorted(self.starts, starts[:-1], side="right") - 1
         return replace(self, starts=starts, columns=self.columns[old])
+
+    def block_of(self, rows: slice) -> Ints:
+        """Return the block of each of some kept rows that follow each other."""
+        edges = np.clip(self.starts, rows.start, rows.stop)
+        return np.repeat(np.arange(len(self.counts)), np.diff(edges))
 
     def first_of(self, kept: Ints) -> Ints:
         """Return what the first row of each block has (blocks,)."""

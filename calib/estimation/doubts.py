@@ -24,6 +24,7 @@ from calib.estimation.misfit import (
 from calib.estimation.persistence import FEWEST_STRETCHES
 from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
+from calib.long_columns import computed, let_go, spans
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -110,18 +111,25 @@ def _moved(finding: Finding, covariance: Floats) -> float:
 def of_a_decibel(problem: Problem, found: Solved) -> Floats:
     """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
     if not problem.unknowns.curve:
-        return np.zeros(len(problem.error))
+        return np.broadcast_to(0.0, len(problem.error))
     mean = np.mean([found.parameters[columns] for _, columns in problem.curves()], axis=0)
     curve = Curve(tuple(problem.knots.tolist()), tuple(mean.tolist()), DEGREE, problem.span)
-    return curve(DECIBEL * problem.lifted) - curve(problem.lifted)
+    lifted = problem.lifted
+    louder = computed(len(lifted), lambda rows: curve(DECIBEL * lifted[rows]) - curve(lifted[rows]))
+    let_go(lifted)
+    return louder
 
 
-def _of_another_shape(problem: Problem, found: Solved) -> Floats:
+def _of_another_shape(problem: Problem, solved: Solved) -> Floats:
     """Return by how much ranges (n,) of a pair would be off, were its reflections of another shape than the fit's."""
-    if found.mixture is None:
-        return np.zeros(len(problem.error))
-    share = found.mixture.tail_share * found.mixture.noise * float(np.exp(np.mean(found.mixture.of("cell_noise"))))
-    return np.asarray(SHAPE * share[problem.pairs.number])
+    mixture = solved.mixture
+    if mixture is None:
+        return np.broadcast_to(0.0, len(problem.error))
+    share = mixture.tail_share * mixture.noise * float(np.exp(np.mean(mixture.of("cell_noise"))))
+    by_pair, number = SHAPE * share, problem.pairs.number
+    found = computed(len(number), lambda rows: by_pair[number[rows]])
+    let_go(number)
+    return found
 
 
 def reflected(problem: Problem, found: Solved) -> list[str]:
@@ -165,7 +173,8 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
     far = found.scores.design.kept(problem.ranges.truth_m - np.median(problem.ranges.truth_m))
     link = found.scores.linked(far, *everywhere(found.scores))[0]
     taken = link @ found.inverse
-    known = float(found.scores.known() @ far**2 - taken @ link) / found.lasting.factor
+    own = sum(float(found.scores.known(rows) @ far[rows] ** 2) for rows in spans(len(far)))
+    known = (own - float(taken @ link)) / found.lasting.factor
     slope = 1 / np.sqrt(SCALE**-2 + max(known, 0.0))
     rows = basis(np.quantile(problem.lifted, np.linspace(0.02, 0.98, 25)), problem.knots)
     rows = np.tile(rows - rows.mean(axis=0), len(problem.groups)) / len(problem.groups)

@@ -39,7 +39,8 @@ from calib.estimation.result import FitResult
 from calib.estimation.solver import Ended, Solved, solve
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
-from calib.ranges import Ranges
+from calib.long_columns import computed, empty, let_go, spans
+from calib.ranges import COLUMNS, Ranges
 from calib.sources import Data, load_ranges
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -118,6 +119,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     loss = loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)
     # Before the columns of a fit are there: sorting millions of ranges takes memory too.
     skewed = list(one_way(ranges))
+    let_go(*(getattr(ranges, name) for name in COLUMNS))
     # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
     with threadpool_limits(limits=1, user_api="blas"):
         problem = build_problem(
@@ -138,17 +140,16 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
                 found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)
             else:
                 found = replace(found, success=False)
+        problem.let_go()
         doubted = doubts(problem, found)
+        problem.let_go()
         calibration = calibration_of(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
         stds = std_taken_over(source, set(fixed) - set(pinned))
         calibration = replace(calibration, delays_std_ns=calibration.delays_std_ns | stds)
         # Of the search no more than this is asked from here on.
         problem, ended = problem.without_design(), found.ended
         del found
-        # What errors are made of is known now, and of no use for the residuals.
-        applied = replace(calibration, errors=None).apply(ranges)
-        residuals = applied.corrected_m - ranges.truth_m
-        inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
+        residuals, inliers = _left(calibration, ranges)
         warnings = [
             *limits(ranges, problem, residuals, fixed),
             *_stopped(ended),
@@ -156,11 +157,11 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             *skewed,
             *implausible(calibration.delays_ns, residuals),
             *_beyond(reference, alpha_dbm, problem),
-            *warnings_of(ranges, applied, float(np.mean(inliers)), problem.free),
+            *warnings_of(ranges, float(np.mean(inliers)), problem.free),
         ]
         provenance = _provenance(ranges, inliers, fixed, sequential, problem, ended, warnings, reference)
         provenance["error_std_m"] = {
-            "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
+            "raw": float(np.std(computed(len(ranges), lambda rows: ranges.raw_m[rows] - ranges.truth_m[rows]))),
             "corrected": float(np.std(residuals)),
         }
         return FitResult(
@@ -172,6 +173,20 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             message=f"{'converged' if ended.success else 'stopped'} after {ended.steps} steps",
             warnings=warnings,
         )
+
+
+def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools]:
+    """Return what a calibration leaves of the errors of ranges (n,), and which of them lie within three sigmas."""
+    # What errors are made of is known, and of no use for this.
+    plain, count = replace(calibration, errors=None), len(ranges)
+    residuals, inliers = empty(count), empty(count, np.bool_)
+    for rows in spans(count):
+        some = ranges[rows]
+        applied = plain.apply(some)
+        residuals[rows] = applied.corrected_m - some.truth_m
+        inliers[rows] = np.abs(residuals[rows]) < INLIER_SIGMAS * applied.sigma_m
+        let_go(residuals, *(getattr(ranges, name) for name in COLUMNS))
+    return residuals, inliers
 
 
 def _solved(

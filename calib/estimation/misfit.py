@@ -18,6 +18,7 @@ from calib.estimation.design import Runs
 from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
+from calib.long_columns import computed, let_go
 from calib.tails import students_quantile
 from uwblink.arrays import Floats, Ints
 
@@ -129,7 +130,8 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
     named = [f"pair {low}-{high}" for low, high in problem.pairs.ends.tolist()]
     yield Family(kind="pair", names=named, weight=1.0, runs=runs, ends=((pair, 1.0),))
     count = segments(seconds)
-    when = kept(np.arange(len(truth_m)) * count // len(truth_m))
+    edges = -(-np.arange(count + 1) * len(truth_m) // count)
+    when = kept(np.repeat(np.arange(count, dtype=np.int32), np.diff(edges)))
     spans = problem.design.runs(when)
     own = when[spans.starts[:-1]]
     yield Family(
@@ -139,17 +141,30 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
         runs=spans,
         ends=tuple((place[spans.block] * count + own, 1.0) for place in (low, high)),
     )
-    rank = np.linspace(-1, 1, len(bins.count))[kept(bins.number)]
     if problem.unknowns.curve:
+        ranks, number = np.linspace(-1, 1, len(bins.count)), kept(bins.number)
+        rank = computed(len(number), lambda rows: ranks[number[rows]])
+        let_go(number)
         yield Family(kind="power", names=names, weight=rank, runs=runs, ends=both)
-    size = float(np.sqrt(np.mean(louder_m**2)))
+    size = float(np.sqrt(louder_m @ louder_m / len(louder_m)))
+    let_go(louder_m, bins.number)
     if size > 0:
-        yield Family(kind="decibels", names=names, weight=kept(louder_m) / size, runs=runs, ends=both)
-    forth = np.where(kept(problem.ranges.initiator < problem.ranges.target), 1.0, -1.0)
+        yield Family(kind="decibels", names=names, weight=_times(kept(louder_m), 1 / size), runs=runs, ends=both)
+    first = kept(problem.ranges.initiator < problem.ranges.target)
+    forth = computed(len(first), lambda rows: np.where(first[rows], 1.0, -1.0))
     yield Family(kind="skew", names=names, weight=forth, runs=runs, ends=((low, 1.0), (high, -1.0)))
-    far = kept(truth_m - np.median(truth_m)) / max(float(np.ptp(truth_m)), 1e-9)
-    if np.ptp(truth_m) > 0:
+    reach = float(np.ptp(truth_m))
+    if reach > 0:
+        middle = float(np.median(truth_m))
+        far = kept(computed(len(truth_m), lambda rows: (truth_m[rows] - middle) / reach))
+        let_go(truth_m)
         yield Family(kind="scale", names=["all tags"], weight=far, runs=runs, ends=((np.zeros_like(low), 1.0),))
+
+
+def _times(column: Floats, factor: float) -> Floats:
+    found = computed(len(column), lambda rows: column[rows] * factor)
+    let_go(column)
+    return found
 
 
 def segments(seconds: float) -> int:
@@ -178,7 +193,10 @@ def examine(
     effect = -delays @ (scores.linked(shape_m, *everywhere(scores)) @ inverse)[0, : delays.shape[1]]
     widening = np.outer(effect, effect)
     # One family at a time: each has columns of its own.
-    results = [_test(family, scores, own, inverse, delays, blocks, seconds) for family in tested]
+    results = []
+    for family in tested:
+        results.append(_test(family, scores, own, inverse, delays, blocks, seconds))
+        del family
     several = sum(len(result.names) for result in results)
     found = [finding for result in results for finding in findings(result, several)]
     widening += sum(widening_of_pairs(result) for result in results if result.kind == "pair")
@@ -219,10 +237,17 @@ def _test(
     """Return a family's efficient slopes; `own` (blocks, D) are those by the fitted parameters."""
     size, count, runs = len(family.names), len(own), family.runs
     plain, square = np.zeros((count, size)), np.zeros((size, size))
-    slope, known = scores.score * family.weight, runs.sums((scores.known() * family.weight**2)[None])[:, 0]
+    known = np.empty(len(runs.block))
+    for which, rows in scores.spans(runs):
+        weight = family.weight[rows] if isinstance(family.weight, np.ndarray) else family.weight
+        known[which] = np.add.reduceat(scores.known(rows) * weight**2, runs.starts[which] - rows.start)
+        slope, lengths, when = scores.score[rows] * weight, runs.lengths[which], blocks[rows] * size
+        for place, sign in family.ends:
+            where = when + np.repeat(place[which], lengths)
+            plain += sign * np.bincount(where, slope, minlength=count * size).reshape(count, size)
+        scores.let_go()
+        let_go(blocks, family.weight if isinstance(family.weight, np.ndarray) else None)
     for place, sign in family.ends:
-        where = blocks * size + runs.rows(place)
-        plain += sign * np.bincount(where, slope, minlength=count * size).reshape(count, size)
         for other, its in family.ends:
             both = np.bincount(place * size + other, known, minlength=size * size).reshape(size, size)
             square += sign * its * both

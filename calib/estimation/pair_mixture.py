@@ -19,6 +19,7 @@ from calib.estimation.design import Design, as_design
 from calib.estimation.problem import CELLS
 from calib.estimation.reflections import Shape, expected
 from calib.estimation.scores import Scores, Sort, Summing, Sums, inverse_of
+from calib.long_columns import ROWS_AT_ONCE, computed, empty, let_go, picked
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
@@ -130,7 +131,7 @@ class Errors:
         keep = self.design.chosen(rows)
         design = self.design.sample(rows)
         place = np.repeat(self.place, self.design.counts)[keep]
-        return replace(self, error=self.error[keep], design=design, place=design.first_of(place))
+        return replace(self, error=picked(self.error, keep), design=design, place=design.first_of(place))
 
     def parts(self, group: Ints, count: int, values: Floats) -> list[Floats]:
         """Return values (n,) apart by groups of blocks, of which `group` (blocks,) are the numbers."""
@@ -245,7 +246,8 @@ def _levels(errors: Errors) -> Iterator[Errors]:
 def _start(errors: Errors, layout: Layout, start: Floats, ridge: Floats, lasting: float) -> tuple[Floats, Prior]:
     """Return first parameters, from robust spreads of the residuals, and what is known beforehand."""
     where = layout.slices()
-    residual = errors.error + errors.design.times(start)
+    fitted = errors.design.times(start)
+    residual = computed(len(fitted), lambda rows: errors.error[rows] + fitted[rows])
     spread = _spread(residual)
     theta = np.zeros(where["pair_mean"].stop)
     theta[where["design"]] = start
@@ -376,7 +378,7 @@ def _pieces(errors: Errors, layout: Layout, theta: Floats) -> Iterator[tuple[sli
     share = 1 / (1 + np.exp(-part["pair_share"][:, None] - part["cell_share"])).ravel()[errors.place]
     mean = np.exp(part["mean"][0] + part["pair_mean"])[errors.place // layout.cells]
     design, counts = errors.design, errors.design.counts
-    for blocks, rows in design.pieces:
+    for blocks, rows in design.passing():
         shape = Shape(
             sigma_m=np.repeat(sigma[blocks], counts[blocks]),
             tail_share=np.repeat(share[blocks], counts[blocks]),
@@ -409,9 +411,12 @@ def _slopes(residual: Floats, shape: Shape) -> _Piece:
 
 def _all_scores(errors: Errors, layout: Layout, theta: Floats) -> Scores:
     """Return the slopes of all ranges at parameters."""
-    found = np.empty((1 + len(SLOPES), len(errors.error)))
+    found = empty(len(errors.error), each=(1 + len(SLOPES),))
     for _, rows, piece in _pieces(errors, layout, theta):
         found[0, rows], found[1:, rows] = piece.score, piece.slopes
+        if rows.start // ROWS_AT_ONCE != rows.stop // ROWS_AT_ONCE:
+            let_go(found, errors.error)
+    let_go(found, errors.error)
     return Scores(
         design=errors.design,
         score=found[0],

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.long_columns import computed, let_go
 from calib.tails import students_quantile
 from uwblink.arrays import Floats, Ints
 
@@ -53,10 +54,12 @@ class Persistence:
 
 def short_blocks(time_ns: Ints) -> Ints:
     """Number short blocks of ascending times (n,) without gaps, a thousand at most."""
-    since = time_ns - time_ns[0]
-    length = max(int(since[-1]) // MOST_BLOCKS, int(SHORTEST_S * 1e9))
-    spans = since // length
-    return np.cumsum(np.diff(spans, prepend=spans[0]) > 0)
+    first = time_ns[0]
+    length = max(int(time_ns[-1] - first) // MOST_BLOCKS, int(SHORTEST_S * 1e9))
+    spans = computed(len(time_ns), lambda rows: (time_ns[rows] - first) // length, np.int32)
+    edges = np.concatenate([[0], np.flatnonzero(spans[1:] > spans[:-1]) + 1, [len(spans)]])
+    let_go(time_ns)
+    return np.repeat(np.arange(len(edges) - 1, dtype=np.int32), np.diff(edges))
 
 
 def lasting_in_pairs(slope: Floats, pair: Ints, time_ns: Ints) -> float:
@@ -64,7 +67,7 @@ def lasting_in_pairs(slope: Floats, pair: Ints, time_ns: Ints) -> float:
     blocks, pairs = short_blocks(time_ns), int(pair.max()) + 1
     count, seconds = int(blocks[-1]) + 1, float(time_ns[-1] - time_ns[0]) * 1e-9
     sums = np.asarray(np.bincount(blocks * pairs + pair, slope, count * pairs), float).reshape(count, pairs)
-    within = float(np.sum(sums**2) / max(np.sum(slope**2), 1e-300))
+    within = float(np.sum(sums**2) / max(float(slope @ slope), 1e-300))
     return max(within, 1.0) * max(persistence(sums, seconds, pairs).factor, 1.0)
 
 

@@ -10,16 +10,19 @@ from typing import Final
 import numpy as np
 
 from calib.errors import UnanswerableError
+from calib.estimation.design import stable_order
+from calib.estimation.pairs import pairs_of
+from calib.long_columns import computed, let_go, picked
 from calib.ranges import STATIC, Ranges
 from calib.spread import robust_spread
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 
 MOST_LEFT_OUT: Final = 0.5
 SCALE: Final = (0.75, 1.35)
 """How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
 
 ENOUGH: Final = 100_000
-"""Of more ranges, only every so many are asked for their scale."""
+"""Of more ranges, only every so many are asked for their scale and their clocks."""
 
 UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet", 1000.0: "kilometres"}
 FEWEST_SPREADS: Final = 3.0
@@ -89,10 +92,11 @@ def robust_slope(x: Floats, y: Floats) -> float:
 
 def _clock_ratios(ranges: Ranges) -> None:
     """Refuse clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order."""
-    double = ranges.protocol == "ds"
-    if not double.any():
+    every = slice(None, None, max(len(ranges) // ENOUGH, 1))
+    weight = ranges.weight_target[every][ranges.protocol[every] == "ds"]
+    if not len(weight):
         return
-    skew = 1e6 * float(np.median(np.abs(2 * ranges.weight_target[double] - 1)))
+    skew = 1e6 * float(np.median(np.abs(2 * weight - 1)))
     if skew > SKEW_PPM:
         raise UnanswerableError(
             f"{ranges.source}: clocks differ by {skew:.0f} ppm by their third messages, crystals by 40 at most; the "
@@ -102,13 +106,12 @@ def _clock_ratios(ranges: Ranges) -> None:
 
 def one_way(ranges: Ranges) -> Iterator[str]:
     """Name the pair whose ranges depend most on who initiates, as they do where clock skew is left in them."""
-    error = ranges.raw_m - ranges.truth_m
-    forth = ranges.initiator < ranges.target
-    low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
-    key = (low * (int(high.max()) + 1) + high) * 2 + forth
-    order = np.argsort(key, kind="stable")
-    keys, starts = np.unique(key[order], return_index=True)
-    parts = dict(zip(keys.tolist(), np.split(error[order], starts[1:]), strict=True))
+    first, second, raw, truth = ranges.initiator, ranges.target, ranges.raw_m, ranges.truth_m
+    tags = ranges.tags()
+    pairs = pairs_of(first, second, tags)
+    key = computed(len(ranges), lambda rows: pairs.number[rows] * 2 + (first[rows] < second[rows]), np.int64)
+    parts = _parts(computed(len(ranges), lambda rows: raw[rows] - truth[rows]), key)
+    let_go(first, second, raw, truth)
     worst, said = 0.0, ""
     for number, part in parts.items():
         back = parts.get(number - 1, part[:0])
@@ -117,7 +120,7 @@ def one_way(ranges: Ranges) -> Iterator[str]:
         differ = float(np.median(part) - np.median(back))
         std = MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in (part, back))))
         if abs(differ) > max(ONE_WAY_M, SURELY * std, worst):
-            a, b = divmod(number // 2, int(high.max()) + 1)
+            a, b = pairs.ends[number // 2]
             worst = abs(differ)
             way = "longer" if differ > 0 else "shorter"
             said = (
@@ -126,6 +129,13 @@ def one_way(ranges: Ranges) -> Iterator[str]:
             )
     if said:
         yield said
+
+
+def _parts(error: Floats, key: Ints) -> dict[int, Floats]:
+    """Return errors (n,) apart by their keys (n,)."""
+    sizes = np.bincount(key)
+    several = picked(error, stable_order(key))
+    return dict(enumerate(np.split(several, np.cumsum(sizes)[:-1])))
 
 
 def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:

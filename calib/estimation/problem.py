@@ -18,11 +18,12 @@ from calib.calibration.power_curves import (
     populated,
 )
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.design import Design, Order, stable_order
+from calib.estimation.design import PIECES_AT_ONCE, Design, stable_order
 from calib.estimation.identifiability import identifiable_directions, require_determined
 from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.unknowns import Unknowns
-from calib.ranges import Ranges
+from calib.long_columns import computed, empty, let_go, picked
+from calib.ranges import COLUMNS, Ranges
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.bsplines import nonzero
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -89,6 +90,7 @@ class Problem:
         Times, ends and true distances stay; millions of the rest need not be there twice.
         """
         nothing = np.broadcast_to(np.nan, len(self.error))
+        self.let_go()
         bare = replace(
             self.ranges,
             protocol=np.broadcast_to(np.array(""), len(self.error)),
@@ -103,6 +105,18 @@ class Problem:
     def without_design(self) -> Problem:
         """Return the problem for those who only ask what was looked for, and at which powers."""
         return replace(self, error=self.error[:0], design=self.design.sample(slice(0, 0)))
+
+    def let_go(self) -> None:
+        """Leave what lies in files to them."""
+        let_go(self.error, self.lifted, self.pairs.number, self.bins.number)
+        let_go(*(getattr(self.ranges, name) for name in COLUMNS))
+
+    def residuals(self, x: Floats) -> Floats:
+        """Return what parameters (m,) leave of the errors (n,)."""
+        fitted = self.design @ x
+        found = computed(len(fitted), lambda rows: self.error[rows] + fitted[rows])
+        let_go(self.error, found)
+        return found
 
     @property
     def rank(self) -> int:
@@ -154,18 +168,21 @@ def build_problem(
         )
     if np.any(np.diff(ranges.time_ns) < 0):
         ranges = ranges[np.argsort(ranges.time_ns, kind="stable")]
-    lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
+    fpp1, fpp2 = ranges.fpp1_dbm, ranges.fpp2_dbm
+    lifted = computed(len(ranges), lambda rows: lifted_power(fpp1[rows], fpp2[rows], lift, alpha_dbm))
+    let_go(fpp1, fpp2)
     powered = np.isfinite(lifted)
-    # What has no power stands at the middle of the others, where it bends nothing.
-    lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
+    if not powered.all():
+        # What has no power stands at the middle of the others, where it bends nothing.
+        lifted[~powered] = np.median(lifted[powered]) if powered.any() else 1.0
     ordered = np.sort(lifted)
     low, high = populated(ordered)
     unknowns = (unknowns or Unknowns()).at_powers(varied=high - low > SAME_POWER)
     # Beyond the populated powers a curve is held constant: what it is there is not for these ranges to say.
     if not sequential and unknowns.curve:
         inside = (lifted >= low) & (lifted <= high)
-        ranges, lifted, powered = ranges[inside], lifted[inside], powered[inside]
-        ordered = ordered[(ordered >= low) & (ordered <= high)]
+        ranges, lifted, powered = ranges[inside], picked(lifted, inside), powered[inside]
+        ordered = ordered[np.searchsorted(ordered, low) : np.searchsorted(ordered, high, side="right")]
     everyone = ranges.tags()
     pairs = pairs_of(ranges.initiator, ranges.target, everyone)
     shares = _shares(ranges, groups, everyone)
@@ -176,9 +193,9 @@ def build_problem(
     raw = _raw(ranges, everyone, pairs, lifted, bins, knots, kind.ravel(), unknowns)
     carriers = raw.shape[1] - len(kinds) * len(averages)
     weights = raw.part(slice(0, carriers))
-    square = weights.normal(np.ones(len(lifted)))
+    square = weights.normal()
     tags, directions, free = list(range(len(pairs.ends))), np.eye(carriers), list[list[int]]()
-    known = np.zeros(len(lifted))
+    known: Floats = np.broadcast_to(0.0, len(lifted))
     if not unknowns.of_pairs:
         pinned = np.array([tag in fixed for tag in everyone])
         if pinned.any():
@@ -200,7 +217,7 @@ def build_problem(
         ranges=ranges,
         tags=tags,
         directions=directions if unknowns.of_pairs else directions[~pinned],
-        error=ranges.raw_m - ranges.truth_m + known,
+        error=computed(len(ranges), lambda rows: ranges.raw_m[rows] - ranges.truth_m[rows] + known[rows]),
         design=replace(raw, turn=_turn(directions, kinds, centres)),
         lifted=lifted,
         pairs=pairs,
@@ -236,7 +253,8 @@ def _bins(lifted: Floats, ordered: Floats) -> Bins:
     count, size = min(SIGMA_BINS, max(1, len(lifted) // 20)), len(lifted)
     edges = -(-np.arange(count + 1) * size // count)
     # Sorting values and looking them up is several times faster than sorting their places, which equal powers need.
-    number = np.searchsorted(ordered[edges[1:-1]], lifted, side="right")
+    inner = ordered[edges[1:-1]]
+    number = computed(size, lambda rows: np.searchsorted(inner, lifted[rows], side="right"), np.int32)
     counts = np.bincount(number, minlength=count)
     if 2 * int(counts.min()) < size // count:
         return equal_bins(lifted)
@@ -256,9 +274,9 @@ def _making_up(delays: Design, share: Floats | None) -> Floats | None:
     """Return the parameters that make up for a constant in a curve with a `share` in ranges (n,), None if none do."""
     if not delays.shape[1]:
         return None
-    aim = delays.kept(np.ones(len(delays)) if share is None else share)
+    aim = delays.kept(np.broadcast_to(1.0, len(delays)) if share is None else share)
     pull = delays.pull(aim)
-    found = np.linalg.lstsq(delays.normal(np.ones(len(delays))), pull, rcond=1e-12)[0]
+    found = np.linalg.lstsq(delays.normal(), pull, rcond=1e-12)[0]
     return np.asarray(found) if float(aim @ aim - pull @ found) < SPANNED * float(aim @ aim) else None
 
 
@@ -313,24 +331,36 @@ def _raw(
     `kind` (pairs,) numbers those that have the same curve. Blocks are of one pair, step of power and piece of curve.
     """
     each = max(len(knots) - DEGREE - 1, 0)
-    first = _first_splines(lifted, knots) if each else np.zeros(len(lifted), dtype=np.int64)
+    first: Ints = np.broadcast_to(np.int64(0), len(lifted))
+    if each:
+        first = computed(len(lifted), lambda rows: _first_splines(lifted[rows], knots), np.int32)
     several = max(each, 1)
-    key = (pairs.number * CELLS + bins.number * CELLS // len(bins.count)) * several + first
+
+    def place(rows: slice) -> Ints:
+        cell = bins.number[rows] * CELLS // len(bins.count)
+        return np.asarray((pairs.number[rows] * CELLS + cell) * several + first[rows])
+
+    key = computed(len(lifted), place, np.int64)
     order = stable_order(key).astype(np.int32)
     sizes = np.bincount(key)
+    del key
     which = np.flatnonzero(sizes)
     pair, first = which // (CELLS * several), which % several
     columns = [pair] if unknowns.of_pairs else list(np.searchsorted(everyone, pairs.ends[pair]).T)
     carriers = len(pairs.ends) if unknowns.of_pairs else len(everyone)
-    values = np.empty((len(columns) + (DEGREE + 1) * bool(each), len(lifted)))
+    values = empty(len(lifted), each=(len(columns) + (DEGREE + 1) * bool(each),))
     if each:
         columns += [carriers + kind[pair] * each + first + k for k in range(DEGREE + 1)]
-    for begin in range(0, len(lifted), ROWS_AT_ONCE):
+    for into, weight in zip(values, _weights(ranges, unknowns), strict=False):
+        into[:] = picked(weight, order)
+        let_go(values)
+    ordered = picked(lifted, order)
+    for begin in range(0, len(lifted) if each else 0, ROWS_AT_ONCE):
         rows = slice(begin, begin + ROWS_AT_ONCE)
-        some = order[rows]
-        values[: 1 if unknowns.of_pairs else 2, rows] = _weights(ranges, some, unknowns)
-        if each:
-            values[-DEGREE - 1 :, rows] = nonzero(np.clip(lifted[some], knots[0], knots[-1]), knots, DEGREE)[1]
+        values[-DEGREE - 1 :, rows] = nonzero(np.clip(ordered[rows], knots[0], knots[-1]), knots, DEGREE)[1]
+        if begin % (PIECES_AT_ONCE * ROWS_AT_ONCE) == 0:
+            let_go(values, ordered)
+    let_go(values, lifted)
     count = carriers + each * (int(kind.max()) + 1)
     starts = np.concatenate([[0], np.cumsum(sizes[which])])
     return Design(values, order, starts, np.column_stack(columns), np.eye(count)).in_short_blocks()
@@ -342,14 +372,20 @@ def _first_splines(lifted: Floats, knots: Floats) -> Ints:
     return np.asarray(np.clip(found, DEGREE, len(knots) - DEGREE - 2) - DEGREE)
 
 
-def _weights(ranges: Ranges, rows: Order, unknowns: Unknowns) -> Floats:
-    """Return the derivatives of ranges by the delays of their lower and their higher tag in ns, or by a constant."""
+def _weights(ranges: Ranges, unknowns: Unknowns) -> Iterator[Floats]:
+    """Yield the derivatives of ranges (n,) by the delays of their lower and higher tags in ns, or by a constant."""
     metres = SPEED_OF_LIGHT * 1e-9
     if unknowns.of_pairs:
-        return np.full((1, len(rows)), metres)
-    forth = ranges.initiator[rows] < ranges.target[rows]
-    first, second = metres * ranges.weight_initiator[rows], metres * ranges.weight_target[rows]
-    return np.array([np.where(forth, first, second), np.where(forth, second, first)])
+        yield np.broadcast_to(metres, len(ranges))
+        return
+    first, second = ranges.weight_initiator, ranges.weight_target
+    for one, other in ((first, second), (second, first)):
+
+        def of(rows: slice, one: Floats = one, other: Floats = other) -> Floats:
+            return metres * np.where(ranges.initiator[rows] < ranges.target[rows], one[rows], other[rows])
+
+        yield computed(len(ranges), of)
+        let_go(first, second, ranges.initiator, ranges.target)
 
 
 def _turn(directions: Floats, kinds: Floats, centres: Floats) -> Floats:

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.estimation.design import Design, as_design
 from calib.estimation.losses import LOSSES, Weights
+from calib.long_columns import computed, empty, let_go, spans
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -71,13 +72,12 @@ def robust_fit(
     error = design.kept(error)
     ridge = np.zeros((design.shape[1],) * 2) if penalty is None else penalty
     x = start if start is not None else _absolute_start(design, error, ridge)
-    function = LOSSES[loss]
-    residual = error + design.times(x)
+    residual = added(error, design.times(x))
     width = scale or scale_of(residual)
     steps, moved, curvature = 0, 0.5 * NEWTON_M if near else np.inf, None
     while moved > STILL_M and steps < MAX_STEPS:
-        weight, slope = function(residual / width)
-        downhill = -design.pull(weight * residual) - ridge @ x
+        weight, slope = terms(loss, residual, width)
+        downhill = -design.pull(product(weight, residual)) - ridge @ x
         # Reweighting descends from anywhere; Newton is faster, where it descends at all. Near the end the curvature no
         # longer changes, and the last one serves on.
         if (near or steps >= SETTLING) and moved < NEWTON_M and (curvature is None or moved > CHORD_M):
@@ -86,12 +86,12 @@ def robust_fit(
         if curvature is not None:
             step = np.asarray(np.linalg.solve(curvature, downhill))
             change = design.times(step)
-        if np.max(np.abs(change)) > NEWTON_M:
+        if farthest(change) > NEWTON_M:
             step = _solved(design.normal(weight) + ridge, downhill)
             change, curvature = design.times(step), None
-        x, residual = np.asarray(x + step), residual + change
+        x, residual = np.asarray(x + step), added(residual, change)
         # What no range determines may go where rounding takes it.
-        moved = float(np.max(np.abs(change)))
+        moved = farthest(change)
         steps += 1
         if scale is None and steps <= SETTLING:
             width = scale_of(residual)
@@ -110,6 +110,31 @@ def _descending(curvature: Floats) -> Floats | None:
     """
     values = np.linalg.eigvalsh(curvature)
     return None if values[0] <= CONVEX * values[-1] else curvature
+
+
+def terms(loss: str, residual: Floats, width: float) -> tuple[Floats, Floats]:
+    """Return the weights of a loss at residuals (n,), and the slopes of its score."""
+    function, count = LOSSES[loss], len(residual)
+    weight, slope = empty(count), empty(count)
+    for rows in spans(count):
+        weight[rows], slope[rows] = function(residual[rows] / width)
+        let_go(weight, slope, residual)
+    return weight, slope
+
+
+def product(one: Floats, other: Floats) -> Floats:
+    """Return two columns (n,) multiplied."""
+    return computed(len(one), lambda rows: one[rows] * other[rows])
+
+
+def added(one: Floats, other: Floats) -> Floats:
+    """Return the sum of two columns (n,)."""
+    return computed(len(one), lambda rows: one[rows] + other[rows])
+
+
+def farthest(change: Floats) -> float:
+    """Return the largest of some values (k,), either way."""
+    return max(float(np.max(change)), -float(np.min(change)))
 
 
 def scale_of(residual: Floats) -> float:
@@ -148,8 +173,8 @@ def quadratic_model(matrix: Design | Floats, residual: Floats, loss: str, width:
     """Return the quadratic that a loss looks like at `residual` (n,)."""
     design = as_design(matrix)
     residual = design.kept(residual)
-    weight, slope = LOSSES[loss](residual / width)
-    score = weight * residual
+    weight, slope = terms(loss, residual, width)
+    score = product(weight, residual)
     return QuadraticModel(
         design.normal(slope), -design.pull(score), float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope))
     )

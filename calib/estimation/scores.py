@@ -8,16 +8,18 @@ follows from the range's place. No matrix of ranges by parameters is ever built:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from calib.estimation.design import Design, Runs
+from calib.estimation.design import PIECES_AT_ONCE, Design, Runs
+from calib.long_columns import ROWS_AT_ONCE, let_go, spans
 from uwblink.arrays import Floats, Ints
 
+EVERY: Final = slice(None)
 _NOTHING: Final = np.zeros((0, 0))
 
 
@@ -65,9 +67,21 @@ class Scores:
         place = np.zeros(len(self.design.counts), dtype=np.int64) if self.place is None else self.place
         return self.design.given(np.repeat(place, self.design.counts))
 
-    def known(self) -> Floats:
-        """Return what each range knows of its residual (n,), in 1/m^2."""
-        return self.score * self.score if self.curvature is None else self.curvature
+    def known(self, rows: slice = EVERY) -> Floats:
+        """Return what each range knows of its residual (n,), in 1/m^2, or some of them."""
+        return self.score[rows] * self.score[rows] if self.curvature is None else self.curvature[rows]
+
+    def spans(self, runs: Runs) -> Iterator[tuple[slice, slice]]:
+        """Yield runs, and their rows, as many as are worked on at once."""
+        edges, first = runs.starts, 0
+        while first < len(edges) - 1:
+            last = max(int(np.searchsorted(edges, edges[first] + ROWS_AT_ONCE, side="right")) - 1, first + 1)
+            yield slice(first, last), slice(int(edges[first]), int(edges[last]))
+            first = last
+
+    def let_go(self) -> None:
+        """Leave what lies in files to them."""
+        let_go(self.design.values, self.score, self.curvature, *self.slopes)
 
     def gradient(self) -> Floats:
         """Return the slope of the log likelihood by all parameters."""
@@ -82,17 +96,23 @@ class Scores:
     def sums(self, *, squares: bool = True) -> Sums:
         """Return sums over the ranges, with those of `squares`, from which the information follows."""
         summing = Summing(self.design, len(self.slopes), squares=squares)
-        for blocks, rows in self.design.pieces:
+        for k, (blocks, rows) in enumerate(self.design.passing()):
             summing.add(blocks, rows, self.score[rows], [slope[rows] for slope in self.slopes])
+            if k % PIECES_AT_ONCE == 0:
+                self.let_go()
+        self.let_go()
         return summing.sums(self.place, self.places, self.sorts, self.curvature)
 
     def by_block(self, blocks: Ints, count: int) -> Floats:
         """Return slopes summed within blocks of time (blocks, parameters), of which `blocks` (n,) are the numbers."""
-        found = np.empty((count, self.size))
+        found = np.zeros((count, self.size))
         found[:, : self.design.shape[1]] = self.design.by_group(self.score, blocks, count)
-        every = np.repeat(np.arange(len(self.design.counts)), self.design.counts)
-        for sums, where in zip(self._of_sorts(self.slopes, blocks, every, count), self.slices(), strict=True):
-            found[:, where] = sums
+        for rows in spans(len(self.score)) if self.sorts else ():
+            every = self.design.block_of(rows)
+            some = [slope[rows] for slope in self.slopes]
+            for sums, where in zip(self._of_sorts(some, blocks[rows], every, count), self.slices(), strict=False):
+                found[:, where] += sums
+            let_go(*self.slopes)
         return found
 
     def linked(self, weight: Floats | float, runs: Runs, ends: Sequence[tuple[Ints, float]], count: int) -> Floats:
@@ -101,12 +121,16 @@ class Scores:
         An offset in metres that a group of runs has, times a range's `weight` (n,); each of `ends` says which group of
         `count` a run belongs to (runs,), and with which sign.
         """
-        known, slope = self.known() * weight, self.score * weight
-        sums = np.empty((len(runs.block), self.design.values.shape[0] + len(self.slopes)))
-        for k, column in enumerate([*self.design.values, *self.slopes]):
-            by = known if k < len(self.design.values) else slope
-            sums[:, k] = np.add.reduceat(column * by, runs.starts[:-1])
         own = self.design.values.shape[0]
+        sums = np.empty((len(runs.block), own + len(self.slopes)))
+        for which, rows in self.spans(runs):
+            by = weight[rows] if isinstance(weight, np.ndarray) else weight
+            known, slope = self.known(rows) * by, self.score[rows] * by
+            starts = runs.starts[which] - rows.start
+            for k, column in enumerate([*self.design.values, *self.slopes]):
+                sums[which, k] = np.add.reduceat(column[rows] * (known if k < own else slope), starts)
+            self.let_go()
+            let_go(weight if isinstance(weight, np.ndarray) else None)
         found = np.zeros((count, self.size))
         for group, sign in ends:
             found[:, : self.design.shape[1]] += sign * self.design.grouped(sums[:, :own], group, count, runs.block)

@@ -10,13 +10,14 @@ import numpy as np
 from calib.estimation.design import Design
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
-from calib.estimation.losses import LOSSES, MIXTURE
+from calib.estimation.losses import MIXTURE
 from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
 from calib.estimation.persistence import Persistence, lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
-from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of
+from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of, terms
 from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import reml_penalty, unsure
+from calib.long_columns import computed
 from uwblink.arrays import Floats
 
 LASTING: Final = 1.5
@@ -91,7 +92,7 @@ def solve(
         return _one_after_the_other(problem, loss, scale_m, reference)
     robust = "cauchy" if loss == MIXTURE else loss
     start, steps = _pilot(problem, robust, scale_m)
-    residual = problem.error + problem.design @ start
+    residual = problem.residuals(start)
     far = _farthest_pair(problem, residual)
     width = scale_m or scale_of(residual)
     near = quadratic_model(problem.design, residual, robust, width)
@@ -120,7 +121,7 @@ def solve(
     columns = len(parameters)
     shares = [_of_curve(prior[:columns, :columns], curve) for _, curve in problem.curves()]
     covariance = known.covariance + unsure(inverse[:columns, :columns], parameters, shares)
-    residual = problem.error + problem.design @ parameters
+    residual = problem.residuals(parameters)
     return Solved(
         parameters=stated @ parameters,
         covariance=stated @ covariance @ stated.T,
@@ -161,8 +162,8 @@ def _slopes(design: Design, found: Solution, loss: str, ridge: Floats) -> tuple[
     its bias too.
     """
     residual = design.kept(found.residuals)
-    weight, slope = LOSSES[loss](residual / found.scale)
-    score = -weight * residual
+    weight, slope = terms(loss, residual, found.scale)
+    score = computed(len(residual), lambda rows: -weight[rows] * residual[rows])
     scores = Scores(design=design, score=score, curvature=slope)
     dispersion = float(score @ score) / max(float(slope.sum()), 1e-9 * len(slope))
     return scores, inverse_of(scores.information() + ridge), dispersion * ridge

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 
-from calib.calibration.parts import CorrectedRanges
 from calib.ranges import STATIC, Ranges
 
 MANY_MISSING: Final = 0.05
@@ -14,7 +13,7 @@ MANY_OUTLIERS: Final = 0.4
 SHORT_S: Final = 25.0
 
 
-def warnings_of(ranges: Ranges, applied: CorrectedRanges, inliers: float, free: list[list[int]]) -> list[str]:
+def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]]) -> list[str]:
     """Return sentences, the gravest first; `inliers` is the share of ranges within three sigmas."""
     found = []
     if free:

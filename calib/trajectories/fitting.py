@@ -220,7 +220,7 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, riv
         *found.doubts,
         *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
-        *warnings_of(ranges, applied, float(np.mean(inliers)), []),
+        *warnings_of(ranges, float(np.mean(inliers)), []),
     ]
     provenance = _provenance(climbed, problem, found, asked) | {
         "inliers": int(np.count_nonzero(inliers)),
