@@ -11,6 +11,9 @@ from calib.estimation import pair_mixture
 from calib.samples import sample_flight
 
 ROWS = 700
+SAME = 1e-8
+"""Sums in another order end in other last digits, and with them where a search comes to rest, in ns and metres."""
+
 SETTINGS = [
     {},
     {"loss": "cauchy"},
@@ -43,14 +46,14 @@ def test_a_fit_of_columns_in_files_is_that_of_columns_in_memory(monkeypatch, set
     one, other = plain.calibration, found.calibration
     assert found.warnings == plain.warnings
     for tag, delay in one.delays_ns.items():
-        assert other.delays_ns[tag] == pytest.approx(delay, abs=1e-9)
-        assert other.delays_std_ns[tag] == pytest.approx(one.delays_std_ns[tag], abs=1e-9)
+        assert other.delays_ns[tag] == pytest.approx(delay, abs=SAME)
+        assert other.delays_std_ns[tag] == pytest.approx(one.delays_std_ns[tag], abs=SAME)
     for name in ("bias_curve", "sigma_curve"):
         ours, theirs = (np.array(getattr(c, name).coefficients) for c in (other, one))
-        np.testing.assert_allclose(ours, theirs, atol=1e-8)
+        np.testing.assert_allclose(ours, theirs, atol=3 * SAME)
     for pair, offset in one.pair_offsets.items():
-        assert other.pair_offsets[pair].offset_m == pytest.approx(offset.offset_m, abs=1e-9)
-    np.testing.assert_allclose(found.residuals_m, plain.residuals_m, atol=1e-8)
+        assert other.pair_offsets[pair].offset_m == pytest.approx(offset.offset_m, abs=SAME)
+    np.testing.assert_allclose(found.residuals_m, plain.residuals_m, atol=3 * SAME)
     np.testing.assert_array_equal(found.inliers, plain.inliers)
 
 
