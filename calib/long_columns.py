@@ -87,7 +87,7 @@ def picked(column: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
     """Return some rows of a column (n,), as `column[rows]` does; one value for all of them stays one."""
     if column.strides == (0,) and len(column):
         return np.broadcast_to(np.asarray(column[0]), np.arange(len(column))[rows].shape)
-    if len(column) < MANY or isinstance(rows, slice):
+    if len(column) < MANY or column.ndim > 1 or isinstance(rows, slice):
         return np.asarray(column[rows])
     where = np.flatnonzero(rows).astype(np.int32 if len(column) < WIDE else np.int64) if rows.dtype == bool else rows
     found = empty(len(where), column.dtype)

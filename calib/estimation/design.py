@@ -116,7 +116,7 @@ class Design:
         """Return values of kept rows (n,) in the order in which rows were given."""
         if self.order is None:
             return kept
-        found = empty(len(kept), kept.dtype)
+        found = empty(len(kept), kept.dtype) if kept.ndim == 1 else np.empty_like(kept)
         found[self.order] = kept
         let_go(found)
         return found
