@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import duckdb
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.ranges import COLUMNS, Ranges
 from calib.samples import DELAYS_NS, sample_flight
 from calib.sources import load_flight, load_ranges
+from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges
@@ -196,4 +198,17 @@ def test_what_a_file_says_was_planted_has_its_form(planted, tmp_path):
         recording.append_poses(flight.poses)
         recording.append_exchanges(flight.exchanges)
     with pytest.raises(BadInputError, match=rf"^f\.uwb: planted: {next(iter(planted))}: found "):
+        load_ranges(tmp_path / "f.uwb")
+
+
+@pytest.mark.parametrize("column", ["time_ns", "body"])
+def test_poses_without_time_or_body_are_refused_in_one_line(tmp_path, column):
+    flight = sample_flight(10)
+    with Recording.create(tmp_path / "f.uwb") as recording:
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(flight.exchanges)
+    with duckdb.connect(str(tmp_path / "f.uwb")) as db:
+        db.execute(f"UPDATE poses SET {column} = NULL WHERE body = ?", [flight.tags[0].body])
+    with pytest.raises(RecordingError, match="table poses: a body without a name, or none"):
         load_ranges(tmp_path / "f.uwb")

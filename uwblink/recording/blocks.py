@@ -51,10 +51,12 @@ class PoseWindows:
     """The poses of a recording by stretches of time; `spans` are first and last time, and number, of each body's."""
 
     def __init__(self, store: Store) -> None:
-        """Read from an open file."""
+        """Read from an open file; raises `RecordingError` for a body without a name, or without any time."""
         self._store = store
         # Numbers instead of words: words of millions of rows take longer than everything else.
         rows = store.rows("SELECT hash(body), body, min(time_ns), max(time_ns), count(*) FROM poses GROUP BY body")
+        if any(None in row for row in rows):
+            raise RecordingError(f"{store.path}: table poses: a body without a name, or none of whose poses has a time")
         rows.sort()
         self._codes = np.array([row[0] for row in rows], dtype=np.uint64)
         self._names = np.array([str(row[1]) for row in rows], dtype=np.str_)
