@@ -103,11 +103,12 @@ def fields_of(text: str, where: str) -> dict[str, Any]:
     """Return what a `Calibration` is made of, by its fields; raises `BadInputError` that says `where`, and the key."""
     read = _reader(text, where)
     return {
+        "lift": _one_of(read, "lift", LIFTS, where),
+        "power_at": _one_of(read, "power_at", POWER_AT, where) if read.has("power_at") else "exchange",
         "delays_ns": read.delays("delays_ns"),
         "delays_std_ns": read.delays("delays_std_ns", missing=math.inf),
         "loss": read.word("loss"),
         "scale_ns": read.number("scale_ns"),
-        "lift": _one_of(read, "lift", LIFTS, where),
         "alpha_dbm": read.number("alpha_dbm"),
         "speed_of_light": read.number("speed_of_light"),
         "bias_curve": read.curve("bias_curve"),
@@ -115,7 +116,6 @@ def fields_of(text: str, where: str) -> dict[str, Any]:
         "provenance": read.table("provenance"),
         "uncertainty": _uncertainty(read),
         "groups": _groups(read),
-        "power_at": _one_of(read, "power_at", POWER_AT, where) if read.has("power_at") else "exchange",
         "errors": read_errors(read.inside("errors")) if read.has("errors") else None,
         "pair_offsets": offsets_from(read) if read.has("pair_offsets") else {},
     }
