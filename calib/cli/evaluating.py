@@ -139,14 +139,17 @@ def localize(
     settings = Settings(velocity_std_mps=process_noise, seeds=seeds)
     with waiting("localizing"):
         found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
+    # What is printed first: where it cannot be said, nothing is written.
+    told = (
+        json.dumps(localization_json(found), indent=1)
+        if as_json
+        else localization_text(found, summarize(found), settings)
+    )
     if tum:
         write_tum(found, tum, force=force)
     if figures:
         write_track_figures(found, figures, force=force)
-    if as_json:
-        typer.echo(json.dumps(localization_json(found), indent=1))
-        return
-    typer.echo(localization_text(found, summarize(found), settings))
+    typer.echo(told)
 
 
 def _onboard(
@@ -165,13 +168,14 @@ def _onboard(
     settings = OnboardSettings(model=model)
     with waiting("localizing"):
         found = [one for path in recordings for one in localize_onboard(path, known, settings)]
+    told = json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings)
     if tum:
         write_onboard_tum(found, tum, force=force)
     if figures:
         from calib.report import write_onboard_figures
 
         write_onboard_figures(found, figures, force=force)
-    typer.echo(json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings))
+    typer.echo(told)
 
 
 def doctor(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.errors import UnanswerableError
 from calib.evaluation.tracking import FILTERS, Localization
 from uwblink.arrays import Floats
 
@@ -34,13 +35,19 @@ class Summary:
 
 
 def summarize(found: list[Localization]) -> Summary:
-    """Average over bodies and recordings, each counting the same, as in the paper."""
+    """Average over bodies and recordings, each counting the same, as in the paper.
+
+    Raises `UnanswerableError` where the filter took no range at all.
+    """
     filters = [name for name in FILTERS if all(name in one.tracks for one in found)]
     means = {name: np.mean([one.rmse_m[name] for one in found], axis=0) for name in filters}
     rmse = {name: float(np.mean(over)) for name, over in means.items()}
     last = [one.tracks["variance"] for one in found]
     nis = np.concatenate([track.nis[track.accepted] for track in last])
     nees = np.concatenate([track.nees for track in last])
+    if not len(nis):
+        names = ", ".join(f"{one.source}: {one.body}" for one in found)
+        raise UnanswerableError(f"{names}: no range agrees with the track within its gate; look at `calib doctor`")
     return Summary(
         rmse_m=rmse,
         spread_m={name: float(np.std(over, ddof=1)) if len(over) > 1 else np.nan for name, over in means.items()},

@@ -82,6 +82,12 @@ def test_a_filter_that_trusts_its_ranges_too_much_is_found_out(flights):
     assert found.nees > found.nees_bounds[1]
 
 
+def test_a_filter_that_takes_no_range_has_no_summary(flights):
+    flight, calibration = clean(flights["test1"])
+    with pytest.raises(UnanswerableError, match="no range agrees with the track"):
+        summarize(localize(flight, calibration, Settings(gate=1e-12, seeds=1)))
+
+
 def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights):
     calibration = fit(flights["train"].ranges).calibration
     found = [one for name in ("test1", "test2") for one in localize(flights[name], calibration, Settings(seeds=2))]
