@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from hashlib import sha256
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -19,15 +18,12 @@ from calib.planted import check_planted
 from calib.ranges import COLUMNS, Ranges, columns_of, usable_rows
 from calib.single_sided import Terms, left_in, skew_terms
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Poses
-from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, names_in
 
 FINGERPRINT: Final = 32
 """Digits of a hash that tells exchanges from all others."""
 
 EXCHANGES_AT_ONCE: Final = 131_072
-POSES_AT_ONCE: Final = 500_000
 
 
 def reported_twice(exchanges: Exchanges) -> bool:
@@ -97,15 +93,14 @@ class _Reading:
         most = recording.count("exchanges")
         self._columns, self._range_m = _Columns(most), empty(most)
         self._times, self._terms, self._asked = sha256(), list[Terms](), Asked()
-        self._tags, self._truth = recording.tags(), _PosesAround(recording)
+        self._tags, self._windows = recording.tags(), recording.pose_windows()
         planted = recording.meta().get("planted")
         self._planted = planted if isinstance(planted, dict) and planted else None
 
     def add(self, block: Exchanges) -> None:
         """Take some more exchanges."""
         complete = bool(np.isfinite(block.truth_m).all())
-        for part in [block] if complete else self._truth.parts(block):
-            poses = None if complete else self._truth.around(part)
+        for part, poses in [(block, None)] if complete else self._windows.beside(block):
             self._keep(columns_of(part, part.truth_m, poses, self._tags))
         self._times.update(np.ascontiguousarray(block.time_ns).data)
         self._range_m[self._count : self._count + len(block)] = block.range_m
@@ -139,24 +134,3 @@ class _Reading:
             recordings=((name, found.hexdigest()[:FINGERPRINT]),),
             **self._columns.found(),
         )
-
-
-class _PosesAround:
-    """The poses that exchanges fall between."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._windows = recording.pose_windows()
-        self._rate_hz = sum(1e9 * count / max(last - first, 1) for first, last, count in self._windows.spans.values())
-
-    def parts(self, block: Exchanges) -> list[Exchanges]:
-        """Return exchanges in parts, so that there are not too many poses around any."""
-        seconds = float(np.ptp(block.time_ns)) * 1e-9
-        count = min(int(seconds * self._rate_hz / POSES_AT_ONCE) + 1, len(block))
-        edges = (np.arange(count + 1) * len(block) // count).tolist()
-        return [block[begin:end] for begin, end in pairwise(edges)]
-
-    def around(self, part: Exchanges) -> Poses:
-        """Return the poses between which exchanges fall, and those next to them."""
-        # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
-        later = int(2**part.bits * TICK_S * 0.5e9) + 1
-        return self._windows.around(int(part.time_ns.min()), int(part.time_ns.max()) + later)

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib import long_columns, recorded
+from calib import long_columns
 from calib.errors import UnanswerableError
 from calib.long_columns import empty, joined, let_go, picked
 from calib.ranges import APART, COLUMNS, Ranges
 from calib.recorded import read_ranges
 from calib.samples import sample_flight
+from uwblink.recording import blocks
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 
@@ -77,7 +78,7 @@ def test_blocks_of_any_size_make_the_ranges_of_the_whole(tmp_path, monkeypatch):
     assert whole.excluded["no power"] > 5
     assert whole.left_skew is not None
     monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**7)
-    monkeypatch.setattr(recorded, "POSES_AT_ONCE", 300)
+    monkeypatch.setattr(blocks, "POSES_AT_ONCE", 300)
     with Recording.open(path) as recording:
         for rows in (37, ROWS - 1, 10 * ROWS):
             assert_same(read_ranges(recording, "it", need_power=True, rows=rows), whole)
@@ -95,20 +96,32 @@ def test_columns_of_files_are_those_of_memory(tmp_path, monkeypatch):
     assert_same(found[np.arange(len(found)) % 3 > 0], whole[np.arange(len(whole)) % 3 > 0])
 
 
+def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
+    """A hundred anchors have a pose each: thousands of exchanges are read in one part, not one by one."""
+    flight = sample_flight(3000)
+    path = written(tmp_path / "it.uwb", flight.exchanges, flight.poses, flight.tags)
+    with Recording.open(path, update=True) as recording:
+        time_ns, names = np.full(100, int(flight.poses.time_ns[0])), np.array([f"anchor{k}" for k in range(100)])
+        recording.append_poses(Poses(time_ns, names, np.ones((100, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (100, 1))))
+    with Recording.open(path) as recording:
+        parts = [len(part) for part, _ in recording.pose_windows().beside(recording.exchanges())]
+    assert parts == [3000]
+
+
 def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeypatch):
     flight = sample_flight(3000)
     path = written(tmp_path / "it.uwb", flight.exchanges, flight.poses, flight.tags)
     held: list[int] = []
     monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**8)
-    monkeypatch.setattr(recorded, "POSES_AT_ONCE", len(flight.poses) // 20)
-    around = recorded._PosesAround.around
+    monkeypatch.setattr(blocks, "POSES_AT_ONCE", len(flight.poses) // 20)
+    around = blocks.PoseWindows.around
 
-    def watched(self, part):
-        found = around(self, part)
+    def watched(self, start_ns, end_ns):
+        found = around(self, start_ns, end_ns)
         held.append(len(found))
         return found
 
-    monkeypatch.setattr(recorded._PosesAround, "around", watched)
+    monkeypatch.setattr(blocks.PoseWindows, "around", watched)
     with Recording.open(path) as recording:
         found = read_ranges(recording, "it", need_power=True)
     assert found is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -12,10 +13,13 @@ from uwblink.errors import RecordingError
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.schema import Poses
 from uwblink.recording.store import Store
+from uwblink.ticks import TICK_S
 from uwblink.twr import COLUMNS, Exchanges
 
 ROWS_AT_ONCE: Final = 131_072
 """A little more than DuckDB keeps together."""
+
+POSES_AT_ONCE: Final = 500_000
 
 MARGIN_NS: Final = 1_000_000_000
 """Poses are looked for so far before and after a stretch of time, and farther where a body has none there."""
@@ -61,6 +65,26 @@ class PoseWindows:
         self._codes = np.array([row[0] for row in rows], dtype=np.uint64)
         self._names = np.array([str(row[1]) for row in rows], dtype=np.str_)
         self.spans = {str(body): (int(first), int(last), int(count)) for _, body, first, last, count in rows}
+
+    def beside(self, exchanges: Exchanges) -> Iterator[tuple[Exchanges, Poses]]:
+        """Yield exchanges in parts, in their order, each with the poses between which its ranges are.
+
+        There are as many parts as it takes that none has more than about half a million poses around it.
+        """
+        if not len(exchanges):
+            return
+        # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
+        later = int(2**exchanges.bits * TICK_S * 0.5e9) + 1
+        expected = self._expected(int(exchanges.time_ns.min()), int(exchanges.time_ns.max()))
+        parts = min(int(expected / POSES_AT_ONCE) + 1, len(exchanges))
+        for begin, end in pairwise((np.arange(parts + 1) * len(exchanges) // parts).tolist()):
+            part = exchanges[begin:end]
+            yield part, self.around(int(part.time_ns.min()), int(part.time_ns.max()) + later)
+
+    def _expected(self, start_ns: int, end_ns: int) -> float:
+        """Return about how many poses there are in a stretch of time, if those of a body lie evenly."""
+        shared = ((min(last, end_ns) - max(first, start_ns), last - first, n) for first, last, n in self.spans.values())
+        return sum(count * max(inside, 0) / whole for inside, whole, count in shared if whole)
 
     def around(self, start_ns: int, end_ns: int) -> Poses:
         """Return the poses from `start_ns` to `end_ns`, and those next to them on either side, in order of time.

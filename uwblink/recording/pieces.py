@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses
-from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges
 
 ROWS_AT_ONCE: Final = 50_000
@@ -21,7 +20,6 @@ ROWS_AT_ONCE: Final = 50_000
 READING_MB: Final = 300
 """Of a file that is read in pieces so much is kept in memory."""
 
-POSES_AROUND: Final = 500_000
 TIMED: Final = ("exchanges", "poses", "imu", "height", "temperature", "corrected", "faults")
 ENDS: Final = ("time_ns", "initiator", "target")
 """By which rows of `corrected` are those of `exchanges`."""
@@ -74,10 +72,5 @@ def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Pose
     Distances at the exchanges' times, and at the middles of their messages, are what they are with all poses.
     """
     windows = recording.pose_windows()
-    rate_hz = sum(1e9 * count / max(last - first, 1) for first, last, count in windows.spans.values())
     for block in recording.exchange_blocks():
-        parts = min(int(float(np.ptp(block.time_ns)) * 1e-9 * rate_hz / POSES_AROUND) + 1, len(block))
-        for begin, end in pairwise((np.arange(parts + 1) * len(block) // parts).tolist()):
-            part = block[begin:end]
-            later = int(2**part.bits * TICK_S * 0.5e9) + 1
-            yield part, windows.around(int(part.time_ns.min()), int(part.time_ns.max()) + later)
+        yield from windows.beside(block)
