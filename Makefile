@@ -27,8 +27,8 @@ demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/repo
 	$(BIN)/calib evaluate demo/test1.uwb demo/test2.uwb -c demo/calibration.json
 	$(BIN)/calib report demo/train.uwb --tests demo/test1.uwb demo/test2.uwb -o demo/report.html --force
 
-test: setup ## run the whole test suite, on two cores
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+test: setup ## run the whole test suite; four processes, for two cores: many tests wait for boards
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 docs: setup ## build the documentation site into docs/_build/html; warnings are errors (a minute)
 	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs docs/_build/html
@@ -36,7 +36,7 @@ docs: setup ## build the documentation site into docs/_build/html; warnings are 
 	@echo "open docs/_build/html/index.html"
 
 coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=term-missing
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder --cov --cov-report=term-missing
 
 rooms: setup ## draw the rooms into docs/architecture.md from the imports
 	$(BIN)/python -m tests.rooms
@@ -46,7 +46,7 @@ lowest newest: ## run the whole test suite on the lowest versions that pyproject
 	$(PYTHON) -m tests.bounds $@ > .venv-$@/requirements.txt
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --upgrade -r .venv-$@/requirements.txt
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation .
-	.venv-$@/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	.venv-$@/bin/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 fuzz: setup ## run commands on 2000 damaged files and options (10 minutes)
 	$(BIN)/python -m tests.fuzz.commands
@@ -79,8 +79,8 @@ ratios: setup ## fail where the packages take far longer than plain scripts (1 m
 bench-large: setup ## measure a calibration of 3.8 million exchanges (two minutes, 2 GB)
 	$(BIN)/python -m benchmarks.large
 
-bench-long: setup ## fit a recording of 50 million exchanges (half an hour, 25 GB of disk)
-	$(BIN)/python -m benchmarks.long_flight
+bench-fifty: setup ## fit a recording of 50 million exchanges (half an hour, 25 GB of disk)
+	$(BIN)/python -m benchmarks.fifty_million
 
 bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 	$(BIN)/python -m benchmarks.workbench
@@ -88,9 +88,9 @@ bench-workbench: setup ## measure engines, workers and Dask (2 minutes)
 bench-stream: setup ## measure how late streamed ranges are (15 s)
 	$(BIN)/python -m benchmarks.streaming
 
-bench-long: setup ## record eight hours in virtual time, then all commands on 5.8 million exchanges (half an hour, 2 GB of disk)
-	$(BIN)/python -m benchmarks.long record
-	$(BIN)/python -m benchmarks.long commands
+bench-hours: setup ## record eight hours in virtual time, then all commands on 5.8 million exchanges (half an hour, 2 GB of disk)
+	$(BIN)/python -m benchmarks.hours record
+	$(BIN)/python -m benchmarks.hours commands
 
 bench-import: setup ## measure how long tables and poses take to come in (2 minutes, 1 GB)
 	$(BIN)/python -m benchmarks.importing

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from benchmarks.long import RATE_HZ, AnsweringPorts
+from benchmarks.hours import RATE_HZ, AnsweringPorts
 from uwblink.boards.listeners import Listener
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import Recorder, identify

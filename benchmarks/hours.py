@@ -1,7 +1,7 @@
 """Eight hours of recording at 200 exchanges a second, in virtual time: memory, latency and the commands on the file.
 
-`python -m benchmarks.long record [HOURS]` records from boards that answer at once and cost nothing, so that what is
-measured is the recorder; `python -m benchmarks.long commands [EXCHANGES]` measures show, doctor, fit, apply and export
+`python -m benchmarks.hours record [HOURS]` records from boards that answer at once and cost nothing, so that what is
+measured is the recorder; `python -m benchmarks.hours commands [EXCHANGES]` measures show, doctor, fit, apply and export
 on a flight of that many exchanges with poses, each in a process of its own.
 """
 
@@ -231,7 +231,7 @@ def commands(exchanges: int) -> None:
     """Write a flight of so many exchanges, and measure each command on it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.uwb"
-        subprocess.run([sys.executable, "-m", "benchmarks.long", "write", str(exchanges), str(path)], check=True)
+        subprocess.run([sys.executable, "-m", "benchmarks.hours", "write", str(exchanges), str(path)], check=True)
         growth(path)
         print("| command | processor time | largest memory |")
         print("|---|---|---|")

@@ -1,4 +1,4 @@
-"""Fit a recording that is longer than memory: `python -m benchmarks.long_flight 50000000` writes it and fits it.
+"""Fit a recording that is longer than memory: `python -m benchmarks.fifty_million 50000000` writes it and fits it.
 
 It is the icra2023 training flight over and over, a second apart, each time with other noise on a stamp; written by
 DuckDB alone, so that it takes minutes and not the memory that is to be measured. Time and peak memory are those that
