@@ -27,7 +27,7 @@ from calib.trajectories.attitudes import Attitude
 from calib.trajectories.fitting import Asked, problem_of
 from calib.trajectories.given import Usable, scene_from
 from calib.trajectories.inertial import Inertial
-from calib.trajectories.judging import verdict_on
+from calib.trajectories.judging import beyond_linear, verdict_on
 from calib.trajectories.known_rows import known_rows
 from calib.trajectories.range_rows import range_rows, tape_rows
 from calib.trajectories.scene import Places, Scene
@@ -244,10 +244,9 @@ class Linearised:
         problem, size = self.flight.problem, self.columns.design
         of_ranges = (self.design * self.informed[:, None]).T @ self.design + self.ridge[:size, :size]
         with_truth = self.delays @ _covariance(of_ranges) @ self.delays.T
+        covariance = beyond_linear(self.of_delays, self.flight.scene)
         return Foreseen(
-            tags=tuple(problem.tags),
-            covariance_ns2=self.of_delays,
-            verdict=verdict_on(self.of_delays, with_truth, problem),
+            tags=tuple(problem.tags), covariance_ns2=covariance, verdict=verdict_on(covariance, with_truth, problem)
         )
 
     def tape(self, pair: tuple[int, int], still_s: float) -> tuple[Floats, Floats]:

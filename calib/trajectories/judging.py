@@ -23,6 +23,7 @@ from calib.trajectories.climbing import Climbed
 from calib.trajectories.coarseness import coarseness
 from calib.trajectories.contradictions import contradictions
 from calib.trajectories.doubts import Taken, doubted
+from calib.trajectories.scene import Scene
 from calib.trajectories.taken_curve import unsure_of_curve
 from uwblink.arrays import Floats
 
@@ -38,6 +39,10 @@ Calibrated by simulation (docs/fit-from-ranges.md): intervals beyond were seen n
 
 GROWTH: Final = 3.0
 """Few ranges leave delays less known than that even where distances are given; then so many times as much will do."""
+
+ALONE: Final = 3.0
+"""By geometry alone a fit is linear no further: errors of up to 4.2 of its standard errors were seen, which are so many
+times as large there as linear propagation has them (docs/fit-from-ranges.md)."""
 
 LOOKED_AT: Final = 400
 
@@ -111,6 +116,7 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None, curve: C
     columns, delays, covariance = climbed.columns.design, solved.delays, doubts.covariance_ns2
     if curve is not None:
         covariance = covariance + unsure_of_curve(problem, curve, solved, climbed.informed)
+    covariance = beyond_linear(covariance, climbed.scene)
     ridge = climbed.ridge[:columns, :columns]
     with_truth = delays @ np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + ridge) @ delays.T
     plain = np.linalg.pinv(_information(reduced.design, climbed.informed) + precision[:columns, :columns])
@@ -212,6 +218,11 @@ def _slopes(
     precision = climbed.mixture.precision.copy()
     precision[: len(prior), : len(prior)] = prior
     return scores, inverse_of(scores.information() + precision, len(problem.pairs.ends), len(SPREADS)), precision
+
+
+def beyond_linear(covariance: Floats, scene: Scene) -> Floats:
+    """Return a covariance of delays (tags, tags), wider where geometry alone tells them."""
+    return covariance * ALONE**2 if scene.by_geometry_alone else covariance
 
 
 def verdict_on(covariance: Floats, with_truth: Floats, problem: Problem) -> Verdict:

@@ -64,6 +64,13 @@ class Scene:
         """Return the bodies that stand still at places that are to be found."""
         return [body for body, place in self.still.items() if place is None]
 
+    @property
+    def by_geometry_alone(self) -> bool:
+        """Whether nothing says how far anything is but how ranges between lever arms fit together in space."""
+        given = sum(place is not None for place in self.still.values())
+        told = len(self.places.time_s), len(self.heights.time_s), len(self.inertial), len(self.tapes.told)
+        return given < 2 and not any(told)
+
     def between(self, begin_s: float, end_s: float) -> Scene:
         """Return what lies within a span of time."""
         known = (self.places.time_s >= begin_s) & (self.places.time_s <= end_s)
