@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.error_model import ErrorModel, PairErrors
-from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
+from calib.estimation.mixture_slopes import Errors
+from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
 from calib.estimation.persistence import lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
 from calib.spread import robust_spread

@@ -11,7 +11,8 @@ from calib.estimation.design import Design
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
 from calib.estimation.losses import MIXTURE
-from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
+from calib.estimation.mixture_slopes import Errors
+from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
 from calib.estimation.persistence import Persistence, lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of, terms

@@ -18,12 +18,13 @@ from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.arguments import check_choice, check_fit
-from calib.estimation.fitting import calibration_of
+from calib.estimation.building import build_problem
 from calib.estimation.limits import limits
 from calib.estimation.losses import MIXTURE
 from calib.estimation.plausibility import implausible, one_way
-from calib.estimation.problem import Problem, build_problem
+from calib.estimation.problem import Problem
 from calib.estimation.result import FitResult
+from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
 from calib.sources import Data

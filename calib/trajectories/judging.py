@@ -12,7 +12,7 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
-from calib.estimation.pair_mixture import SPREADS
+from calib.estimation.mixture_start import SPREADS
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import unsure

@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.pair_mixture import Errors, PairMixture, fit_pair_mixture
+from calib.estimation.mixture_slopes import Errors
+from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.reflections import Shape
 from calib.trajectories.range_losses import Reflecting

@@ -7,7 +7,7 @@ import pytest
 
 import calib
 from calib import long_columns
-from calib.estimation import pair_mixture
+from calib.estimation import mixture_slopes, pair_mixture
 from calib.samples import sample_flight
 
 ROWS = 700
@@ -28,11 +28,11 @@ SETTINGS = [
 def in_files(monkeypatch, rows):
     monkeypatch.setattr(long_columns, "MANY", 50)
     monkeypatch.setattr(long_columns, "ROWS_AT_ONCE", rows)
-    for module in ("scores", "pair_mixture"):
+    for module in ("scores", "mixture_slopes"):
         monkeypatch.setattr(f"calib.estimation.{module}.ROWS_AT_ONCE", rows)
-    for module in ("design", "problem"):
+    for module in ("design", "building"):
         monkeypatch.setattr(f"calib.estimation.{module}.ROWS_AT_ONCE", max(rows // 4, 7))
-    for module in ("design", "problem", "scores"):
+    for module in ("design", "building", "scores"):
         monkeypatch.setattr(f"calib.estimation.{module}.PIECES_AT_ONCE", 2)
 
 
@@ -75,13 +75,13 @@ def test_columns_in_files_are_let_go_of_while_a_fit_goes_on(monkeypatch):
     flight = sample_flight(20_000, seed=4)
     in_files(monkeypatch, 2000)
     seen = []
-    sums = pair_mixture._sums
+    sums = mixture_slopes.sums_at
 
     def watched(*given, **settings):
         seen.append(mapped())
         return sums(*given, **settings)
 
-    monkeypatch.setattr(pair_mixture, "_sums", watched)
+    monkeypatch.setattr(pair_mixture, "sums_at", watched)
     assert calib.fit(flight, loss="mixture").success
     size, resident = seen[-1]
     assert size > 20_000 * 100

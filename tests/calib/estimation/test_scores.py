@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import exponnorm
 
 from calib.estimation.design import Design
-from calib.estimation.pair_mixture import Errors, Layout, _sums, fit_pair_mixture
+from calib.estimation.mixture_slopes import Errors, Layout, sums_at
+from calib.estimation.pair_mixture import fit_pair_mixture
 from calib.estimation.reflections import Shape, expected
 from calib.estimation.scores import Scores, Sort, inverse_of
 
@@ -24,11 +25,11 @@ def test_slopes_are_those_of_the_likelihood():
     theta = rng.normal(0, 0.1, layout.slices()["pair_mean"].stop)
     for name, start in (("mean", np.log(0.3)), ("least", np.log(0.05)), ("outliers", -4), ("cell_noise", -2.4)):
         theta[layout.slices()[name]] += start
-    sums, _ = _sums(some, layout, theta, squares=False)
+    sums, _ = sums_at(some, layout, theta, squares=False)
     step, found = 1e-6, []
     for k in range(len(theta)):
         moved = np.eye(len(theta))[k] * step
-        up, down = (_sums(some, layout, at, squares=False)[1] for at in (theta + moved, theta - moved))
+        up, down = (sums_at(some, layout, at, squares=False)[1] for at in (theta + moved, theta - moved))
         found.append((up - down) / (2 * step))
     np.testing.assert_allclose(sums.gradient(), found, rtol=1e-5, atol=1e-4)
 

@@ -12,9 +12,9 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation import solver
+from calib.estimation.building import build_problem
 from calib.estimation.fitting import fit
 from calib.estimation.pair_mixture import fit_pair_mixture
-from calib.estimation.problem import build_problem
 from calib.estimation.robust import quadratic_model, robust_fit
 from calib.estimation.smoothing import reml_penalty
 from calib.estimation.solver import solve
