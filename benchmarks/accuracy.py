@@ -43,7 +43,8 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
     from calib.evaluation.statistics import evaluate
     from calib.sources import load_ranges
     from uwbsim.scenario.loading import load as load_scenario
-    from uwbsim.simulation.run import simulate, write
+    from uwbsim.simulation.run import simulate
+    from uwbsim.simulation.simulated import write
 
     settings = [f"run.seed={seed}", f"radio.multipath.share={share}"]
     settings += [f"run.duration_s={duration_s}"] if duration_s else []

@@ -23,7 +23,8 @@ from benchmarks.fidelity_errors import (
 from uwblink.ticks import TICK_S, elapsed
 from uwblink.twr import intervals, raw_range, truncate4
 from uwbsim.scenario.loading import load as load_scenario
-from uwbsim.simulation.run import Simulated, simulate
+from uwbsim.simulation.run import simulate
+from uwbsim.simulation.simulated import Simulated
 
 ROOT = Path(__file__).parents[1]
 ICRA = ROOT / "scenarios" / "icra2023"

@@ -22,7 +22,7 @@ from uwblink.importers import import_recording, read_source
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import delay_weights, raw_range
 from uwbsim import twin
-from uwbsim.simulation.run import Simulated, write
+from uwbsim.simulation.simulated import Simulated, write
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("UWBCAL_DATA", ROOT.parent / "shared" / "data"))

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from uwbsim.scenario.loading import load
     from uwbsim.scenario.model import Scenario
     from uwbsim.scenario.shipped import shipped_scenarios
-    from uwbsim.simulation.run import Simulated, simulate
+    from uwbsim.simulation.run import simulate
+    from uwbsim.simulation.simulated import Simulated
     from uwbsim.simulation.through_wire import through_wire
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
@@ -64,7 +65,7 @@ _HOMES: Final = {
     "Scenario": "uwbsim.scenario.model",
     "ScenarioError": "uwbsim.errors",
     "Server": "uwbsim.boards.server",
-    "Simulated": "uwbsim.simulation.run",
+    "Simulated": "uwbsim.simulation.simulated",
     "State": "uwbsim.protocols.single_state",
     "Twin": "uwbsim.twins.fitting",
     "UwbsimError": "uwbsim.errors",

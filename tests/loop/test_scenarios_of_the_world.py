@@ -11,7 +11,8 @@ from calib.evaluation.statistics import evaluate, pair_rows
 from calib.sources import load_ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate, write
+from uwbsim.simulation.run import simulate
+from uwbsim.simulation.simulated import write
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 

@@ -15,7 +15,7 @@ from uwblink.wire.bulk import ColumnDecoder
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import RangeReport
 from uwbsim.errors import ScenarioError
-from uwbsim.simulation.run import Simulated
+from uwbsim.simulation.simulated import Simulated
 from uwbsim.units import NS_PER_S
 
 

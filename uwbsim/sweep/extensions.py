@@ -14,7 +14,7 @@ from typing import Any, Final
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS, register_protocol
 from uwbsim.errors import ParameterError
-from uwbsim.simulation.run import Simulated
+from uwbsim.simulation.simulated import Simulated
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
 
 Evaluate = Callable[[Simulated], Mapping[str, Any]]

@@ -12,7 +12,8 @@ from uwblink.recording.schema import Fault
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import STAMPS, board_range
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import Simulated, simulate, write
+from uwbsim.simulation.run import simulate
+from uwbsim.simulation.simulated import Simulated, write
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 

@@ -52,7 +52,8 @@ def test_what_cannot_be_added(known):
 
 def test_the_scenario_of_a_new_tag(tmp_path, known):
     from uwbsim.scenario.loading import load as read
-    from uwbsim.simulation.run import simulate, write
+    from uwbsim.simulation.run import simulate
+    from uwbsim.simulation.simulated import write
 
     train = tmp_path / "train.uwb"
     write(simulate(read(ROOT / "scenarios" / "icra2023" / "train.toml", ["run.duration_s=120"])), train)

@@ -13,7 +13,8 @@ from calib.estimation.passive_listeners import heard_delays
 from calib.sources import load_ranges
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate, write
+from uwbsim.simulation.run import simulate
+from uwbsim.simulation.simulated import write
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 PASSIVE = [f"tags.{k}.passive=true" for k in range(6)]

@@ -18,7 +18,8 @@ from calib.evaluation.tracking import Settings
 from calib.samples import sample_flight
 from calib.sources import Flight, load_flight
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate, write
+from uwbsim.simulation.run import simulate
+from uwbsim.simulation.simulated import write
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios" / "icra2023"
 

@@ -14,7 +14,8 @@ from uwblink.importers.table import Table
 from uwblink.recording.file import Recording
 from uwbsim.boards.live_poses import LivePoses
 from uwbsim.scenario.loading import load
-from uwbsim.simulation.run import simulate, write
+from uwbsim.simulation.run import simulate
+from uwbsim.simulation.simulated import write
 
 ROOT = Path(__file__).parents[3]
 TEST1 = ROOT / "scenarios" / "icra2023" / "test1.toml"
