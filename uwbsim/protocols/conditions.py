@@ -145,3 +145,9 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         detour_s=mean_m / SPEED_OF_LIGHT,
         quantize=radio.quantize,
     )
+
+
+def calibrated(conditions: Conditions) -> Conditions:
+    """Return the same world as a calibration leaves it: no antenna delays, no bias by power, no reflections."""
+    delays = {f"{end}_delay_{side}": 0.0 for end in ("tx", "rx") for side in ("initiator", "target")}
+    return replace(conditions.with_columns(late=0.0, excess=0.0, **delays), multipath=0.0)

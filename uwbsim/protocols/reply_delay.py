@@ -11,8 +11,8 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.comparison import calibrated, chosen, costs
-from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.comparison import chosen, costs
+from uwbsim.protocols.conditions import calibrated, conditions_of
 from uwbsim.protocols.prediction import predict
 from uwbsim.scenario.airtime import TURNAROUND_S
 from uwbsim.scenario.loading import Source, as_scenario

@@ -9,8 +9,9 @@ import pytest
 
 from tests import processes
 from uwblink.protocols.table import PROTOCOLS
-from uwbsim.protocols.comparison import calibrated, compare, costs, over_reply, over_skew, paper_bias_m, winners
-from uwbsim.protocols.conditions import conditions_of
+from uwbsim.protocols.comparison import compare, costs, winners
+from uwbsim.protocols.conditions import calibrated, conditions_of
+from uwbsim.protocols.error_curves import over_reply, over_skew, paper_bias_m
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
 from uwbsim.protocols.reply_delay import optimum
