@@ -109,7 +109,7 @@ SAME = {
 
 ELSEWHERE = {
     "uwblink record --output": "uwblink/boards/test_recorder.py",
-    "uwblink stream --output": "uwblink/boards/test_recorder.py",  # by the same recorder
+    "uwblink stream --output": "test_full_disk.py",
     "uwbsim sweep --output": "uwbsim/sweep/test_machine_faults.py",
     "uwblink cir --plot": "test_full_disk.py",
 }
@@ -180,6 +180,39 @@ def test_poses_for_which_the_disk_has_no_room_leave_the_recording_as_it_was(seed
     after = uwblink.load(path)
     assert len(after.poses) == 0
     assert len(after.exchanges) == len(flight.exchanges)
+
+
+def test_poses_that_fit_into_the_log_alone_are_kept_in_it(seeds, tmp_path):
+    path = tmp_path / "f.uwb"
+    flight = uwblink.load(seeds / "f.uwb")
+    replace(flight, poses=flight.poses[:0]).save(path)
+    source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
+    ended = run("uwblink", "poses", path, *source, folder=tmp_path, most_bytes=path.stat().st_size + 20_000)
+    assert ended.status == 2, ended
+    assert ended.err.count("\n") == 1
+    assert "cannot be completed" in ended.err
+    assert "keep the two together" in ended.err
+    assert {each.name for each in tmp_path.iterdir()} == {"f.uwb", "f.uwb.wal"}
+    after = uwblink.load(path)
+    assert len(after.exchanges) == len(flight.exchanges)
+    assert set(after.poses.body) == {"ifo001", "ifo002"}
+
+
+@pytest.mark.parametrize(("most_bytes", "said", "kept"), [(4_000, "cannot be written (", False), (700_000, "", True)])
+def test_a_stream_for_which_the_disk_has_no_room(tmp_path, most_bytes, said, kept):
+    """It is full when the recording begins, or when all has been written to the log and is put into the file."""
+    with served() as server:
+        words = ["uwblink", "stream", *server.names.values(), "-o", "out.uwb", "--duration", "0.7", "--rate", "100"]
+        ended = run(*words, folder=tmp_path, most_bytes=most_bytes)
+    assert ended.status == 2, ended
+    assert ended.err.count("\n") == 1
+    assert (said or "cannot be completed (") in ended.err
+    if not kept:
+        assert list(tmp_path.iterdir()) == []
+        return
+    assert (tmp_path / "out.uwb").stat().st_size == most_bytes
+    exchanges = uwblink.load(tmp_path / "out.uwb").exchanges
+    assert len(exchanges) == len(ended.out.splitlines()) > 30
 
 
 def test_a_plot_of_a_board_for_which_the_disk_has_no_room(tmp_path):

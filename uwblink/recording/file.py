@@ -24,7 +24,7 @@ from uwblink.recording.schema import (
     standard_meta,
 )
 from uwblink.recording.snapshots import open_snapshot
-from uwblink.recording.soundness import is_locked
+from uwblink.recording.soundness import is_locked, log_of
 from uwblink.recording.store import Store
 from uwblink.recording.writers import TableWriters
 
@@ -88,6 +88,7 @@ class Recording(TableWriters, TableReaders):
             if live:
                 # So that the tables are in the file itself, and only rows ever in the log beside it.
                 recording._store.finish()
+                recording._store.vanishes = False
         except RecordingError:
             _remove(place)
             raise
@@ -138,20 +139,18 @@ class Recording(TableWriters, TableReaders):
 
         Raises `RecordingError` where the disk does not take all of it.
         """
-        if self._partial is None:
-            self._store.close()
-            return
         try:
-            if kind is None:
+            if kind is None and self._store.writes:
                 self._store.finish()
             self._store.close()
-            if kind is None:
+            if kind is None and self._partial:
                 self._partial.replace(self.path)
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be written ({error.strerror})") from error
         finally:
             self._store.close()
-            _remove(self._partial)
+            if self._partial:
+                _remove(self._partial)
 
     def snapshot(self, place: str | os.PathLike[str]) -> None:
         """Write everything committed so far to a new file, while others go on appending; raises `RecordingError`."""
@@ -242,5 +241,5 @@ _APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
 
 
 def _remove(path: Path) -> None:
-    for name in (path, path.with_name(path.name + ".wal")):
+    for name in (path, log_of(path)):
         name.unlink(missing_ok=True)

@@ -34,8 +34,20 @@ def damaged(path: Path, error: Exception) -> RecordingError:
     return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({first_line(error)})")
 
 
+def log_of(path: Path) -> Path:
+    """Return where DuckDB keeps what was committed to a file and is not in the file itself yet."""
+    return path.with_name(path.name + ".wal")
+
+
 def check_length(path: Path) -> None:
-    """Raise `RecordingError` for a file that was cut: DuckDB's are headers and whole blocks, and may still open."""
+    """Raise `RecordingError` for a file that was cut: DuckDB's are headers and whole blocks, and may still open.
+
+    Beside a log it may have any length: a disk that was full while the log was put into it leaves half a block at its
+    end, to which nothing refers, and everything is in the log.
+    """
+    log = log_of(path)
+    if log.exists() and log.stat().st_size:
+        return
     if path.stat().st_size % BLOCK_BYTES != HEADER_BYTES % BLOCK_BYTES:
         raise RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one (its length is odd)")
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from uwblink.errors import RecordingError, RecordingInUseError
 from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
-from uwblink.recording.soundness import check_length, damaged, first_line, is_locked
+from uwblink.recording.soundness import check_length, damaged, first_line, is_locked, log_of
 
 if TYPE_CHECKING:
     import duckdb
@@ -40,14 +40,14 @@ class Store:
     """An open file with the tables of `TABLES`; `path` is what messages call it."""
 
     def __init__(
-        self, connection: duckdb.DuckDBPyConnection, path: Path, size: int = 0, *, hidden: bool = False
+        self, connection: duckdb.DuckDBPyConnection, path: Path, size: int = 0, *, writes: bool, vanishes: bool = False
     ) -> None:
         """Wrap an open connection to a file of `size` bytes, which bounds how long reading may take.
 
-        A `hidden` one has not its name yet, and vanishes where writing fails.
+        It may be one that `writes`; where that fails, the file of one that `vanishes` is removed by its owner.
         """
         self._db, self._second = connection, connection.cursor()
-        self.path, self._hidden = path, hidden
+        self.path, self.writes, self.vanishes = path, writes, vanishes
         self._longest_read_s = longest_read_s(size)
 
     @classmethod
@@ -56,7 +56,7 @@ class Store:
         import duckdb
 
         try:
-            store = cls(duckdb.connect(str(place)), path, hidden=place != path)
+            store = cls(duckdb.connect(str(place)), path, writes=True, vanishes=True)
             # Snapshots are written beside the recording, and nothing ever elsewhere.
             if memory_mb is not None:
                 store.execute(f"SET memory_limit = '{memory_mb}MB'")
@@ -88,7 +88,7 @@ class Store:
                 if not limit:
                     raise
                 connection = duckdb.connect(str(path), read_only=not update, config=config)
-            store = cls(connection, path, size)
+            store = cls(connection, path, size, writes=update)
         except duckdb.ConnectionException as error:
             raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error
         except duckdb.IOException as error:
@@ -118,7 +118,17 @@ class Store:
 
         Closing does so too, and says nothing where it cannot.
         """
-        self.execute("CHECKPOINT")
+        import duckdb
+
+        try:
+            self._db.execute("CHECKPOINT")
+        except duckdb.Error as error:
+            if self.vanishes:
+                raise self._unwritable(error) from error
+            raise RecordingError(
+                f"{self.path}: cannot be completed ({first_line(error)}); is the disk full? Everything is kept, "
+                f"some of it in {log_of(self.path).name} beside it: keep the two together"
+            ) from error
 
     def copy_to(self, place: Path) -> None:
         """Write what is committed to a new file, on a connection of its own; raises `RecordingError`."""
@@ -153,7 +163,7 @@ class Store:
 
         disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
         reason = f"{first_line(error)}){'; is the disk full?' if disk else '.'}"
-        if self._hidden:
+        if self.vanishes:
             return RecordingError(f"{self.path}: cannot be written ({reason} Nothing was written")
         return RecordingError(f"{self.path}: cannot be written any more ({reason} What was written before is kept")
 
