@@ -111,7 +111,7 @@ worlds: setup ## fits in worlds that share nothing with the simulator, into docs
 	$(BIN)/python -m benchmarks.worlds_report
 
 surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/without-motion-capture.md (10 minutes)
-	$(BIN)/python -m benchmarks.surveys
+	$(BIN)/python -m benchmarks.surveys --write
 
 doctor-table: setup ## write docs/doctor.md's table: planted faults, hits and false alarms (15 minutes)
 	$(BIN)/python -W ignore -m benchmarks.doctor

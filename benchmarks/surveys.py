@@ -1,14 +1,18 @@
 """Surveys of boards that stand still, over many seeds: errors of delays beside what was promised, and coverage.
 
-`python -m benchmarks.surveys [SEEDS]` writes the table of docs/without-motion-capture.md (`make surveys`).
+`python -m benchmarks.surveys --write` writes the table of docs/without-motion-capture.md (`make surveys`). With
+`--results FILE` outcomes are kept, a line each, and what stands there is not surveyed again.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import re
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -44,33 +48,34 @@ WORLDS: dict[str, dict[str, Any]] = {
 }
 
 
+HEAD = """\
+| world | seeds | delays, rms | promised | in 95 % | delays left out | refused |
+|---|---|---|---|---|---|---|"""
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """One survey: errors of delays over their standard deviations, errors and promises in ns, or why there are none."""
+    """One survey: errors of delays and their standard deviations in ns, tag by tag, or why there are none."""
 
+    tags: tuple[int, ...] = ()
     errors_ns: tuple[float, ...] = ()
-    scores: tuple[float, ...] = ()
-    promised_ns: tuple[float, ...] = ()
-    left_out: int = 0
+    std_ns: tuple[float, ...] = ()
     refused: str = ""
 
 
-def one(settings: dict[str, Any], seed: int) -> Outcome:
+def one(name: str, seed: int) -> Outcome:
     """Survey one world."""
+    settings = WORLDS[name]
     world = standing_boards(seed, **settings)
     shape = settings["shape"]
     try:
-        result = calib.survey(world.ranges, known="" if shape == "space" else shape)
+        found = calib.survey(world.ranges, known="" if shape == "space" else shape).calibration
     except calib.UnanswerableError as error:
         return Outcome(refused=str(error))
-    found = result.calibration
-    spread = promised(world, DIMENSIONS[shape], settings.get("bias_size_m", 0.0))
-    errors = {tag: delay - world.delays_ns[tag] for tag, delay in found.delays_ns.items()}
     return Outcome(
-        errors_ns=tuple(errors.values()),
-        scores=tuple(error / found.delays_std_ns[tag] for tag, error in errors.items()),
-        promised_ns=tuple(float(spread[tag - 1]) for tag in errors),
-        left_out=len(world.delays_ns) - len(errors),
+        tags=tuple(found.delays_ns),
+        errors_ns=tuple(delay - world.delays_ns[tag] for tag, delay in found.delays_ns.items()),
+        std_ns=tuple(found.delays_std_ns[tag] for tag in found.delays_ns),
     )
 
 
@@ -109,47 +114,73 @@ def promised(world: Standing, dimensions: int, curve_m: float) -> Floats:
     return np.asarray(np.sqrt(np.diag(np.linalg.pinv(information))) / C_M_PER_NS)
 
 
-def row(name: str, outcomes: list[Outcome]) -> str:
-    """Return a row of the table."""
-    errors = np.concatenate([o.errors_ns for o in outcomes])
-    scores = np.concatenate([o.scores for o in outcomes])
-    promised = np.concatenate([o.promised_ns for o in outcomes])
-    refused = sum(bool(o.refused) for o in outcomes)
-    if not len(errors):
+def row(name: str, outcomes: dict[int, Outcome]) -> str:
+    """Return a row of the table from outcomes by seed."""
+    settings = WORLDS[name]
+    some = {seed: found for seed, found in outcomes.items() if not found.refused}
+    refused = len(outcomes) - len(some)
+    if not some:
         return f"| {name} | {len(outcomes)} | - | - | - | - | {refused} |"
-    rms, promise = (float(np.sqrt(np.mean(v**2))) for v in (errors, promised))
-    covered = 100 * float(np.mean(np.abs(scores) < 1.96))
-    left = sum(o.left_out for o in outcomes if not o.refused)
+    errors = np.concatenate([found.errors_ns for found in some.values()])
+    scores = errors / np.concatenate([found.std_ns for found in some.values()])
+    spreads = []
+    for seed, found in some.items():
+        world = standing_boards(seed, **settings)
+        spread = promised(world, DIMENSIONS[settings["shape"]], settings.get("bias_size_m", 0.0))
+        spreads.append(spread[np.array(found.tags) - 1])
+    rms, promise = (float(np.sqrt(np.mean(v**2))) for v in (errors, np.concatenate(spreads)))
+    left = sum(settings["boards"] - len(found.tags) for found in some.values())
     cells = [
         f"{1e3 * rms:.0f} ps",
         f"{1e3 * promise:.0f} ps",
-        f"{covered:.1f} %",
+        f"{100 * float(np.mean(np.abs(scores) < 1.96)):.1f} %",
         str(left),
         str(refused),
     ]
     return f"| {name} | {len(outcomes)} | {' | '.join(cells)} |"
 
 
-def table(seeds: int) -> str:
-    """Return the table, worlds of seeds from 1000 on."""
-    lines = [
-        "| world | seeds | delays, rms | promised | in 95 % | delays left out | refused |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    with ProcessPoolExecutor(2) as workers:
-        for name, settings in WORLDS.items():
-            lines.append(row(name, list(workers.map(partial(one, settings), range(1000, 1000 + seeds)))))
-            print(lines[-1], flush=True)
-    return "\n".join(lines) + "\n"
+def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> dict[int, Outcome]:
+    """Return a world's outcomes by seed (from 1000 on); those in a file of results are taken from there."""
+    wanted = range(1000, 1000 + seeds)
+    stored = {} if results is None else {s: o for s, o in _stored(name, results) if s in wanted}
+    missing = [seed for seed in wanted if seed not in stored]
+    for seed, outcome in zip(missing, pool.map(partial(one, name), missing), strict=True):
+        stored[seed] = outcome
+        if results is not None:
+            with results.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"world": name, "seed": seed, **asdict(outcome)}) + "\n")
+    return dict(sorted(stored.items()))
 
 
-def main() -> int:
-    """Write the table into the page."""
-    text = table(int(sys.argv[1]) if len(sys.argv) > 1 else 50)
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(PLACE.sub(lambda found: found[1] + text + found[2], page), encoding="utf-8")
+def _stored(name: str, results: Path) -> Iterator[tuple[int, Outcome]]:
+    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
+    for line in map(json.loads, lines):
+        if line.pop("world") == name:
+            columns = (tuple(line[key]) for key in ("tags", "errors_ns", "std_ns"))
+            yield line["seed"], Outcome(*columns, refused=line["refused"])
+
+
+def main(argv: list[str]) -> int:
+    """Print the table, and write it into the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--only", default="", help="worlds whose name has this in it")
+    parser.add_argument("--results", type=Path, help="file of outcomes, a line each: what it has is not surveyed again")
+    parser.add_argument("--write", action="store_true", help="write the table into the page")
+    given = parser.parse_args(argv)
+    lines = [HEAD]
+    with ProcessPoolExecutor(given.workers) as pool:
+        for name in WORLDS:
+            if given.only in name:
+                lines.append(row(name, outcomes_of(name, given.seeds, given.results, pool)))
+                print(lines[-1], flush=True)
+    if given.write:
+        page, text = PAGE.read_text(encoding="utf-8"), "\n".join(lines) + "\n"
+        PAGE.write_text(PLACE.sub(lambda found: found[1] + text + found[2], page), encoding="utf-8")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main(sys.argv[1:]))
