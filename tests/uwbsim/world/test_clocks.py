@@ -129,6 +129,14 @@ def test_the_rate_of_a_noisy_clock_is_what_its_reading_gains_over_a_preamble_or_
     assert np.std(found[which == 0]) > 2 / span, "there is noise in it"
 
 
+def test_few_instants_have_the_same_noise_as_many():
+    c = noisy_clocks()
+    time = np.random.default_rng(2).integers(0, 10 * SUBTICKS_PER_SECOND, 500)
+    which = np.arange(500) % 2
+    singly = [c.read(which[k : k + 5], time[k : k + 5]) for k in range(0, 500, 5)]
+    assert np.concatenate(singly).tolist() == c.read(which, time).tolist()
+
+
 def test_runs_may_last_as_long_as_63_bits_count_subticks():
     assert LONGEST_RUN_S == 129_600
     assert (LONGEST_RUN_S + 3600) * SUBTICKS_PER_SECOND + 2**40 * SUBTICKS < 2**63
