@@ -157,8 +157,8 @@ def _stored(name: str, results: Path) -> Iterator[tuple[int, Outcome]]:
     lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
     for line in map(json.loads, lines):
         if line.pop("world") == name:
-            columns = (tuple(line[key]) for key in ("tags", "errors_ns", "std_ns"))
-            yield line["seed"], Outcome(*columns, refused=line["refused"])
+            tags, errors, std = (tuple(line[key]) for key in ("tags", "errors_ns", "std_ns"))
+            yield line["seed"], Outcome(tags, errors, std, line["refused"])
 
 
 def main(argv: list[str]) -> int:

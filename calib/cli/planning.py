@@ -145,6 +145,9 @@ def plan(
     delays_only: Annotated[
         bool, typer.Option("--delays-only", rich_help_panel=FLYING, help="No curve over power will be fitted.")
     ] = False,
+    ports: Annotated[
+        str, typer.Option(help="How the boards' serial ports are called in the commands, as in 'ports/*'.")
+    ] = "PORTS",
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -188,8 +191,8 @@ def plan(
     if output or figures:
         from calib.report import write_plan
 
-        write_plan(found, output, figures, commands=list(_commands(found, boards)), force=force)
-    _print(found, boards, as_json=as_json)
+        write_plan(found, output, figures, commands=list(_commands(found, boards, ports)), force=force)
+    _print(found, list(_commands(found, boards, ports)), as_json=as_json)
 
 
 def _given(used: Mapping[str, Any], others: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -228,37 +231,38 @@ def _robots(boards: str, settings: Mapping[str, Any]) -> Any:
     return [_whole(robot, "robots") for robot in boards.split("/")]
 
 
-def _print(found: calib.Plan | calib.FlightPlan, boards: str, *, as_json: bool) -> None:
+def _print(found: calib.Plan | calib.FlightPlan, commands: list[str], *, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=1))
         return
     typer.echo(str(found))
     typer.echo("\nCommands, one after the other:")
-    for line in _commands(found, boards):
+    for line in commands:
         typer.echo(f"  {line}")
 
 
-def _commands(found: calib.Plan | calib.FlightPlan, boards: str) -> Iterator[str]:
+def _commands(found: calib.Plan | calib.FlightPlan, boards: str, ports: str) -> Iterator[str]:
     """Yield the commands that follow the steps, a line each."""
     import calib
 
     if isinstance(found, calib.FlightPlan):
-        yield from _flight_commands(found, boards)
+        yield from _flight_commands(found, boards, ports)
         return
     for one in found.arrangements:
-        words = f"--pairs all --arrangement {one.name} --duration {found.seconds_each:.0f} -o {one.name}.uwb"
-        yield f"uwblink record PORTS {words}"
-    known = "known.toml" if found.known_beside else found.on
-    shape = f" --known {known}" if known else ""
-    yield f"calib survey {' '.join(f'{one.name}.uwb' for one in found.arrangements)}{shape} -o calibration.json"
+        shape = f" --known {found.on}" if found.on else ""
+        shape += f" --order {','.join(map(str, one.order()))}" if found.on == "line" else ""
+        words = f"--pairs all --rate {found.rate_hz:g} --duration {found.seconds_each:.0f} -o {one.name}.uwb"
+        yield f"uwblink record {ports} --arrangement {one.name}{shape} {words}"
+    beside = " --known known.toml" if found.known_beside else ""
+    yield f"calib survey {' '.join(f'{one.name}.uwb' for one in found.arrangements)}{beside} -o calibration.json"
 
 
-def _flight_commands(found: calib.FlightPlan, boards: str) -> Iterator[str]:
+def _flight_commands(found: calib.FlightPlan, boards: str, ports: str) -> Iterator[str]:
     name = "flight.uwb"
     if found.flown is None:
         name = boards
     else:
-        yield f"uwblink record PORTS --pairs all --duration {found.seconds:.0f} -o {name}"
+        yield f"uwblink record {ports} --pairs all --duration {found.seconds:.0f} -o {name}"
         yield f"uwblink poses {name} --from poses.csv --tags robots.toml"
     usable = found.usable
     words = [f"--poses-until {usable.poses_until_s:g}"]

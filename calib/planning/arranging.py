@@ -21,7 +21,9 @@ from calib.surveys.network import DIMENSIONS
 from calib.surveys.scales import DELAY_SCALE_NS, M_PER_NS, TWO_SIDED, widened
 from uwblink.arrays import Floats
 
-RANGES_A_PAIR: Final = 60
+RANGES_A_PAIR: Final = 20
+"""Noise of 4 cm leaves 9 mm in a mean of so many, which adds a tenth to a pair's constant error of 2 cm."""
+
 FEWEST_S: Final = 30.0
 NAMES: Final = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
@@ -77,6 +79,7 @@ def _promised(choice: Choice, rate_hz: float) -> Plan:
         common_ns=wide * _common(verdict),
         verdict=verdict,
         next_best=tuple(_next_best(choice, total, wide)),
+        rate_hz=rate_hz,
         seconds_each=seconds,
         pair_error_m=given.pair_error_m,
         known_beside=bool(given.anchors) or given.taped > 0,

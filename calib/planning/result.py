@@ -60,6 +60,7 @@ class Plan:
     common_ns: float
     verdict: Verdict
     next_best: tuple[NextBest, ...]
+    rate_hz: float
     seconds_each: float
     pair_error_m: float
     known_beside: bool
@@ -95,6 +96,7 @@ class Plan:
         known = {str(tag): half if math.isfinite(half) else None for tag, half in self.half_ns.items()}
         return {
             "on": self.on,
+            "rate_hz": self.rate_hz,
             "seconds_each": self.seconds_each,
             "pair_error_m": self.pair_error_m,
             "half_interval_ns": known,

@@ -1,6 +1,10 @@
-"""The page on calibrating without motion capture: its commands run as they stand there, and find what was planted."""
+"""The page on calibrating without motion capture: its commands run as they stand there, and find what was planted.
+
+Served boards are those of the scenario on ports in virtual time: a recording begins when they stand in the next place.
+"""
 
 import re
+import shlex
 import shutil
 import tomllib
 from pathlib import Path
@@ -9,78 +13,125 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import calib
 import uwblink
 import uwbsim
 from calib.calibration.model import load_calibration
 from calib.cli.commands import app as calib_app
 from calib.surveys.knowledge import load_knowledge
-from uwbsim.cli.commands import app as uwbsim_app
+from tests import pages
+from uwblink.cli.commands import app as uwblink_app
+from uwbsim.boards.stays import stays_s
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "without-motion-capture.md").read_text(encoding="utf-8")
 SCENARIO = ROOT / "scenarios" / "string" / "string.toml"
-C_M_PER_NS = 0.299702547
+SHORTER = ("--duration 30", "--duration 12")
+"""What a test changes of the page: eight ranges a pair instead of twenty, in a third of the time."""
+
+PLANTED = {tag["id"]: tag["delay_ns"] for tag in tomllib.loads(SCENARIO.read_text())["tags"]}
 
 
-def commands(label):
-    blocks = re.findall(rf"^```sh {label}\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
-    return [line.split() for block in blocks for line in block.splitlines() if line.strip()]
+def blocks(label):
+    return re.findall(rf"^```{label}\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+
+
+COMMANDS = [line for block in blocks("sh survey") for line in pages.lines(block)]
+
+
+class Bench:
+    """The boards of a scenario as `uwbsim serve` has them in a folder, in virtual time."""
+
+    def __init__(self, scenario, link_dir):
+        self.ports = uwbsim.VirtualPorts(uwbsim.load(scenario))
+        self.ports.names = {tag: f"{link_dir}/tag{tag}" for tag in self.ports.names}
+        self.stays = iter(stays_s(self.ports.bench.radios.scenario))
+
+    def record(self, words):
+        """Run `uwblink record` when the boards stand in their next place; patterns of names are spelt out."""
+        begin_s, end_s = next(self.stays)
+        self.ports.bench.advance(int(begin_s * 1e9))
+        names = [name for word in words for name in (self.ports.names.values() if "*" in word else [word])]
+        done = CliRunner().invoke(uwblink_app, names)
+        assert self.ports.now_s() < end_s
+        return done
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
     """The folder after all commands of the tutorial, and what each printed."""
     folder = tmp_path_factory.mktemp("string")
-    shutil.copytree(ROOT / "scenarios", folder / "scenarios")
-    said = {}
+    shutil.copytree(ROOT / "scenarios" / "string", folder / "scenarios" / "string")
+    (taped,) = blocks("toml taped")
+    (folder / "known.toml").write_text(taped)
+    said: dict[str, str] = {}
+    bench = None
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for name, *words in commands("survey"):
-            result = CliRunner().invoke({"calib": calib_app, "uwbsim": uwbsim_app}[name], words)
+        for name, *words in (shlex.split(line.replace(*SHORTER)) for line in COMMANDS):
+            if words[0] == "serve":
+                bench = Bench(words[1], words[words.index("--link-dir") + 1])
+                patch.setattr("uwblink.boards.recorder.SerialPorts", lambda ports=bench.ports: ports)
+                continue
+            result = bench.record(words) if name == "uwblink" else CliRunner().invoke(calib_app, words)
             assert result.exit_code == 0, (name, words, result.output, result.exception)
-            said[words[0]] = result.stdout
+            said.setdefault(words[0], result.stdout)
     return folder, said
 
 
-def test_the_tutorial_finds_what_was_planted(done):
-    folder, said = done
-    known = load_calibration(folder / "delays.json")
-    planted = {str(t["id"]): t["delay_ns"] for t in tomllib.loads(SCENARIO.read_text())["tags"]}
-    apart = np.array([known.delays_ns[int(tag)] - delay for tag, delay in planted.items()])
-    # A shift common to all delays is the curve's constant; apart from it they are found to hundredths of a nanosecond.
-    assert np.abs(apart - apart.mean()).max() < 0.03
-    assert np.all(np.abs(apart.mean()) < 4 * np.array(list(known.delays_std_ns.values())))
-    assert [one["name"] for one in known.provenance["rests_on"]["arrangements"]] == [str(k) for k in range(1, 9)]
-    assert "arrangement 8, on a line" in said["survey"]
-    assert "rests on arrangements 1, 2, 3, 4, 5, 6, 7, 8, on a line" in said["show"]
+def errors_ns(path):
+    """Errors of delays against what was planted, and their covariance; in the order of tags."""
+    found = load_calibration(path)
+    error = np.array([found.delays_ns[tag] - planted for tag, planted in PLANTED.items()])
+    return error, np.array(found.uncertainty.delays_ns2)
+
+
+def test_delays_against_their_mean_are_within_the_promise(done):
+    folder, _ = done
+    error, spread = errors_ns(folder / "calibration.json")
+    plan = calib.plan(6, on="line", size_m=(4.0,), arrangements=8, rate_hz=10.0)
+    assert np.abs(error - error.mean()).max() < min(plan.half_ns.values())
+    # What all share is the curve's constant as well: known as badly as it is said to be.
+    assert 0.2 < np.sqrt(spread.mean()) < 0.3
+    assert abs(error.mean()) < 2.5 * np.sqrt(spread.mean())
+
+
+def test_one_distance_by_tape_settles_what_all_share(done):
+    folder, _ = done
+    error, spread = errors_ns(folder / "taped.json")
+    assert np.sqrt(spread.mean()) < 0.025
+    assert np.all(np.abs(error) < 0.08)
+    motion = {b["name"]: b["motion"]["places_m"][0][0] for b in tomllib.loads(SCENARIO.read_text())["bodies"]}
+    tape = load_knowledge(folder / "known.toml").distances[0]
+    assert tape.distance_m == pytest.approx(abs(motion["stand4"] - motion["stand5"]))
+
+
+def test_the_survey_prints_what_the_page_shows(done):
+    _, said = done
+    (shown,) = blocks("text survey")
+    pages.compare(said["survey"], shown)
+    assert "rests on arrangements A, B, C, D, E, F, G, H, on a line" in said["show"]
     assert "from the geometry of boards that stood still" in said["show"]
 
 
-def test_the_places_are_those_on_the_string(done):
-    folder, _ = done
-    places = {row["id"]: row["position_m"][0] for row in tomllib.loads((folder / "places.toml").read_text())["anchors"]}
-    bodies = {b["name"]: b["motion"]["places_m"][0][0] for b in tomllib.loads(SCENARIO.read_text())["bodies"]}
-    truth = np.array([bodies[f"stand{tag}"] - bodies["stand1"] for tag in range(1, 7)])
-    found = np.array([places[tag] for tag in range(1, 7)]) * np.sign(truth[1])
-    # A curve over power that falls with distance is nearly a scale of all distances: 3 % of it is left open.
-    assert np.abs(found - truth).max() < 0.03 * np.ptp(truth)
-
-
-def test_the_plan_for_the_tutorial_lists_the_commands(done):
+def test_the_commands_are_those_of_the_plan_and_the_boards_stand_as_planned(done):
     _, said = done
-    record = next(words for words in commands("boards") if words[1] == "record")
-    shared = [word for word in record if word not in {"--known", "line"}]
-    assert " ".join(shared) in said["plan"]
+    planned = [line.strip() for line in said["plan"].splitlines() if line.startswith("  u") or "calib survey" in line]
+    assert len(planned) == 9
+    page = [line for line in COMMANDS if line.startswith(("uwblink record", "calib survey"))]
+    assert planned == [line.replace(" --report survey.html", "") for line in page[:9]]
+    bodies = tomllib.loads(SCENARIO.read_text())["bodies"]
+    for k, line in enumerate(planned[:8]):
+        where = {int(b["name"].removeprefix("stand")): b["motion"]["places_m"][k][0] for b in bodies}
+        assert line.split("--order ")[1].split()[0] == ",".join(map(str, sorted(where, key=lambda tag: where[tag])))
 
 
-def test_boards_that_are_served_are_recorded_as_marked_arrangements(tmp_path):
-    ports = uwbsim.VirtualPorts(uwbsim.load(SCENARIO))
-    plan = uwblink.RangingPlan("all", rate_hz=20.0)
-    names, out = ports.names.values(), tmp_path / "A.uwb"
-    uwblink.record(names, out, plan, duration_s=2.0, using=ports, arrangement="A", known="line")
-    contents = uwblink.load(tmp_path / "A.uwb")
-    assert [(one.name, one.known) for one in contents.arrangements] == [("A", "line")]
-    assert len(contents.exchanges) >= 38
+def test_recordings_carry_what_was_said_of_their_arrangement(done):
+    folder, _ = done
+    (mark,) = uwblink.load(folder / "B.uwb").arrangements
+    assert (mark.name, mark.known, mark.order) == ("B", "line", (2, 1, 5, 4, 6, 3))
+    (after,) = uwblink.load(folder / "corrected.uwb").arrangements
+    assert after.order == uwblink.load(folder / "A.uwb").arrangements[0].order
 
 
 def test_the_file_of_what_is_known_is_read_as_it_stands_there(tmp_path):

@@ -7,7 +7,7 @@ would collide on the air. A board that is unplugged leaves the others running an
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -48,6 +48,7 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     passive: bool = False,
     arrangement: str | None = None,
     known: str = "",
+    order: Sequence[int] = (),
     force: bool = False,
     stop: Callable[[], bool] = lambda: False,
     watch: Callable[[Progress], None] | None = None,
@@ -58,10 +59,11 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
 
     `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are told what the file gets
     (see `uwblink.boards.listeners`), and `using` are other ports than this computer's serial ones (`VirtualPorts`).
-    `arrangement` names the places of boards that stand still meanwhile, `known` to be on a "line" or a "plane"; it is
-    marked in the recording, for a survey. `KeyboardInterrupt` ends a recording like `stop`, with everything in the
-    file. Raises the errors of `Board.open`, `PlanError` (a tag of the plan is absent, two boards have one id, a
-    duration that is none), and `RecordingError` (cannot be written, disk full); the file stays readable.
+    `arrangement` names the places of boards that stand still meanwhile, `known` to be on a "line" or a "plane", and
+    `order` says in which order their ids lie along a line; it is marked in the recording, for a survey.
+    `KeyboardInterrupt` ends a recording like `stop`, with everything in the file. Raises the errors of `Board.open`,
+    `PlanError` (a tag of plan or order is absent, two boards have one id, a duration that is none), and
+    `RecordingError` (cannot be written, disk full); the file stays readable.
 
     >>> import uwblink, uwbsim
     >>> ports = uwbsim.VirtualPorts(
@@ -86,10 +88,15 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
     if known not in SHAPES or (known and not arrangement):
         raise PlanError(f"known: found {known!r:.40}, allowed: line, plane, of an arrangement that has a name")
+    if order and known != "line":
+        raise PlanError("order: is that of boards on a line; say that they are known to be on one")
     path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
     check_output(path, force=force)
     found = identify(ports, using)
     turns = plan.turns(sorted(found))
+    if order and sorted(order) != sorted(found):
+        there = ", ".join(map(str, sorted(found)))
+        raise PlanError(f"order: found {', '.join(map(str, order))}, expected each of the boards at the ports, {there}")
     meta = _meta(found, plan, turns, passive)
     with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
         seats = {tag.tag: tag for tag in plan.tags}
@@ -108,7 +115,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
                 recorder.close()
         if arrangement:
             last_ns = max(using.host_ns(), recorder.progress.start_ns + 1)
-            recording.append_arrangements([Arrangement(arrangement, recorder.progress.start_ns, last_ns, known)])
+            mark = Arrangement(arrangement, recorder.progress.start_ns, last_ns, known, tuple(order))
+            recording.append_arrangements([mark])
     return recorder.progress
 
 

@@ -47,6 +47,9 @@ def record(
     known: Annotated[
         str, typer.Option(help="How boards of an arrangement are known to stand.", **choice("line", "plane"))
     ] = "",
+    order: Annotated[
+        str, typer.Option(metavar="TAG,TAG...", help="In which order they lie along a line, from either end.")
+    ] = "",
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
     cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
     live: Annotated[
@@ -81,6 +84,8 @@ def record(
         chosen = replace(chosen, get_cir=True)
     if known and not arrangement:
         raise PlanError("--known: is said of an arrangement; give --arrangement NAME, too")
+    if order and known != "line":
+        raise PlanError("--order: is that of boards on a line; give --known line, too")
     if calibration and not live:
         raise PlanError("--calibration: corrected ranges are shown on the page of --live; give that, too")
     with interrupts() as stop, _watcher() as watch, _page(output, calibration, live_port, live) as page:
@@ -98,12 +103,22 @@ def record(
             passive=passive,
             arrangement=arrangement,
             known=known,
+            order=_ids(order),
             force=force,
             stop=stop,
             watch=watch_all,
             listeners=[page] if page else [],
         )
     typer.echo(f"{output}: {_summary(progress)}")
+
+
+def _ids(text: str) -> tuple[int, ...]:
+    from uwblink.errors import PlanError
+
+    words = [word.strip() for word in text.split(",")] if text else []
+    if not all(word.isascii() and word.isdigit() and len(word) < 6 for word in words):
+        raise PlanError(f"--order: found {text!r:.40}, expected ids with commas, as in 3,1,2")
+    return tuple(map(int, words))
 
 
 @contextmanager

@@ -186,9 +186,20 @@ class TableReaders:
         return [Fault(int(t), str(b), str(k), str(d), i, j) for t, b, k, d, i, j in rows]
 
     def arrangements(self) -> list[Arrangement]:
-        """Return the stretches of time in which boards stood still, in order of time; none in older files."""
+        """Return the stretches of time in which boards stood still, in order of time; none in older files.
+
+        Raises `RecordingError` where what is known of one is neither a shape nor a line with the order of its tags.
+        """
         rows = self._whole_rows("arrangements", "start_ns")
-        return [Arrangement(str(n), int(start), int(end), str(known)) for start, end, n, known in rows]
+        return [Arrangement(str(n), int(start), int(end), *self._known(str(known))) for start, end, n, known in rows]
+
+    def _known(self, text: str) -> tuple[str, tuple[int, ...]]:
+        shape, *order = text.split(" ")
+        tags = all(word.isascii() and word.isdigit() and len(word) < 6 for word in order)
+        if not tags or len(set(order)) < len(order) or (order and shape != "line"):
+            expected = "a shape, or line and tags in their order, each once"
+            raise RecordingError(f"{self.path}: table arrangements: known: found {text!r:.40}, expected {expected}")
+        return shape, tuple(map(int, order))
 
     def known_distances(self) -> list[KnownDistance]:
         """Return the distances between tags that were measured otherwise, in order of tags; none in older files."""

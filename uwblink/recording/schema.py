@@ -211,15 +211,18 @@ SHAPES: Final = ("", "line", "plane")
 class Arrangement:
     """A stretch of time in which boards stood still: its name, and whether on a "line" or a "plane" ("": not known).
 
+    `order` are the tags as they were put along a line, from either end; empty where nobody said it.
+
     >>> from uwblink import Arrangement
-    >>> Arrangement("A", 0, 60_000_000_000, "line").name
-    'A'
+    >>> Arrangement("A", 0, 60_000_000_000, "line", (3, 1, 2)).order
+    (3, 1, 2)
     """
 
     name: str
     start_ns: int
     end_ns: int
     known: str = ""
+    order: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,8 @@ class TableWriters:
     def append_arrangements(self, arrangements: Iterable[Arrangement]) -> None:
         """Add stretches of time in which boards stood still."""
         for a in arrangements:
-            self._store.insert_row("arrangements", [a.start_ns, a.end_ns, a.name, a.known])
+            known = " ".join([a.known, *map(str, a.order)])
+            self._store.insert_row("arrangements", [a.start_ns, a.end_ns, a.name, known])
 
     def append_distances(self, distances: Iterable[KnownDistance]) -> None:
         """Add distances that were measured otherwise."""

@@ -7,6 +7,7 @@ boards print goes out when it is due.
 from __future__ import annotations
 
 import heapq
+import math
 import selectors
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ import numpy as np
 from uwblink.boards.pseudo_terminals import Terminal
 from uwbsim.boards.board_air import MS, NS_PER_S
 from uwbsim.boards.live_poses import LivePoses
+from uwbsim.boards.stays import stays_s
 from uwbsim.boards.virtual_board import Bench, VirtualBoard
 from uwbsim.random_streams import stream
 from uwbsim.scenario.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
@@ -133,6 +135,14 @@ class Server:
         while self._timed and self._timed[0][0] <= now:
             heapq.heappop(self._timed)[2]()
 
+    def announce(self, tell: Callable[[str], object]) -> None:
+        """Have `tell` told in a line when boards that are carried from place to place stand, and until when."""
+        stays = stays_s(self.bench.radios.scenario)
+        for number, (begin_s, end_s) in enumerate(stays, start=1):
+            until = "stay there" if math.isinf(end_s) else f"stand until {end_s:g} s"
+            text = f"{begin_s:5g} s  place {number} of {len(stays)}: boards {until}"
+            self._at(int(begin_s * NS_PER_S), partial(_told, tell, text))
+
     def write_poses(self, path: Path) -> None:
         """Write motion capture to a file from now on, in host time, as `uwblink poses` reads it."""
         self._poses = LivePoses(self.bench.radios.world, path, self.epoch_ns)
@@ -226,3 +236,7 @@ class Server:
         if fault.kind == "drop-bytes":
             return values[~hit].tobytes()
         return np.where(hit, self._chance.integers(0, 256, len(values)), values).astype(np.uint8).tobytes()
+
+
+def _told(tell: Callable[[str], object], text: str) -> None:
+    tell(text)

@@ -119,6 +119,7 @@ def serve(
     try:
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")
+        server.announce(typer.echo)
         if poses:
             server.write_poses(poses)
         with interrupts() as stop:

@@ -104,8 +104,9 @@ def test_steps_name_commands_that_exist_and_pictures_show_orders():
 def test_the_command_prints_steps_and_json():
     done = CliRunner().invoke(app, ["plan", "3", "--on", "line", "--arrangements", "2"])
     assert done.exit_code == 0
-    assert "  uwblink record PORTS --pairs all --arrangement A --duration 30 -o A.uwb\n" in done.stdout
-    assert done.stdout.endswith("  calib survey A.uwb B.uwb --known line -o calibration.json\n")
+    line = "--arrangement A --known line --order 1,2,3 --pairs all --rate 50 --duration 30 -o A.uwb"
+    assert f"  uwblink record PORTS {line}\n" in done.stdout
+    assert done.stdout.endswith("  calib survey A.uwb B.uwb -o calibration.json\n")
     told = json.loads(CliRunner().invoke(app, ["plan", "1,2,5", "--arrangements", "1", "--json"]).stdout)
     assert sorted(told["half_interval_ns"]) == ["1", "2", "5"]
     assert len(told["undetermined"]) == 2

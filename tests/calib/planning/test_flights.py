@@ -172,7 +172,7 @@ def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
     (pair,) = taped.taped
     assert said.what == f"the distance of tags {pair[0]} and {pair[1]} by tape"
     assert said.mean_ns == pytest.approx(taped.next_best[0].instead_of_ns, rel=1e-6)
-    assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(_commands(taped, "3"))
+    assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(_commands(taped, "3", "PORTS"))
 
 
 def test_the_best_tape_is_the_best_of_all():

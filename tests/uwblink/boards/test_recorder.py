@@ -15,8 +15,9 @@ from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import record
 from uwblink.boards.replay import decode_again
-from uwblink.errors import PlanError, PortMissingError, RecordingExistsError
+from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
 from uwblink.recording.file import Recording
+from uwblink.recording.schema import Arrangement
 from uwbsim.boards.virtual_port import VirtualPorts
 
 BIN = Path(sys.executable).parent
@@ -37,6 +38,25 @@ def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
     assert (mark.name, mark.known) == ("A", "plane")
     assert mark.start_ns <= time_ns.min()
     assert time_ns.max() < mark.end_ns < mark.start_ns + 1.2e9
+
+
+@pytest.mark.parametrize(
+    ("known", "order", "message"),
+    [("plane", (30, 10, 20), "order: is that of boards on a line"), ("line", (10, 20), "each of the boards at the")],
+)
+def test_an_order_is_that_of_all_boards_on_a_line(tmp_path, known, order, message):
+    ports = VirtualPorts(bench_scenario())
+    names, out = ports.names.values(), tmp_path / "a.uwb"
+    with pytest.raises(PlanError, match=message):
+        record(names, out, RangingPlan(), using=ports, arrangement="A", known=known, order=order)
+
+
+@pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])
+def test_an_order_that_is_none_is_one_line(tmp_path, known):
+    with Recording.create(tmp_path / "a.uwb", meta={}) as recording:
+        recording.append_arrangements([Arrangement("A", 0, 1, known)])
+        with pytest.raises(RecordingError, match="known: found"):
+            recording.arrangements()
 
 
 def test_what_is_known_is_known_of_an_arrangement(tmp_path):
