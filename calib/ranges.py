@@ -18,6 +18,7 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.tracks import Tracks
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, delay_weights, intervals, raw_range, without_stamps
 
@@ -275,7 +276,9 @@ def measured_powers(fpp_dbm: Floats) -> Floats:
         return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
 
 
-def columns_of(exchanges: Exchanges, given_m: Floats, poses: Poses | None, tags: Sequence[Tag]) -> dict[str, Any]:
+def columns_of(
+    exchanges: Exchanges, given_m: Floats, poses: Poses | Tracks | None, tags: Sequence[Tag]
+) -> dict[str, Any]:
     """Return exchanges as the columns of ranges, with true distances `given_m` (n,), from poses where they are NaN."""
     raw, initiator, target, middle = _of_stamps(exchanges)
     bare = without_stamps(exchanges)
@@ -305,9 +308,11 @@ def _of_stamps(exchanges: Exchanges) -> tuple[Floats, Floats, Floats, Ints]:
     return raw, initiator, target, middle
 
 
-def _truth(exchanges: Exchanges, given_m: Floats, poses: Poses | None, tags: Sequence[Tag], middle_ns: Ints) -> Floats:
+def _truth(
+    exchanges: Exchanges, given_m: Floats, poses: Poses | Tracks | None, tags: Sequence[Tag], middle_ns: Ints
+) -> Floats:
     known = np.isfinite(given_m)
     if known.all() or poses is None or not len(poses):
         return given_m
     # A range belongs to the middle of its first two messages.
-    return np.where(known, given_m, distances_m(poses, list(tags), exchanges.initiator, exchanges.target, middle_ns))
+    return np.where(known, given_m, distances_m(poses, tags, exchanges.initiator, exchanges.target, middle_ns))

@@ -100,7 +100,7 @@ class _Reading:
     def add(self, block: Exchanges) -> None:
         """Take some more exchanges."""
         complete = bool(np.isfinite(block.truth_m).all())
-        for part, poses in [(block, None)] if complete else self._windows.beside(block):
+        for part, poses in [(block, None)] if complete else self._windows.tracks_beside(block):
             self._keep(columns_of(part, part.truth_m, poses, self._tags))
         self._times.update(np.ascontiguousarray(block.time_ns).data)
         self._range_m[self._count : self._count + len(block)] = block.range_m

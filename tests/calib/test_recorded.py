@@ -114,14 +114,14 @@ def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeyp
     held: list[int] = []
     monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**8)
     monkeypatch.setattr(blocks, "POSES_AT_ONCE", len(flight.poses) // 20)
-    around = blocks.PoseWindows.around
+    window = blocks.PoseWindows.window
 
     def watched(self, start_ns, end_ns):
-        found = around(self, start_ns, end_ns)
+        found = window(self, start_ns, end_ns)
         held.append(len(found))
         return found
 
-    monkeypatch.setattr(blocks.PoseWindows, "around", watched)
+    monkeypatch.setattr(blocks.PoseWindows, "window", watched)
     with Recording.open(path) as recording:
         found = read_ranges(recording, "it", need_power=True)
     assert found is not None
