@@ -24,6 +24,9 @@ REACH_ABOVE: Final = 24.0
 SHORTEST_TAIL: Final = 2.0
 """A mean detour below this many sigmas cannot be told from noise."""
 
+ROWS_AT_ONCE: Final = 131_072
+"""Errors that are counted together, so that what leads to counts stays small."""
+
 ITERATIONS: Final = 400
 SETTLED: Final = 1e-4
 
@@ -78,13 +81,16 @@ def fit_error_mixture(error_m: Floats, bins: Ints, count: int, near: ErrorMixtur
     spread = max(robust_spread(error_m), 1e-9)
     edges = np.arange(-REACH_BELOW, REACH_ABOVE, 1 / CELLS_A_SIGMA) * spread + median
     middle = (edges[1:] + edges[:-1]) / 2
-    cell = np.floor((error_m - edges[0]) * (CELLS_A_SIGMA / spread)).astype(np.int64)
-    inside = (cell >= 0) & (cell < len(middle))
-    flat = bins[inside] * len(middle) + cell[inside]
-    counts = np.bincount(flat, minlength=count * len(middle)).reshape(count, len(middle)).astype(np.float64)
-    beyond = float(np.count_nonzero(~inside))
+    flat, beyond = np.zeros(count * len(middle)), 0
+    for begin in range(0, len(error_m), ROWS_AT_ONCE):
+        rows = slice(begin, begin + ROWS_AT_ONCE)
+        cell = np.floor((error_m[rows] - edges[0]) * (CELLS_A_SIGMA / spread)).astype(np.int64)
+        inside = (cell >= 0) & (cell < len(middle))
+        flat += np.bincount(bins[rows][inside] * len(middle) + cell[inside], minlength=len(flat))
+        beyond += int(np.count_nonzero(~inside))
+    counts = flat.reshape(count, len(middle))
     span = max(float(edges[-1]), float(error_m.max())) - min(float(edges[0]), float(error_m.min()))
-    return _maximise(middle, counts, beyond, spread, 1 / span, near)
+    return _maximise(middle, counts, float(beyond), spread, 1 / span, near)
 
 
 def _maximise(

@@ -17,6 +17,7 @@ from calib.estimation.mixture_slopes import Errors
 from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
 from calib.estimation.persistence import lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
+from calib.long_columns import let_go, picked, spans
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
@@ -84,8 +85,8 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
 
 def _middles(lifted: Floats, cell: Ints) -> Floats:
     """Return the lifted power that stands for each step (CELLS,): of few powers, some steps hold no range."""
-    held = np.unique(cell)
-    middles = np.interp(np.arange(CELLS), held, [np.median(lifted[cell == k]) for k in held])
+    held = np.flatnonzero(np.bincount(cell, minlength=CELLS))
+    middles = np.interp(np.arange(CELLS), held, [np.median(picked(lifted, cell == k)) for k in held])
     # Powers may repeat; what is straight between two of them needs them apart.
     return np.asarray(middles + 1e-9 * np.arange(CELLS))
 
@@ -129,7 +130,11 @@ def _of_pairs(mixture: PairMixture, time_ns: Ints, pair: Ints) -> _PairsPredicte
     factor = lasting_in_pairs(by_share, pair, time_ns)
     reflected = np.bincount(pair, minlength=pairs) * mixture.tail_share
     # One wall has one detour: a mean is known from as many reflections as there were, not from as many ranges.
-    unknown = [factor / np.maximum(known, 1e-6) for known in (np.bincount(pair, by_share**2, pairs), reflected)]
+    told = np.zeros(pairs)
+    for rows in spans(len(pair)):
+        told += np.bincount(pair[rows], by_share[rows] ** 2, pairs)
+        let_go(by_share, pair)
+    unknown = [factor / np.maximum(known, 1e-6) for known in (told, reflected)]
     share, share_var, any_share, any_share_var = _drawn(mixture.of("pair_share"), unknown[0])
     mean, mean_var, any_mean, any_mean_var = _drawn(mixture.of("pair_mean"), unknown[1])
     # What a few lasting reflections leave open is more than any room has, and the means of their exponentials explode.
@@ -188,11 +193,16 @@ class _Outliers:
 
 
 def _outliers(mixture: PairMixture, error_m: Floats) -> _Outliers:
-    outlier = np.clip(mixture.slope("outliers") + 1 / (1 + np.exp(-mixture.of("outliers")[0])), 0, 1)
+    slope, always = mixture.slope("outliers"), 1 / (1 + np.exp(-mixture.of("outliers")[0]))
     reach = BEYOND_MEANS * float(mixture.tail_mean_m.max())
-    near = outlier * (np.abs(error_m) < reach)
-    share = max(float(near.mean()), 1e-9)
-    return _Outliers(share=share, rms_m=float(np.sqrt(np.sum(near * error_m**2) / max(near.sum(), 1e-9))) or reach)
+    total, square = 0.0, 0.0
+    for rows in spans(len(error_m)):
+        some = error_m[rows]
+        near = np.clip(slope[rows] + always, 0, 1) * (np.abs(some) < reach)
+        total, square = total + float(near.sum()), square + float(np.sum(near * some**2))
+        let_go(slope, error_m)
+    share = max(total / len(error_m), 1e-9)
+    return _Outliers(share=share, rms_m=float(np.sqrt(square / max(total, 1e-9))) or reach)
 
 
 def _put_right(model: ErrorModel, problem: Problem, residual_m: Floats) -> ErrorModel:

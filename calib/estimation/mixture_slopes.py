@@ -145,22 +145,35 @@ def _slopes(residual: Floats, shape: Shape) -> _Piece:
     )
 
 
-def scores_at(errors: Errors, layout: Layout, theta: Floats) -> Scores:
-    """Return the slopes of all ranges at parameters."""
-    found = empty(len(errors.error), each=(1 + len(SLOPES),))
+def slopes_at(errors: Errors, layout: Layout, theta: Floats, name: str) -> Floats:
+    """Return the slope of each range (n,) by its own parameter of a kind of `SLOPES`, at parameters."""
+    found, which = empty(len(errors.error)), SLOPES.index(name)
     for _, rows, piece in _pieces(errors, layout, theta):
+        found[rows] = piece.slopes[which]
+    let_go(found, errors.error)
+    return found
+
+
+def scores_at(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, Sums]:
+    """Return the slopes of all ranges at parameters, and their sums with those of squares."""
+    found = empty(len(errors.error), each=(1 + len(SLOPES),))
+    summing = Summing(errors.design, len(SLOPES), squares=True)
+    for blocks, rows, piece in _pieces(errors, layout, theta):
         found[0, rows], found[1:, rows] = piece.score, piece.slopes
+        summing.add(blocks, rows, piece.score, piece.slopes)
         if rows.start // ROWS_AT_ONCE != rows.stop // ROWS_AT_ONCE:
             let_go(found, errors.error)
     let_go(found, errors.error)
-    return Scores(
+    places, sorts = layout.pairs * layout.cells, _sorts(layout)
+    scores = Scores(
         design=errors.design,
         score=found[0],
         slopes=tuple(found[1:]),
         place=errors.place,
-        places=layout.pairs * layout.cells,
-        sorts=_sorts(layout),
+        places=places,
+        sorts=sorts,
     )
+    return scores, summing.sums(errors.place, places, sorts)
 
 
 def _sorts(layout: Layout) -> tuple[Sort, ...]:

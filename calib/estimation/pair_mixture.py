@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.mixture_slopes import SLOPES, Errors, Layout, scores_at, sums_at
+from calib.estimation.mixture_slopes import SLOPES, Errors, Layout, scores_at, slopes_at, sums_at
 from calib.estimation.mixture_start import SPREADS, Prior, begin, between_pairs
 from calib.estimation.scores import Scores, inverse_of
 from uwblink.arrays import Floats
@@ -95,7 +95,27 @@ class PairMixture:
         return np.exp(self.of("pair_noise"))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Top:
+    """The top of a likelihood: parameters (D,), what is known beforehand, and how it was climbed."""
+
+    layout: Layout
+    parameters: Floats
+    prior: Prior
+    steps: int
+    success: bool
+
+    def slope(self, errors: Errors, name: str) -> Floats:
+        """Return every range's slope by its own parameter of a kind of `SLOPES` (n,), in the order of given rows."""
+        return errors.design.given(slopes_at(errors, self.layout, self.parameters, name))
+
+
 def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats, lasting: float = 1.0) -> PairMixture:
+    """Return the likeliest parameters and what is known of them; takes what `climbed` takes."""
+    return described(errors, climbed(errors, start, ridge, lasting))
+
+
+def climbed(errors: Errors, start: Floats, ridge: Floats, lasting: float = 1.0) -> Top:
     """Return the likeliest parameters, from a robust `start` (m,) of those of the design.
 
     `ridge` (m, m) is the inverse covariance of what is known of them beforehand, in 1/m^2.
@@ -107,16 +127,20 @@ def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats, lasting: floa
         nearly = NEARLY if some is errors else ROUGHLY
         theta, prior, taken, success = _climb(some, layout, theta, prior, nearly)
         steps += taken
-    scores = scores_at(errors, layout, theta)
-    covariance = inverse_of(scores.information() + prior.weighed, layout.pairs, len(SPREADS))
+    return Top(layout=layout, parameters=theta, prior=prior, steps=steps, success=success)
+
+
+def described(errors: Errors, top: Top) -> PairMixture:
+    """Return the top of a likelihood with every range's slopes and the covariance there."""
+    scores, sums = scores_at(errors, top.layout, top.parameters)
     return PairMixture(
-        layout=layout,
-        parameters=theta,
-        covariance=covariance,
-        precision=prior.pull,
+        layout=top.layout,
+        parameters=top.parameters,
+        covariance=inverse_of(sums.information() + top.prior.weighed, top.layout.pairs, len(SPREADS)),
+        precision=top.prior.pull,
         scores=scores,
-        steps=steps,
-        success=success,
+        steps=top.steps,
+        success=top.success,
     )
 
 

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.long_columns import computed, let_go
+from calib.long_columns import computed, let_go, spans
 from calib.tails import students_quantile
 from uwblink.arrays import Floats, Ints
 
@@ -66,8 +66,13 @@ def lasting_in_pairs(slope: Floats, pair: Ints, time_ns: Ints) -> float:
     """Return by how much more sums of slopes (n,) by pair (n,) vary than those of independent ranges would."""
     blocks, pairs = short_blocks(time_ns), int(pair.max()) + 1
     count, seconds = int(blocks[-1]) + 1, float(time_ns[-1] - time_ns[0]) * 1e-9
-    sums = np.asarray(np.bincount(blocks * pairs + pair, slope, count * pairs), float).reshape(count, pairs)
+    flat = np.zeros(count * pairs)
+    for rows in spans(len(slope)):
+        flat += np.bincount(blocks[rows] * pairs + pair[rows], slope[rows], count * pairs)
+        let_go(slope, pair)
+    sums = flat.reshape(count, pairs)
     within = float(np.sum(sums**2) / max(float(slope @ slope), 1e-300))
+    let_go(slope)
     return max(within, 1.0) * max(persistence(sums, seconds, pairs).factor, 1.0)
 
 

@@ -104,7 +104,11 @@ class Problem:
     @property
     def cell(self) -> Ints:
         """Return the step of power of each range (n,)."""
-        return self.bins.number * CELLS // len(self.bins.count)
+        return computed(len(self.bins.number), self.cell_of, np.int32)
+
+    def cell_of(self, rows: slice) -> Ints:
+        """Return the step of power of some ranges."""
+        return np.asarray(self.bins.number[rows] * CELLS // len(self.bins.count))
 
     def penalties(self) -> list[Floats]:
         """Return the roughness of each group's curve as a matrix over all parameters; none where none is fitted."""

@@ -20,6 +20,7 @@ from calib.calibration.power_curves import (
 from calib.error_mixture import ErrorMixture, fit_error_mixture
 from calib.errors import UnanswerableError
 from calib.estimation.problem import Problem
+from calib.long_columns import picked
 from uwblink.arrays import Floats, Ints
 
 FEWEST: Final = 20
@@ -50,8 +51,10 @@ def fit_sigma(problem: Problem, centred_m: Floats, mixture: ErrorMixture) -> Sig
         where, sigma, counts, shares = _by_groups(problem, centred_m)
     # Nothing is known of sigma beyond the middles of the outermost bins.
     span = (float(where.min()), float(where.max()))
-    known = problem.lifted[(problem.lifted >= span[0]) & (problem.lifted <= span[1])]
-    knots = knots_for(np.sort(known), SIGMA_SEGMENTS)
+    known = picked(problem.lifted, (problem.lifted >= span[0]) & (problem.lifted <= span[1]))
+    # A copy of its own, which may be sorted where it lies.
+    known.sort()
+    knots = knots_for(known, SIGMA_SEGMENTS)
     splines = basis(where, knots)
     design = np.hstack([splines * shares[:, k, None] for k in range(shares.shape[1])])
     each, rough = splines.shape[1], curvature(knots)

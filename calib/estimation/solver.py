@@ -12,7 +12,7 @@ from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
 from calib.estimation.losses import MIXTURE
 from calib.estimation.mixture_slopes import Errors
-from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
+from calib.estimation.pair_mixture import PairMixture, climbed, described
 from calib.estimation.persistence import Persistence, lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of, terms
@@ -101,14 +101,7 @@ def solve(
     mixture = None
     # Ranges without any error have no distribution to be likely under; the robust loss is exact there.
     if loss == MIXTURE and near.dispersion > 0:
-        errors = Errors.of(
-            problem.error, problem.design, problem.pairs.number * CELLS + problem.cell, len(problem.pairs.ends)
-        )
-        mixture = fit_pair_mixture(errors, start, ridge / near.dispersion)
-        lasting = lasting_in_pairs(mixture.slope("share"), problem.pairs.number, problem.ranges.time_ns)
-        if lasting > LASTING:
-            again = fit_pair_mixture(errors, start, ridge / near.dispersion, lasting)
-            mixture = replace(again if again.success else mixture, steps=mixture.steps + again.steps)
+        mixture = _likeliest(problem, start, ridge / near.dispersion)
         parameters, success, steps = mixture.of("design"), mixture.success, steps + mixture.steps
         scores, inverse, prior = mixture.scores, mixture.covariance, mixture.precision
     else:
@@ -138,6 +131,20 @@ def solve(
         mixture=mixture,
         astray=mixture is not None and _farthest_pair(problem, residual) > ASTRAY_M + 3 * far,
     )
+
+
+def _likeliest(problem: Problem, start: Floats, ridge: Floats) -> PairMixture:
+    """Return the likeliest mixture, where reflections last with less trust in what tells pairs apart."""
+    pairs = problem.pairs
+    place = computed(len(pairs.number), lambda rows: pairs.number[rows] * CELLS + problem.cell_of(rows), np.int32)
+    errors = Errors.of(problem.error, problem.design, place, len(pairs.ends))
+    del place
+    top = climbed(errors, start, ridge)
+    lasting = lasting_in_pairs(top.slope(errors, "share"), pairs.number, problem.ranges.time_ns)
+    if lasting > LASTING:
+        again = climbed(errors, start, ridge, lasting)
+        top = replace(again if again.success else top, steps=top.steps + again.steps)
+    return described(errors, top)
 
 
 def _farthest_pair(problem: Problem, residual: Floats) -> float:

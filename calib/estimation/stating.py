@@ -17,6 +17,7 @@ from calib.estimation.error_model import error_model
 from calib.estimation.flat import no_bias, sigma_of
 from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
+from calib.long_columns import computed, let_go
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -42,7 +43,10 @@ def calibration_of(
     biases = _bias_curves(problem, found)
     core = found.residuals
     mixture = fit_error_mixture(core, problem.bins.number, len(problem.bins.count))
-    sigma = sigma_of(problem, core - mixture.location_m, mixture)
+    let_go(core, problem.bins.number)
+    centred = computed(len(core), lambda rows: core[rows] - mixture.location_m)
+    sigma = sigma_of(problem, centred, mixture)
+    del centred
     return Calibration(
         delays_ns=dict(zip(tags, delays.tolist(), strict=not offsets)) | fixed,
         delays_std_ns=dict(zip(tags, std, strict=not offsets)) | dict.fromkeys(fixed, 0.0),

@@ -14,7 +14,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimation import solver
 from calib.estimation.building import build_problem
 from calib.estimation.fitting import fit
-from calib.estimation.pair_mixture import fit_pair_mixture
+from calib.estimation.pair_mixture import described
 from calib.estimation.robust import quadratic_model, robust_fit
 from calib.estimation.smoothing import reml_penalty
 from calib.estimation.solver import solve
@@ -252,7 +252,7 @@ def test_single_sided_ranges_and_missing_ones_are_warned_of():
 
 
 def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
-    found_by = fit_pair_mixture
+    found_by = described
 
     def lost(*words):
         found = found_by(*words)
@@ -261,7 +261,7 @@ def test_a_likelihood_that_leaves_a_pair_out_is_not_believed(monkeypatch):
         moved[0] += 5.0
         return replace(found, parameters=moved)
 
-    monkeypatch.setattr(solver, "fit_pair_mixture", lost)
+    monkeypatch.setattr(solver, "described", lost)
     r = ranges(2000)
     assert fit(r).calibration.loss == "cauchy"
     asked_for = fit(r, loss="mixture")
