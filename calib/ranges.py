@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
@@ -47,7 +47,8 @@ class Ranges:
     respect to the two tags' antenna delays. `protocol` is "range" where a range came without stamps.
     `excluded` counts by reason what was left out; `planted` is what a simulation put in, for display only;
     `recordings` are name and `fingerprint` of each that they come from, empty where they come from none;
-    `left_skew` says what clock skew may have left in single-sided ranges, None where there are none.
+    `left_skew` says what clock skew may have left in single-sided ranges, None where there are none; `bodies` are tags
+    with the body that carries each, as far as it is known.
     """
 
     source: str
@@ -66,6 +67,7 @@ class Ranges:
     left_skew: LeftSkew | None = None
     clocks_apart: ClocksApart | None = None
     recordings: tuple[tuple[str, str], ...] = ()
+    bodies: tuple[tuple[int, str], ...] = ()
 
     @classmethod
     def from_exchanges(
@@ -93,6 +95,7 @@ class Ranges:
             planted=dict(planted) if planted else None,
             left_skew=left_skew(exchanges),
             clocks_apart=clocks_apart(exchanges),
+            bodies=bodies_of(tags),
             **columns_of(exchanges, given, poses, tags),
         )
 
@@ -223,7 +226,7 @@ def require_some(source: str, count: int, excluded: Mapping[str, int], why_no_tr
     raise UnanswerableError(f"{source}: none of its {count} exchanges can be used: {most}{hint}")
 
 
-APART: Final = ("source", "excluded", "planted", "left_skew", "clocks_apart", "recordings")
+APART: Final = ("source", "excluded", "planted", "left_skew", "clocks_apart", "recordings", "bodies")
 """What is no column."""
 
 COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in APART)
@@ -240,8 +243,20 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         left_skew=worst([p.left_skew for p in parts]),
         clocks_apart=farthest(p.clocks_apart for p in parts),
         recordings=tuple(one for p in parts for one in p.recordings),
+        bodies=_bodies_of_all(parts),
         **columns,
     )
+
+
+def bodies_of(tags: Iterable[Tag]) -> tuple[tuple[int, str], ...]:
+    """Return tags with the body that carries each."""
+    return tuple((tag.tag, tag.body) for tag in tags)
+
+
+def _bodies_of_all(parts: Sequence[Ranges]) -> tuple[tuple[int, str], ...]:
+    """Return the bodies of tags that sit on the same ones in all recordings; none where some tag changes its body."""
+    every = {one for part in parts for one in part.bodies}
+    return tuple(sorted(every)) if len({tag for tag, _ in every}) == len(every) else ()
 
 
 STATIC = "static"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib.carriers import Asked
 from calib.long_columns import ROWS_AT_ONCE, empty, let_go
 from calib.planted import check_planted
-from calib.ranges import COLUMNS, Ranges, columns_of, usable_rows
+from calib.ranges import COLUMNS, Ranges, bodies_of, columns_of, usable_rows
 from calib.single_sided import Terms, left_in, skew_terms
 from uwblink.recording.file import Recording
 from uwblink.twr import Exchanges, names_in
@@ -131,6 +131,7 @@ class _Reading:
             planted=self._planted,
             left_skew=left_in(self._terms),
             clocks_apart=self._asked.apart(),
+            bodies=bodies_of(self._tags),
             recordings=((name, found.hexdigest()[:FINGERPRINT]),),
             **self._columns.found(),
         )

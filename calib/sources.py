@@ -204,7 +204,7 @@ def _load(data: Data, need_power: bool) -> Ranges:
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
         complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
-        poses, tags = (None, []) if complete else (source.poses, source.tags)
+        poses, tags = None if complete else source.poses, source.tags
         planted = _planted(source, name)
     ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, planted=planted, source=name)
     ranges = replace(ranges, recordings=((name, fingerprint(exchanges)),))

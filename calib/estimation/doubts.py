@@ -22,6 +22,7 @@ from calib.estimation.misfit import (
     told,
 )
 from calib.estimation.persistence import FEWEST_STRETCHES
+from calib.estimation.places import OfPlaces, of_places
 from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
 from calib.long_columns import computed, let_go, spans
@@ -72,15 +73,17 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
         tested=tested,
         shape_m=kept(_of_another_shape(problem, found)),
     )
-    covariance, sentences = weighed(problem, found, judged)
+    places = of_places(problem, found.scores, judged.pairs, kept(blocks))
+    covariance, sentences = weighed(problem, found, judged, places)
     sentences += [*reflected(problem, found), *short(found), *_confounded(problem, found)]
     return Doubts(covariance_ns2=covariance, sentences=sentences)
 
 
-def weighed(problem: Problem, found: Solved, judged: Judgement) -> tuple[Floats, list[str]]:
+def weighed(problem: Problem, found: Solved, judged: Judgement, places: OfPlaces) -> tuple[Floats, list[str]]:
     """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences."""
     plain = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
-    covariance = plain + judged.widening_ns2
+    said = places.told(plain + judged.widening_ns2)
+    covariance = plain + judged.widening_ns2 + places.widening_ns2
     matter, plain = [], covariance
     for finding in judged.findings:
         moved = _moved(finding, plain)
@@ -91,7 +94,7 @@ def weighed(problem: Problem, found: Solved, judged: Judgement) -> tuple[Floats,
             matter.append(finding)
     # A tag that was moved stands out in more than one span of time: once is enough.
     once = {(finding.kind, finding.names): finding for finding in reversed(matter)}
-    return covariance, [told(finding) for finding in matter if once[finding.kind, finding.names] is finding]
+    return covariance, [*said, *(told(one) for one in matter if once[one.kind, one.names] is one)]
 
 
 def _moved(finding: Finding, covariance: Floats) -> float:

@@ -88,10 +88,14 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """What the residuals say: findings, the gravest first, and covariance (tags, tags) to add to that of the delays."""
+    """What the residuals say: findings, the gravest first, and covariance (tags, tags) to add to that of the delays.
+
+    `pairs` are the slopes of offsets by pair, from which some of it follows.
+    """
 
     findings: list[Finding]
     widening_ns2: Floats
+    pairs: Tested | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,7 +205,11 @@ def examine(
     found = [finding for result in results for finding in findings(result, several)]
     widening += sum(widening_of_pairs(result) for result in results if result.kind == "pair")
     found += list(_of_gain(found, results))
-    return Judgement(findings=sorted(found, key=lambda finding: -abs(finding.deviation)), widening_ns2=widening)
+    return Judgement(
+        findings=sorted(found, key=lambda finding: -abs(finding.deviation)),
+        widening_ns2=widening,
+        pairs=next((result for result in results if result.kind == "pair"), None),
+    )
 
 
 def everywhere(scores: Scores) -> tuple[Runs, list[tuple[Ints, float]], int]:

@@ -26,6 +26,7 @@ from calib.estimation.misfit import (
     widening_of_pairs,
 )
 from calib.estimation.persistence import persistence
+from calib.estimation.places import of_places
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
 from calib.estimation.solver import Solved
@@ -82,8 +83,10 @@ def doubted(problem: Problem, found: Solved, taken: Taken) -> Doubts:
             (one for each in tested for one in findings(each, several)), key=lambda finding: -abs(finding.deviation)
         ),
         widening_ns2=np.asarray(sum(widening_of_pairs(each) for each in tested if each.kind == "pair")),
+        pairs=next((one for one in tested if one.kind == "pair"), None),
     )
-    covariance, sentences = weighed(problem, found, judged)
+    places = of_places(problem, found.scores, judged.pairs, kept(blocks))
+    covariance, sentences = weighed(problem, found, judged, places)
     return Doubts(covariance_ns2=covariance, sentences=[*sentences, *reflected(problem, found), *short(found)])
 
 

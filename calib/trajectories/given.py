@@ -75,7 +75,7 @@ def scene_from(data: Data, usable: Usable, *, need_power: bool = True) -> Scene:
         raise UnanswerableError(f"{name}: does not say which tag sits on which body; 'uwblink poses --tags' adds that")
     # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
     numbered = Ranges.from_exchanges(
-        exchanges, np.arange(len(exchanges), dtype=np.float64), planted=planted, source=name
+        exchanges, np.arange(len(exchanges), dtype=np.float64), tags=tags, planted=planted, source=name
     ).usable(need_power=need_power)
     carried = {tag.tag for tag in tags}
     rows = numbered.truth_m.astype(np.int64)

@@ -1,0 +1,84 @@
+"""Worlds whose errors belong to places: boards in twos on bodies that swim, a smooth field of errors between any two.
+
+Nothing here is shared with the simulator or the fit: no walls and no paths, but waves over the places of both ends.
+"""
+
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from calib.ranges import Ranges
+
+LIGHT_M_PER_NS = 0.299702547
+
+
+def swum(rng: np.random.Generator, bodies: int, time_s: Any) -> Any:
+    """Metres (bodies, n, 3) on sums of three sines an axis about places on a ring."""
+    angle = 2 * np.pi * (np.arange(bodies) + 0.3 * rng.random(bodies)) / bodies
+    middle = np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(1, 2, bodies)])
+    rate = 2 * np.pi / rng.uniform(4, 15, (bodies, 3, 3))
+    phase = rng.uniform(0, 2 * np.pi, rate.shape)
+    waves = np.sin(rate[:, None] * time_s[None, :, None, None] + phase[:, None]).sum(axis=3)
+    return middle[:, None] + 0.45 * waves
+
+
+def field(rng: np.random.Generator, first: Any, second: Any, size_m: float, wave_m: float) -> Any:
+    """Errors (n,) of standard deviation `size_m`, smooth over `wave_m` of either end's place (n, 3)."""
+    vectors = rng.normal(0, 2 * np.pi / wave_m / np.sqrt(3), (40, 6))
+    angle = np.hstack([first, second]) @ vectors.T + rng.uniform(0, 2 * np.pi, 40)
+    return size_m * np.sqrt(2 / 40) * np.cos(angle).sum(axis=1)
+
+
+def ranges_with_field(  # noqa: PLR0913 - what a world may differ in
+    seed: int,
+    *,
+    bodies: int = 4,
+    seconds: float = 60.0,
+    rate: float = 100.0,
+    field_m: float = 0.0,
+    wave_m: float = 2.0,
+    between_m: float = 0.0,
+    noise_m: float = 0.03,
+    reflected: float = 0.08,
+) -> tuple[Ranges, Any]:
+    """Return ranges with their truth, and delays in ns by tag, 1 on, two on each body.
+
+    Errors by place have a field of `field_m` for every two bodies, and an offset of `between_m` that stays.
+    """
+    rng = np.random.default_rng([seed, 4711])
+    count = int(seconds * rate)
+    time = np.sort(rng.uniform(0, seconds, count))
+    tags = 2 * bodies
+    delays = np.concatenate([[0.0], rng.uniform(-0.4, 0.3, tags)])
+    pairs = np.array([(a, b) for a, b in combinations(range(1, tags + 1), 2) if (a - 1) // 2 != (b - 1) // 2])
+    first, second = pairs[rng.integers(0, len(pairs), count)].T
+    places = swum(rng, bodies, time)
+    arm, turning = rng.normal(0, 0.15, (tags + 1, 3)), rng.uniform(0.3, 0.9, bodies)
+    ends = []
+    for ids in (first, second):
+        body = (ids - 1) // 2
+        angle = turning[body] * time
+        c, s = np.cos(angle), np.sin(angle)
+        x, y, z = arm[ids].T
+        ends.append(places[body, np.arange(count)] + np.column_stack([c * x - s * y, s * x + c * y, z]))
+    truth = np.linalg.norm(ends[0] - ends[1], axis=1)
+    powers = -80 - 20 * np.log10(truth / 3) + rng.normal(0, 2.5, (2, count))
+    lifted = np.mean(10 ** ((powers + 82) / 10), axis=0)
+    error = 0.05 * np.sin(1.5 * lifted) + noise_m * rng.normal(size=count)
+    error += np.where(rng.random(count) < reflected, rng.exponential(0.3, count), 0.0)
+    for a, b in combinations(range(bodies), 2):
+        rows = ((first - 1) // 2 == a) & ((second - 1) // 2 == b)
+        error[rows] += between_m * rng.normal() + field(rng, ends[0][rows], ends[1][rows], field_m, wave_m)
+    swap = rng.random(count) < 0.5
+    made = Ranges.from_arrays(
+        truth + error - 0.5 * LIGHT_M_PER_NS * (delays[first] + delays[second]),
+        initiator=np.where(swap, second, first),
+        target=np.where(swap, first, second),
+        fpp1_dbm=powers[0],
+        fpp2_dbm=powers[1],
+        truth_m=truth,
+        time_ns=np.rint(time * 1e9).astype(np.int64),
+    )
+    return replace(made, bodies=tuple((tag, f"robot{(tag - 1) // 2}") for tag in range(1, tags + 1))), delays[1:]
