@@ -43,6 +43,8 @@ WORLDS: dict[str, dict[str, Any]] = {
     "line, 5 % reflected, by 5 to 20 cm": LINE | {"reflected": 0.05, "detour_m": (0.05, 0.2)},
     "plane, 5 % of pairs reflected": PLANE | {"reflected": 0.05},
     "space, 5 % of pairs reflected": SPACE | {"reflected": 0.05},
+    "line, 5 % of pairs reflected, orders said": LINE | {"reflected": 0.05, "said": ""},
+    "line, 10 % of pairs reflected, orders said": LINE | {"reflected": 0.1, "said": ""},
     "plane, bias over power": PLANE | {"bias_size_m": 0.05, "size_m": 8.0},
     "space, one arrangement": {"shape": "space", "boards": 5, "arrangements": 1},
 }
@@ -51,6 +53,14 @@ WORLDS: dict[str, dict[str, Any]] = {
 HEAD = """\
 | world | seeds | delays, rms | promised | in 95 % | delays left out | refused |
 |---|---|---|---|---|---|---|"""
+
+LABELS: dict[str, dict[str, Any]] = {
+    f"line, {share} % reflected, labels exchanged": LINE | {"reflected": share / 100, "said": "wrongly"}
+    for share in (0, 5, 10)
+}
+LABELS_HEAD = """\
+| two labels exchanged in one arrangement | seeds | found, the two named | another two named as well |
+|---|---|---|---|"""
 
 
 @dataclass(frozen=True)
@@ -61,22 +71,39 @@ class Outcome:
     errors_ns: tuple[float, ...] = ()
     std_ns: tuple[float, ...] = ()
     refused: str = ""
+    exchanged: str = ""
 
 
 def one(name: str, seed: int) -> Outcome:
-    """Survey one world."""
-    settings = WORLDS[name]
+    """Survey one world; in those of `LABELS`, two boards are exchanged in the order that is said of an arrangement."""
+    settings = dict((WORLDS | LABELS)[name])
+    said = settings.pop("said", None)
     world = standing_boards(seed, **settings)
-    shape = settings["shape"]
+    shape = "" if settings["shape"] == "space" else settings["shape"]
+    orders, two = orders_of(world, seed if said else None) if said is not None else ({}, "")
     try:
-        found = calib.survey(world.ranges, known="" if shape == "space" else shape).calibration
+        found = calib.survey(world.ranges, known=calib.Knowledge(shape=shape, orders=orders)).calibration
     except calib.UnanswerableError as error:
-        return Outcome(refused=str(error))
+        return Outcome(refused=str(error), exchanged=two)
     return Outcome(
         tags=tuple(found.delays_ns),
         errors_ns=tuple(delay - world.delays_ns[tag] for tag, delay in found.delays_ns.items()),
         std_ns=tuple(found.delays_std_ns[tag] for tag in found.delays_ns),
+        exchanged=two,
     )
+
+
+def orders_of(world: Standing, wrong: int | None) -> tuple[dict[str, tuple[int, ...]], str]:
+    """Return the boards' orders by arrangement; with a seed for it, two exchanged in one, and which as it is said."""
+    orders = {str(k): (np.argsort(place[:, 0]) + 1).tolist() for k, place in enumerate(world.places, start=1)}
+    text = ""
+    if wrong is not None:
+        rng = np.random.default_rng(wrong)
+        name = str(rng.integers(1, len(orders) + 1))
+        i, j = rng.choice(len(orders[name]), 2, replace=False).tolist()
+        orders[name][i], orders[name][j] = orders[name][j], orders[name][i]
+        text = f"{name}: {min(orders[name][i], orders[name][j])} and {max(orders[name][i], orders[name][j])}"
+    return {name: tuple(order) for name, order in orders.items()}, text
 
 
 def promised(world: Standing, dimensions: int, curve_m: float) -> Floats:
@@ -116,7 +143,8 @@ def promised(world: Standing, dimensions: int, curve_m: float) -> Floats:
 
 def row(name: str, outcomes: dict[int, Outcome]) -> str:
     """Return a row of the table from outcomes by seed."""
-    settings = WORLDS[name]
+    settings = dict(WORLDS[name])
+    settings.pop("said", None)
     some = {seed: found for seed, found in outcomes.items() if not found.refused}
     refused = len(outcomes) - len(some)
     if not some:
@@ -140,6 +168,17 @@ def row(name: str, outcomes: dict[int, Outcome]) -> str:
     return f"| {name} | {len(outcomes)} | {' | '.join(cells)} |"
 
 
+def labels_row(name: str, outcomes: dict[int, Outcome]) -> str:
+    """Return a row of the table of exchanged labels."""
+    found = others = 0
+    for one in outcomes.values():
+        where, two = one.exchanged.split(": ")
+        told = one.refused.split(" stand")[0]
+        good = told.startswith(f"{where}: boards ") and two in told
+        found, others = found + good, others + (good and ", or " in told)
+    return f"| {name} | {len(outcomes)} | {found} | {others} |"
+
+
 def outcomes_of(name: str, seeds: int, results: Path | None, pool: Executor) -> dict[int, Outcome]:
     """Return a world's outcomes by seed (from 1000 on); those in a file of results are taken from there."""
     wanted = range(1000, 1000 + seeds)
@@ -158,7 +197,7 @@ def _stored(name: str, results: Path) -> Iterator[tuple[int, Outcome]]:
     for line in map(json.loads, lines):
         if line.pop("world") == name:
             tags, errors, std = (tuple(line[key]) for key in ("tags", "errors_ns", "std_ns"))
-            yield line["seed"], Outcome(tags, errors, std, line["refused"])
+            yield line["seed"], Outcome(tags, errors, std, line["refused"], line.get("exchanged", ""))
 
 
 def main(argv: list[str]) -> int:
@@ -170,11 +209,12 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--results", type=Path, help="file of outcomes, a line each: what it has is not surveyed again")
     parser.add_argument("--write", action="store_true", help="write the table into the page")
     given = parser.parse_args(argv)
-    lines = [HEAD]
+    lines = []
     with ProcessPoolExecutor(given.workers) as pool:
-        for name in WORLDS:
-            if given.only in name:
-                lines.append(row(name, outcomes_of(name, given.seeds, given.results, pool)))
+        for worlds, head, line in ((WORLDS, HEAD, row), (LABELS, f"\n{LABELS_HEAD}", labels_row)):
+            lines.append(head)
+            for name in filter(lambda name: given.only in name, worlds):
+                lines.append(line(name, outcomes_of(name, given.seeds, given.results, pool)))
                 print(lines[-1], flush=True)
     if given.write:
         page, text = PAGE.read_text(encoding="utf-8"), "\n".join(lines) + "\n"

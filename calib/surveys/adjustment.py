@@ -28,6 +28,9 @@ CURVE_FACTOR: Final = 1.8
 SETTLED: Final = 1e-8
 """Share of the weighed squares below which a step gains nothing: a ten-thousandth of a standard deviation."""
 
+ORDER_IS_RIGHT: Final = 2 * math.log(100.0)
+"""-2 log of the chance that boards stand in another order than somebody said who put them so: one in a hundred."""
+
 MOST_STEPS: Final = 60
 ROUNDS: Final = 6
 
@@ -167,7 +170,8 @@ def unlikely_at(network: Network, x: Floats, std_m: Floats, curve_std_m: float, 
     prior = network.prior(curve_std_m)
     known = float(np.linalg.slogdet(rows.T @ rows + prior)[1]) - float(np.linalg.slogdet(prior)[1])
     marks = unlikely(int(network.reflected.sum()), len(network.means))
-    return weighed + known + 2 * float(np.log(std_m).sum()) + marks
+    orders = ORDER_IS_RIGHT * len(network.out_of_order(x))
+    return weighed + known + 2 * float(np.log(std_m).sum()) + marks + orders
 
 
 def averaged(found: Adjusted) -> Adjusted:

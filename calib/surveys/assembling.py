@@ -61,7 +61,12 @@ def _place(gathered: Gathered, knowledge: Knowledge, there: dict[str, set[int]],
         )
     if placed and shape == "plane" and len({p.position_m[2] for p in placed}) > 1:
         raise BadInputError(f"{one.name}: a plane is that of x and y; its positions differ in z", parameter="known")
-    return Place(one.name, DIMENSIONS[shape], tags)
+    order = knowledge.order_of(one)
+    strangers = sorted(set(order) - set(tags))
+    if strangers or len(set(order)) < len(order):
+        who = f"tag {strangers[0]}, which does not range there" if strangers else "a tag twice"
+        raise BadInputError(f"{one.name}: its order of boards has {who}", parameter="known")
+    return Place(one.name, DIMENSIONS[shape], tags, order=order)
 
 
 def _known(places: tuple[Place, ...], knowledge: Knowledge, distances: tuple[KnownDistance, ...]) -> Known:

@@ -17,7 +17,8 @@ import numpy as np
 
 from calib.surveys.adjustment import Adjusted, adjust, leverages
 from calib.surveys.minima import alone, found_positions, settled_marks
-from calib.surveys.network import Network, Place
+from calib.surveys.network import Network
+from calib.surveys.orders import along, exchanged, in_words
 from calib.surveys.starts import first_start
 from uwblink.arrays import Floats
 
@@ -138,7 +139,7 @@ def _beside(found: Adjusted, arrangement: int) -> tuple[_Single, float]:
     flat = alone(found, arrangement)
     place = flat.places[0]
     here = settled_marks(flat, found, flat.with_positions(flat.centre(), found_positions(found, arrangement)))[0]
-    freed = replace(flat, places=(Place(place.name, place.dimensions + 1, place.tags, BESIDE_M),))
+    freed = replace(flat, places=(replace(place, dimensions=place.dimensions + 1, beside_m=BESIDE_M),))
     freed = freed.marked(np.zeros_like(freed.reflected))
     points = first_start(freed, np.array([flat.fixed_m[tag] for tag in flat.tags]))
     place_m = freed.positions(points)
@@ -148,6 +149,27 @@ def _beside(found: Adjusted, arrangement: int) -> tuple[_Single, float]:
         place_m[:, last] += LIFT_M * np.where(np.arange(len(place_m)) % 2, 1.0, -1.0)
     there, x, marked = settled_marks(freed, found, freed.with_positions(points, place_m))
     return _Single(marked, x), here - there
+
+
+def misplaced(found: Adjusted) -> Iterator[tuple[str, str]]:
+    """Yield the kind of it and what is wrong with orders that were said of boards on a line, a line for each mistake.
+
+    What several arrangements have in common is one mistake.
+    """
+    network = found.network
+    points = network.positions(found.x)
+    spots = {k: along(points[network.seats(k)][network.places[k].ordered_rows]) for k in network.out_of_order(found.x)}
+    mistakes: list[tuple[set[tuple[int, int]], list[int]]] = []
+    for k, spot in spots.items():
+        pairs = exchanged(network.places[k].order, spot)
+        same = next((n for n, (known, _) in enumerate(mistakes) if known & pairs), None)
+        if same is None:
+            mistakes.append((pairs, [k]))
+        else:
+            mistakes[same] = (mistakes[same][0] & pairs, [*mistakes[same][1], k])
+    for pairs, rows in mistakes:
+        places = [network.places[k] for k in rows]
+        yield "labels", in_words([place.name for place in places], pairs, places[0].order, spots[rows[0]])
 
 
 def _exchanged(found: Adjusted) -> Iterator[Doubt]:

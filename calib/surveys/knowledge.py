@@ -46,7 +46,8 @@ class KnownPosition:
 class Knowledge:
     """What is known of arrangements: `shapes` by name, stretches of time in seconds since the first exchange by name.
 
-    `shape` is that of all arrangements that `shapes` does not name.
+    `shape` is that of all arrangements that `shapes` does not name; `orders` are the tags of a line as they were put
+    along it, from either end, by name.
 
     >>> import calib
     >>> from uwblink import KnownDistance
@@ -60,26 +61,34 @@ class Knowledge:
     spans_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     distances: tuple[KnownDistance, ...] = ()
     positions: tuple[KnownPosition, ...] = ()
+    orders: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def shape_of(self, arrangement: Arrangement) -> str:
         """Return what is known of where boards stand in an arrangement: what is said here, else what it says itself."""
-        return self.shapes.get(arrangement.name, self.shape or arrangement.known)
+        said = "line" if arrangement.name in self.orders else self.shape or arrangement.known
+        return self.shapes.get(arrangement.name, said)
+
+    def order_of(self, arrangement: Arrangement) -> tuple[int, ...]:
+        """Return in which order boards stand on a line; empty where nobody said it, or where they are on none."""
+        order = self.orders.get(arrangement.name, arrangement.order)
+        return tuple(order) if self.shape_of(arrangement) == "line" else ()
 
 
 def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     """Read a TOML file of `[[arrangements]]`, `[[distances]]` and `[[positions]]`; raises `BadInputError`, one line.
 
     `known = "line"` or "plane" at the head holds for all arrangements; an arrangement has `name`, and any of `known`,
-    `start_s` and `end_s`. A distance has `between = [1, 2]`, `distance_m`, and any of `sigma_m` and `arrangement`; a
-    position `tag`, `position_m`, and any of the same two.
+    `order = [3, 1, 2]`, `start_s` and `end_s`. A distance has `between = [1, 2]`, `distance_m`, and any of `sigma_m`
+    and `arrangement`; a position `tag`, `position_m`, and any of the same two.
     """
     file = TomlReader(Path(path), BadInputError, "file of what is known")
     file.known(file.table, ("known", "arrangements", "distances", "positions"))
-    shapes, spans = _arrangements(file)
+    shapes, spans, orders = _arrangements(file)
     return Knowledge(
         shape=_shape(file, "known", file.table.get("known", "")),
         shapes=shapes,
         spans_s=spans,
+        orders=orders,
         distances=tuple(_distance(file, f"distances[{k}].", row) for k, row in enumerate(_rows(file, "distances"))),
         positions=tuple(_position(file, f"positions[{k}].", row) for k, row in enumerate(_rows(file, "positions"))),
     )
@@ -96,15 +105,23 @@ def _shape(file: TomlReader, key: str, value: Any) -> str:
     return str(file.choice(key, value, SHAPES))
 
 
-def _arrangements(file: TomlReader) -> tuple[dict[str, str], dict[str, tuple[float, float]]]:
+def _arrangements(
+    file: TomlReader,
+) -> tuple[dict[str, str], dict[str, tuple[float, float]], dict[str, tuple[int, ...]]]:
     shapes: dict[str, str] = {}
     spans: dict[str, tuple[float, float]] = {}
+    orders: dict[str, tuple[int, ...]] = {}
+    names: set[str] = set()
     for k, row in enumerate(_rows(file, "arrangements")):
         where = f"arrangements[{k}]."
-        file.known(row, ("name", "known", "start_s", "end_s"), where)
+        file.known(row, ("name", "known", "order", "start_s", "end_s"), where)
         name = _word(file, f"{where}name", row.get("name"))
-        file.check(f"{where}name", name, name not in shapes, "each name once")
-        shapes[name] = _shape(file, f"{where}known", row.get("known", ""))
+        file.check(f"{where}name", name, name not in names, "each name once")
+        names.add(name)
+        if "order" in row:
+            orders[name] = _order(file, f"{where}order", row["order"], row.get("known", "line"))
+        if "known" in row or name not in orders:
+            shapes[name] = _shape(file, f"{where}known", row.get("known", ""))
         if ("start_s" in row) != ("end_s" in row):
             raise BadInputError(f"{file.path}: {where}start_s: give both start_s and end_s, or neither")
         if "start_s" in row:
@@ -112,7 +129,14 @@ def _arrangements(file: TomlReader) -> tuple[dict[str, str], dict[str, tuple[flo
             file.check(f"{where}start_s", start, _is_time(start), "a number of seconds")
             file.check(f"{where}end_s", end, _is_time(end) and end > start, f"a number above start_s, {start}")
             spans[name] = (float(start), float(end))
-    return shapes, spans
+    return shapes, spans, orders
+
+
+def _order(file: TomlReader, key: str, order: Any, shape: Any) -> tuple[int, ...]:
+    good = isinstance(order, list) and len(order) > 1 and all(map(_is_id, order)) and len(set(order)) == len(order)
+    file.check(key, order, good, "two tags or more, each once, as in [3, 1, 2]")
+    file.check(key, order, shape == "line", 'an order of boards on a line, known = "line"')
+    return tuple(order)
 
 
 def _distance(file: TomlReader, where: str, row: dict[str, Any]) -> KnownDistance:
@@ -161,7 +185,7 @@ def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
 
     Lengths that come from Python are checked here, too.
     """
-    named = {*knowledge.shapes, *(d.arrangement for d in knowledge.distances)}
+    named = {*knowledge.shapes, *knowledge.orders, *(d.arrangement for d in knowledge.distances)}
     named |= {p.arrangement for p in knowledge.positions}
     strangers = sorted(named - {"", *tags})
     if strangers:

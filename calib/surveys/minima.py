@@ -10,7 +10,7 @@ import numpy as np
 from calib.surveys.adjustment import Adjusted, adjust, settle, unlikely_at
 from calib.surveys.network import Known, Network
 from calib.surveys.reflections import searched
-from calib.surveys.starts import first_start, other_starts
+from calib.surveys.starts import first_start, other_starts, start_in_order
 from uwblink.arrays import Bools, Floats
 
 SHAKEN: Final = 4
@@ -46,6 +46,9 @@ def best(network: Network, *, pair_std_m: float | None) -> tuple[Adjusted, Secon
     # Once more with the delays that came out: the first guess of places was made without any.
     again = adjust(network, first_start(network, found.x[network.delay_columns]), pair_std_m=pair_std_m)
     found = min(found, again, key=lambda one: one.unlikely)
+    said = start_in_order(network, found.x)
+    if said is not None:
+        found = min(found, adjust(network, said, pair_std_m=pair_std_m), key=lambda one: one.unlikely)
     worse: list[tuple[float, Who]] = []
     for _ in range(MOST_MOVES):
         others = [other for k in range(len(network.places)) for other in _others(found, k)]

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.surveys.orders import agrees, along
 from calib.surveys.pair_means import PairMeans
 from calib.surveys.power import PowerModel
 from uwblink.arrays import Bools, Floats, Ints
@@ -31,13 +32,20 @@ DETOUR_STD_M: Final = 0.25
 class Place:
     """An arrangement of boards: its name, in how many dimensions they may stand, and who they are.
 
-    `beside_m` is how far they stand out into the last of these dimensions, as a standard deviation.
+    `beside_m` is how far they stand out into the last of these dimensions, as a standard deviation. `order` are tags as
+    they are said to stand along a line, or nothing.
     """
 
     name: str
     dimensions: int
     tags: tuple[int, ...]
     beside_m: float = FAR_M
+    order: tuple[int, ...] = ()
+
+    @property
+    def ordered_rows(self) -> list[int]:
+        """The numbers among `tags` of those whose order is said, in that order."""
+        return [self.tags.index(tag) for tag in self.order]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,6 +224,16 @@ class Network:
         owner = np.array([a for a, _ in self.points])
         each = np.repeat(owner[k.at][:, None], 3, axis=1)[self._position_free]
         return np.asarray(np.concatenate([self.means.arrangement, owner[k.ends[:, 0]], each]) == arrangement)
+
+    def seats(self, arrangement: int) -> list[int]:
+        """Return the points (rows of `points`) of an arrangement, in the order of its tags."""
+        return [n for n, (k, _) in enumerate(self.points) if k == arrangement]
+
+    def out_of_order(self, x: Floats) -> list[int]:
+        """Return the arrangements in which boards do not stand in the order that is said."""
+        said = [k for k, place in enumerate(self.places) if place.order]
+        points = self.positions(x) if said else np.zeros((0, 3))
+        return [k for k in said if not agrees(along(points[self.seats(k)][self.places[k].ordered_rows]))]
 
     def marked(self, reflected: Bools) -> Network:
         """Return the network with other means (n,) taken to be reflected."""

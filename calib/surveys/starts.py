@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from calib.surveys.network import Network
+from calib.surveys.orders import rearranged
 from uwblink.arrays import Floats
 
 
@@ -23,6 +24,15 @@ def first_start(network: Network, delays_m: Floats | None = None) -> Floats:
         place[here, : found.shape[1]] = found
         place[here] = _onto_known(network, place[here], here)
     return network.with_positions(x, place)
+
+
+def start_in_order(network: Network, x: Floats) -> Floats | None:
+    """Return unknowns with boards put in the order that is said wherever they stand in another; None where nowhere."""
+    place, wrong = network.positions(x), network.out_of_order(x)
+    for k in wrong:
+        here = network.seats(k)
+        place[here] = rearranged(place[here], network.places[k].ordered_rows)[0]
+    return network.with_positions(x, place) if wrong else None
 
 
 def scaled(apart: Floats, dimensions: int) -> Floats:
@@ -41,7 +51,11 @@ def other_starts(network: Network, x: Floats, arrangement: int, count: int, seed
     place = network.positions(x)
     here = [k for k, (a, _) in enumerate(network.points) if a == arrangement]
     dimensions = network.places[arrangement].dimensions
-    for points in _variants(place[here], dimensions, count, rng):
+    order = network.places[arrangement].ordered_rows
+    if order:
+        yield first_start(network, x[network.delay_columns])
+    said = rearranged(place[here], order) if order else []
+    for points in (*said, *_variants(place[here], dimensions, count, rng)):
         changed = place.copy()
         changed[here] = points
         yield network.with_positions(x, changed)

@@ -16,7 +16,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.sources import Data
 from calib.surveys.adjustment import Adjusted, averaged
 from calib.surveys.assembling import assembled
-from calib.surveys.doubts import worst
+from calib.surveys.doubts import misplaced, worst
 from calib.surveys.gathering import Gathered, gather
 from calib.surveys.knowledge import Knowledge, load_knowledge
 from calib.surveys.minima import SecondBest, best
@@ -121,6 +121,7 @@ def _without_doubts(network: Network, names: tuple[str, ...], pair_error_m: floa
         found = doubted[1]
     if findings:
         found, second = best(found.network, pair_std_m=pair_error_m)
+    findings += [Contradiction(kind, text) for kind, text in misplaced(found)]
     return _Settled(averaged(found), second, tuple(findings))
 
 

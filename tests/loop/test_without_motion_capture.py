@@ -138,6 +138,8 @@ def test_the_file_of_what_is_known_is_read_as_it_stands_there(tmp_path):
     (example,) = re.findall(r"^```toml\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
     (tmp_path / "known.toml").write_text(example)
     known = load_knowledge(tmp_path / "known.toml")
-    assert (known.shape, dict(known.shapes), dict(known.spans_s)) == ("line", {"A": "plane"}, {"A": (0.0, 60.0)})
+    spans = {"A": (0.0, 60.0), "B": (70.0, 130.0)}
+    assert (known.shape, dict(known.shapes), dict(known.spans_s)) == ("line", {"A": "plane"}, spans)
+    assert dict(known.orders) == {"B": (3, 1, 4, 2)}
     assert known.distances[0].distance_m == 3.06
     assert known.positions[0].tag == 4

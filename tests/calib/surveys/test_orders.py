@@ -1,0 +1,98 @@
+"""Boards in the order that is said: exchanged labels are named, right ones are not, and what cannot be told is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import calib
+from benchmarks.standing import standing_boards
+from benchmarks.surveys import orders_of
+from calib.errors import BadInputError, UnanswerableError
+from calib.surveys.knowledge import load_knowledge
+from calib.surveys.network import Place
+from calib.surveys.orders import agrees, along, amiss, exchanged, rearranged
+
+FIVE = standing_boards(4, boards=5, arrangements=6, reflected=0.05)
+
+
+def said_with(world, exchange=None):
+    """What is known: the line, and the true orders but for labels (arrangement, one, other) that are exchanged."""
+    orders = orders_of(world, None)[0]
+    for name, one, other in exchange or ():
+        swap = {one: other, other: one}
+        orders[name] = tuple(swap.get(tag, tag) for tag in orders[name])
+    return calib.Knowledge(shape="line", orders=orders)
+
+
+def test_right_orders_from_either_end_are_not_spoken_against():
+    known = said_with(FIVE)
+    turned = replace(known, orders={name: order[::-1] for name, order in known.orders.items()})
+    found = [calib.survey(FIVE.ranges, known=one) for one in (known, turned)]
+    assert found[0].contradictions == ()
+    assert found[0].calibration.delays_ns == pytest.approx(found[1].calibration.delays_ns, abs=1e-3)
+
+
+def test_exchanged_labels_of_an_arrangement_are_named_and_the_ranges_are_believed_if_asked():
+    order = orders_of(FIVE, None)[0]["3"]
+    known = said_with(FIVE, [("3", order[0], order[1])])
+    pair = f"{min(order[:2])} and {max(order[:2])}"
+    with pytest.raises(UnanswerableError, match=f"^3: boards {pair} stand in each other's place: said was") as told:
+        calib.survey(FIVE.ranges, known=known)
+    assert "\n" not in str(told.value)
+    found = calib.survey(FIVE.ranges, known=known, regardless=True)
+    assert [one.kind for one in found.contradictions] == ["labels"]
+    right = calib.survey(FIVE.ranges, known=said_with(FIVE))
+    assert found.calibration.delays_ns == pytest.approx(right.calibration.delays_ns, abs=1e-3)
+
+
+def test_labels_that_are_exchanged_everywhere_are_one_mistake():
+    known = said_with(FIVE, [(str(k), 2, 5) for k in range(1, 7)])
+    with pytest.raises(UnanswerableError, match="1, 2, 3, 4, 5, 6: boards 2 and 5 stand in each other's place"):
+        calib.survey(FIVE.ranges, known=known)
+
+
+def test_an_exchange_that_is_another_one_from_the_other_end_names_both():
+    places = np.array([0.0, 1.0, 2.0, 3.0])
+    assert exchanged((1, 3, 2, 4), places) == set()
+    assert exchanged((1, 3, 2, 4), places[[0, 2, 1, 3]]) == {(2, 3), (1, 4)}
+    assert exchanged((1, 3, 2, 4), places[[1, 0, 2, 3]]) == {(1, 3)}
+
+
+def test_boards_side_by_side_stand_in_either_order():
+    assert agrees(np.array([0.0, 1.0, 0.95, 2.0]))
+    assert agrees(np.array([2.0, 0.95, 1.0, 0.0]))
+    assert not agrees(np.array([0.0, 1.0, 0.85, 2.0]))
+    assert amiss(np.array([0.0, 1.0, 0.85, 2.0])) == pytest.approx(0.15)
+
+
+def test_points_are_put_in_the_order_that_is_said():
+    points = np.array([[0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0]])
+    near, far = rearranged(points, [0, 1, 2])
+    assert near[:, 0].tolist() == [0.0, 1.0, 3.0]
+    assert far[:, 0].tolist() == [3.0, 1.0, 0.0]
+    assert agrees(along(near[[0, 1, 2]]))
+    assert Place("A", 1, (4, 7, 9), order=(9, 4, 7)).ordered_rows == [2, 0, 1]
+
+
+def test_the_file_of_what_is_known_states_orders(tmp_path):
+    file = tmp_path / "known.toml"
+    file.write_text('[[arrangements]]\nname = "A"\norder = [3, 1, 2]\n')
+    known = load_knowledge(file)
+    assert (dict(known.orders), dict(known.shapes)) == ({"A": (3, 1, 2)}, {})
+    for text, message in (
+        ("order = [3, 3]", "each once"),
+        ("order = [3]", "each once"),
+        ('order = "3 1"', "each once"),
+        ('order = [3, 1]\nknown = "plane"', 'known = "line"'),
+        ('order = [3, 1]\n[[arrangements]]\nname = "A"', "each name once"),
+    ):
+        file.write_text(f'[[arrangements]]\nname = "A"\n{text}\n')
+        with pytest.raises(BadInputError, match=message):
+            load_knowledge(file)
+
+
+@pytest.mark.parametrize("orders", [{"1": (1, 2, 9)}, {"1": (1, 2, 2)}, {"Z": (1, 2)}])
+def test_orders_of_boards_that_are_not_there_are_refused(orders):
+    with pytest.raises(BadInputError, match=r"order of boards|an arrangement"):
+        calib.survey(FIVE.ranges, known=calib.Knowledge(shape="line", orders=orders))
