@@ -37,21 +37,14 @@ class Outcome:
 
 def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, Outcome]:
     """Simulate, fit with each loss, and compare with what was planted."""
-    import tempfile
-
+    import uwbsim
     from calib.estimation.fitting import fit
     from calib.evaluation.statistics import evaluate
     from calib.sources import load_ranges
-    from uwbsim.scenario.loading import load as load_scenario
-    from uwbsim.simulation.run import simulate
-    from uwbsim.simulation.simulated import write
 
     settings = [f"run.seed={seed}", f"radio.multipath.share={share}"]
     settings += [f"run.duration_s={duration_s}"] if duration_s else []
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "flight.uwb"
-        write(simulate(load_scenario(TRAIN, settings)), path)
-        ranges = load_ranges(path)
+    ranges = load_ranges(uwbsim.simulate(uwbsim.load(TRAIN, settings)))
     found = {}
     for loss in LOSSES:
         calibration = fit(ranges, loss=loss).calibration
