@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tests import processes
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BOARDS = (ROOT / "docs" / "tutorials" / "boards.md").read_text(encoding="utf-8")
@@ -62,7 +64,7 @@ def test_the_commands_for_boards_work_on_served_ones(tmp_path):
         commands = shell_commands(BOARDS, " boards")
         assert len(commands) >= 8
         for command in commands:
-            done = subprocess.run(command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True)
+            done = processes.run(*command.split(), cwd=tmp_path, env=environment)
             assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         script = re.search(r"^```python\n(.*?)^```", BOARDS, flags=re.MULTILINE | re.DOTALL)[1]
         done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
@@ -76,7 +78,7 @@ def test_the_way_from_served_drones_to_a_calibration_works(tmp_path):
         shutil.copytree(ROOT / name, tmp_path / name)
     with serving(tmp_path, " serve-drones", "motion.csv", "drones/tag6") as environment:
         for command in shell_commands(BOARDS, " drones"):
-            done = subprocess.run(command.split(), cwd=tmp_path, env=environment, capture_output=True, text=True)
+            done = processes.run(*command.split(), cwd=tmp_path, env=environment)
             assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
     fitted = json.loads((tmp_path / "drones.json").read_text())["delays_ns"]
     planted = {str(t["id"]): t["delay_ns"] for t in tomllib.loads((tmp_path / TRAIN).read_text())["tags"]}

@@ -1,20 +1,17 @@
 """Recordings that lack something: every command that needs it says what, and ends with status 1 or 2 as it should."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import calib
 import uwbsim
+from tests import processes
 from uwblink import Contents, Exchanges, Poses
 from uwblink.errors import ImportTableError
 from uwblink.importers.guess import guess_map
 
-BIN = Path(sys.executable).parent
 COUNT = 900
 
 
@@ -34,7 +31,7 @@ def known(tmp_path_factory):
 
 
 def run(*words):
-    done = subprocess.run([str(BIN / words[0]), *map(str, words[1:])], capture_output=True, text=True)
+    done = processes.run(*words)
     return done.returncode, done.stderr
 
 

@@ -1,9 +1,6 @@
 """Figures of commands without a report, PDF where the name says so, and nothing that takes another's place."""
 
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -11,10 +8,9 @@ import calib
 from calib.report.blocks import Document, Picture
 from calib.report.writing import check_places, write_document
 from calib.samples import sample_flight
+from tests import processes
 from uwblink.pages.figures import sheet
 from uwblink.recording.file import Recording
-
-BIN = Path(sys.executable).parent
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +27,7 @@ def folder(tmp_path_factory):
 
 
 def run(folder, *words, status=0):
-    done = subprocess.run([BIN / "calib", *words], capture_output=True, text=True, cwd=folder)
+    done = processes.run("calib", *words, cwd=folder)
     assert done.returncode == status, done.stderr
     return done
 

@@ -1,16 +1,13 @@
 """Scenarios that come along, by name: found, listed, copied."""
 
 import doctest
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import uwbsim
+from tests import processes
 from uwbsim.scenario import copy_scenarios, listed, shipped, shipped_scenarios
-
-UWBSIM = Path(sys.executable).parent / "uwbsim"
 
 
 def test_the_examples_run():
@@ -58,7 +55,7 @@ def test_copies_run_on_their_own(tmp_path):
 
 def test_the_command_copies_and_replaces_only_when_told(tmp_path):
     def run(*words):
-        return subprocess.run([UWBSIM, "scenarios", *words], cwd=tmp_path, capture_output=True, text=True)
+        return processes.run("uwbsim", "scenarios", *words, cwd=tmp_path)
 
     assert "icra2023/train" in run().stdout
     assert run("icra2023", "-o", "s").stdout.splitlines() == [
