@@ -1,8 +1,9 @@
 """Eight hours of recording at 200 exchanges a second, in virtual time: memory, latency and the commands on the file.
 
-`python -m benchmarks.hours record [HOURS]` records from boards that answer at once and cost nothing, so that what is
-measured is the recorder; `python -m benchmarks.hours commands [EXCHANGES]` measures show, doctor, fit, apply and export
-on a flight of that many exchanges with poses, each in a process of its own.
+`python -m benchmarks.hours record HOURS FILE` records from boards that answer at once and cost nothing, so that what is
+measured is the recorder, and adds poses of motion capture; `python -m benchmarks.hours commands FILE` measures show,
+doctor, fit, apply and export on that file, each in a process of its own; `python -m benchmarks.hours write EXCHANGES
+FILE` makes a flight to use instead.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from bisect import bisect
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -26,19 +29,28 @@ from uwblink.boards.listeners import Heard
 from uwblink.boards.ports import Transport
 from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.recorder import record
+from uwblink.boards.recorder import FILE_MB, record
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import FrameRow
+from uwblink.recording.schema import FrameRow, Poses
 from uwblink.wire.codec import Decoder, encode
 from uwblink.wire.messages import REPORTS, GetId, IdReport, RangeCommand, RangeReport
 
-HOURS: Final = 8.0
 RATE_HZ: Final = 200.0
-EXCHANGES: Final = 5_760_000
+BEGIN_NS: Final = 1_000_000_000
+"""When flights begin, by their own clock."""
+
 ANSWER_NS: Final = 4_000_000
-BANK: Final = 4_000
-"""Different reports that the boards have; they come again."""
+ROUND_S: Final = 100.0
+"""Bodies move so long before they begin again."""
+
+A_ROUND: Final = 4_000
+"""Different reports that the boards have, without a wish for more; they come again."""
+
+MANY_A_ROUND: Final = 80_000
+"""So many that a report is of what was 15 ms ago at most, as poses tell it."""
+
+LINES_EVERY_S: Final = 1_800.0
 
 COMMANDS: Final = (
     ("uwblink", "show", "long.uwb"),
@@ -83,19 +95,23 @@ class AnsweringPort:
 class AnsweringPorts:
     """Ports of such boards; time passes only while somebody waits. Reports are those of a flight, again and again."""
 
-    def __init__(self, seed: int = 1) -> None:
-        """Make the reports."""
+    def __init__(self, seed: int = 1, a_round: int = A_ROUND) -> None:
+        """Make so many reports for `a_round` of the flight."""
         self.time_ns = 0
         self._open: dict[str, AnsweringPort] = {}
-        e = fly(Plan(seconds=BANK / 160, per_second=160), seed).exchanges
-        self._reports: dict[bytes, deque[bytes]] = {}
+        self.flight = fly(Plan(seconds=ROUND_S, per_second=a_round / ROUND_S), seed)
+        e = self.flight.exchanges
+        self._reports: dict[bytes, tuple[list[int], list[bytes]]] = {}
         for k in range(len(e)):
             report = RangeReport(
                 int(e.target[k]), float(e.range_m[k]),
                 *(int(getattr(e, name)[k]) for name in ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")),
                 *(float(getattr(e, name)[k]) for name in ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")),
             )  # fmt: skip
-            self._reports.setdefault(self._key(int(e.initiator[k]), int(e.target[k])), deque()).append(encode(report))
+            key = self._key(int(e.initiator[k]), int(e.target[k]))
+            times, reports = self._reports.setdefault(key, ([], []))
+            times.append(int(e.time_ns[k]) - BEGIN_NS)
+            reports.append(encode(report))
         self.pairs = tuple(sorted((i, j) for i, j in (map(int, key.split()) for key in self._reports) if i < j))
         self.names = [str(board) for board in sorted({*e.initiator.tolist(), *e.target.tolist()})]
 
@@ -103,10 +119,17 @@ class AnsweringPorts:
         """Return what a board says to a command."""
         if data == encode(GetId()):
             return encode(IdReport(board))
-        target = int(data.split(b"|")[1])
-        bank = self._reports[self._key(board, target)]
-        bank.rotate(-1)
-        return bank[0]
+        times, reports = self._reports[self._key(board, int(data.split(b"|")[1]))]
+        return reports[bisect(times, self.time_ns % int(ROUND_S * 1e9)) - 1]
+
+    def poses(self, seconds: float) -> Iterator[Poses]:
+        """Yield the poses of so many seconds, a round at a time."""
+        p = self.flight.poses
+        begin, end = BEGIN_NS, BEGIN_NS + int(ROUND_S * 1e9)
+        one = p[np.flatnonzero((p.time_ns >= begin) & (p.time_ns < end))]
+        one = one[np.argsort(one.time_ns, kind="stable")]
+        for k in range(int(np.ceil(seconds / ROUND_S))):
+            yield replace(one, time_ns=one.time_ns + k * int(ROUND_S * 1e9) - BEGIN_NS)
 
     @staticmethod
     def _key(board: int, target: int) -> bytes:
@@ -154,25 +177,26 @@ class TimedBatch(writer.Batch):
         self.commits.append((begin, time.monotonic()))
 
 
-def recording(hours: float) -> None:
-    """Record in virtual time; prints a line for each tenth of it. *: by processor time."""
+def recording(hours: float, path: Path) -> None:
+    """Record in virtual time; prints a line for each half hour of it. *: by processor time."""
     writer.Batch = TimedBatch  # type: ignore[misc]
-    ports, lines = AnsweringPorts(), _Lines(hours * 3600 / 10)
+    ports = AnsweringPorts(a_round=MANY_A_ROUND)
     print("| hour | exchanges | file | memory | commit, median (99 %) | message to row, 99 % | times real time* |")
-    print("|---|---|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory() as folder:
-        lines.path = Path(folder) / "long.uwb"
-        plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ)
-        record(ports.names, lines.path, plan, duration_s=hours * 3600, using=ports, watch=lines.watch)
+    print("|---|---|---|---|---|---|---|", flush=True)
+    plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ, tags=tuple(ports.flight.tags))
+    record(ports.names, path, plan, duration_s=hours * 3600, using=ports, watch=_Lines(path).watch, force=True)
+    with Recording.open(path, update=True, memory_mb=FILE_MB) as recorded:
+        for poses in ports.poses(hours * 3600):
+            recorded.append_poses(poses)
 
 
 class _Lines:
     """Prints what was measured since the last line."""
 
-    def __init__(self, every_s: float) -> None:
-        self._every_s = self._next_s = every_s
+    def __init__(self, path: Path) -> None:
+        self._next_s = LINES_EVERY_S
         self._began = time.process_time()
-        self.path = Path()
+        self.path = path
 
     def watch(self, progress: Progress) -> None:
         if progress.time_s < self._next_s:
@@ -187,11 +211,11 @@ class _Lines:
         print(
             f"| {progress.time_s / 3600:.1f} | {progress.exchanges} | {self.path.stat().st_size / 1e6:.0f} MB | "
             f"{pages / 1e6:.0f} MB | {1e3 * np.median(taken):.0f} ms ({1e3 * np.percentile(taken, 99):.0f}) | "
-            f"{1e3 * np.percentile(late, 99):.0f} ms | {self._every_s / (now - self._began):.0f} |",
+            f"{1e3 * np.percentile(late, 99):.0f} ms | {LINES_EVERY_S / (now - self._began):.0f} |",
             flush=True,
         )
         self._began = now
-        self._next_s += self._every_s
+        self._next_s += LINES_EVERY_S
 
 
 def growth(path: Path) -> None:
@@ -227,28 +251,27 @@ def _commits(recording: Recording, batch: writer.Batch) -> str:
     return f"{1e3 * np.median(taken):.1f} ms ({1e3 * np.percentile(taken, 99):.1f})"
 
 
-def commands(exchanges: int) -> None:
-    """Write a flight of so many exchanges, and measure each command on it."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "long.uwb"
-        subprocess.run([sys.executable, "-m", "benchmarks.hours", "write", str(exchanges), str(path)], check=True)
-        growth(path)
-        print("| command | processor time | largest memory |")
-        print("|---|---|---|")
-        for words, seconds, memory_mb in measured(Path(folder)):
-            print(f"| `{words}` | {seconds:.1f} s | {memory_mb:.0f} MB |", flush=True)
+def commands(path: Path) -> None:
+    """Measure commits into a recording, and each command on it."""
+    growth(path)
+    print("| command | processor time | largest memory |")
+    print("|---|---|---|")
+    for words, seconds, memory_mb in measured(path):
+        print(f"| `{words}` | {seconds:.1f} s | {memory_mb:.0f} MB |", flush=True)
 
 
-def measured(folder: Path) -> Iterator[tuple[str, float, float]]:
+def measured(path: Path) -> Iterator[tuple[str, float, float]]:
     """Yield each command, its processor time, and the most memory that it had."""
-    for words in COMMANDS:
-        process = subprocess.Popen(
-            [sys.executable, "-m", *words], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        _, status, used = os.wait4(process.pid, 0)
-        if os.waitstatus_to_exitcode(status):
-            sys.exit(f"{' '.join(words)}: ended with {os.waitstatus_to_exitcode(status)}")
-        yield " ".join(words), used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "long.uwb").symlink_to(path.absolute())
+        for words in COMMANDS:
+            process = subprocess.Popen(
+                [sys.executable, "-m", *words], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
+            _, status, used = os.wait4(process.pid, 0)
+            if os.waitstatus_to_exitcode(status):
+                sys.exit(f"{' '.join(words)}: ended with {os.waitstatus_to_exitcode(status)}")
+            yield " ".join(words), used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
 def write(exchanges: int, path: Path) -> None:
@@ -260,15 +283,15 @@ def write(exchanges: int, path: Path) -> None:
 
 def main(words: list[str]) -> None:
     """Do what the first word says."""
-    what, *rest = words or ["record"]
-    if what == "write":
+    what, *rest = words
+    if what == "record":
+        recording(float(rest[0]), Path(rest[1]))
+    elif what == "write":
         write(int(rest[0]), Path(rest[1]))
     elif what == "growth":
         growth(Path(rest[0]))
-    elif what == "commands":
-        commands(int(rest[0]) if rest else EXCHANGES)
     else:
-        recording(float(rest[0]) if rest else HOURS)
+        commands(Path(rest[0]))
 
 
 if __name__ == "__main__":
