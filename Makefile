@@ -89,8 +89,8 @@ bench-stream: setup ## measure how late streamed ranges are (15 s)
 	$(BIN)/python -m benchmarks.streaming
 
 bench-hours: setup ## record eight hours in virtual time, then all commands on 5.8 million exchanges (half an hour, 2 GB of disk)
-	$(BIN)/python -m benchmarks.hours record
-	$(BIN)/python -m benchmarks.hours commands
+	$(BIN)/python -m benchmarks.hours record 8 long.uwb
+	$(BIN)/python -m benchmarks.hours commands long.uwb
 
 bench-import: setup ## measure how long tables and poses take to come in (2 minutes, 1 GB)
 	$(BIN)/python -m benchmarks.importing

@@ -101,14 +101,17 @@ def _argument(row: Importer) -> Any:
 
 def _import(row: Importer, source: Path | list[Path], output: Path, map_file: Path | None, *, force: bool) -> None:
     from uwblink.display import printable
-    from uwblink.importers import read_source
-    from uwblink.output import check_output
+    from uwblink.importers import import_file
 
-    check_output(output, force=force)
-    with waiting("importing"):
-        contents = read_source(source, importer=row.name, map_file=map_file)
-        contents.save(output, force=force)
-        counts = contents.counts()
-    typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in counts.items())}")
-    for note in contents.meta.get("notes", ()):
+    with waiting("importing") as say:
+        done = import_file(
+            source,
+            output,
+            importer=row.name,
+            map_file=map_file,
+            force=force,
+            watch=lambda what, share: say(f"{what}, {share:.0%}" if share else what),
+        )
+    typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in done.counts.items())}")
+    for note in done.notes:
         typer.echo(f"  {printable(note)}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Lock, Timer
 from time import monotonic
@@ -20,6 +20,7 @@ class Waiting:
         """Begin to wait for `what`, as in "fitting"."""
         self._what, self._lock, self._over = what, Lock(), False
         self._line: Any = None
+        self._task: Any = None
         self._began = monotonic()
         self._timer = Timer(PATIENCE_S, self._show)
         self._timer.daemon = True
@@ -41,8 +42,18 @@ class Waiting:
         line.tasks[task].start_time = self._began
         with self._lock:
             if not self._over:
-                self._line = line
+                self._line, self._task = line, task
+                line.update(task, description=escape(self._what))
                 line.start()
+
+    def say(self, what: str) -> None:
+        """Say what is being done now."""
+        from rich.markup import escape
+
+        with self._lock:
+            self._what = what
+            if self._line is not None:
+                self._line.update(self._task, description=escape(what))
 
     def close(self) -> None:
         """Take the line away."""
@@ -54,16 +65,16 @@ class Waiting:
 
 
 @contextmanager
-def waiting(what: str) -> Iterator[None]:
+def waiting(what: str) -> Iterator[Callable[[str], None]]:
     """Show on a terminal that the block is still at work; elsewhere nothing, and nothing where it is quick.
 
-    The block prints nothing: what it found is printed after it.
+    The block prints nothing: what it found is printed after it. What this yields says what is being done now.
     """
     if not sys.stderr.isatty():
-        yield
+        yield lambda _what: None
         return
     line = Waiting(what)
     try:
-        yield
+        yield line.say
     finally:
         line.close()

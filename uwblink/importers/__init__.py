@@ -7,29 +7,40 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.exchange_bags import SUFFIXES as BAGS
 from uwblink.importers.exchange_bags import read_exchange_bag
-from uwblink.importers.exchange_tables import SUFFIXES, read_table, read_tables
+from uwblink.importers.exchange_tables import SUFFIXES, open_tables, read_table, read_tables
 from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.motion_capture import add_poses
+from uwblink.importers.staged_tables import Watch
 from uwblink.output import check_output
 from uwblink.plugins import NAME, Registry
 from uwblink.recording.contents import Contents
 
 __all__ = [
     "IMPORTERS",
+    "Imported",
     "Importer",
     "add_poses",
+    "import_file",
     "import_recording",
     "read_source",
     "register_importer",
 ]
+
+
+class Importing(Protocol):
+    """What files hold, and need not be in memory at once."""
+
+    def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
+        """Write a recording; returns how many rows its tables have, and what a user should know of the import."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +50,9 @@ class Importer:
     `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
     file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
     small letters, none for a kind of folder; `name` is that of the command `uwblink import NAME`, and `help` its line.
-    `read_all`, of kinds of which several files can be one recording, takes a list of paths instead of one.
+    `read_all`, of kinds of which several files can be one recording, takes a list of paths instead of one. `open_all`
+    is for kinds whose files need not be in memory at once, and used where a recording is written: it takes a list of
+    paths, the map's, and who is told what is being done, and yields an object with a method `write`.
     """
 
     name: str
@@ -48,6 +61,8 @@ class Importer:
     help: str
     map_help: str | None = None
     read_all: Callable[[Sequence[Path], Path | None], Contents] | None = None
+    _: KW_ONLY
+    open_all: Callable[[Sequence[Path], Path | None, Watch | None], AbstractContextManager[Importing]] | None = None
 
 
 def check_importer(row: Any) -> None:
@@ -76,6 +91,7 @@ _OWN: Final = (
         "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
         map_help="Names, units and constants (.toml).",
         read_all=read_tables,
+        open_all=open_tables,
     ),
     Importer(
         "bag",
@@ -140,10 +156,39 @@ def import_recording(
     >>> uwblink.import_recording(folder / "t.csv", folder / "t.uwb")
     1
     """
+    return import_file(source, output, importer=importer, map_file=map_file, force=force).counts["exchanges"]
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What was imported: how many rows by table, the exchanges first, and what a user should know of it."""
+
+    counts: dict[str, int]
+    notes: list[str]
+
+
+def import_file(
+    source: Source,
+    output: str | os.PathLike[str],
+    *,
+    importer: str | None = None,
+    map_file: str | os.PathLike[str] | None = None,
+    force: bool = False,
+    watch: Watch | None = None,
+) -> Imported:
+    """Do what `import_recording` does; returns what was imported.
+
+    `watch` is called with what is being done ("reading", "checking", "writing") and which share of it is done, by
+    importers that say so.
+    """
     check_output(Path(output), force=force)
-    contents = read_source(source, importer=importer, map_file=map_file)
+    sources, row, explained = _chosen(source, importer, map_file)
+    if row.open_all is not None:
+        with row.open_all(sources, explained, watch) as found:
+            return Imported(*found.write(output, force=force))
+    contents = _read(sources, row, explained)
     contents.save(output, force=force)
-    return len(contents.exchanges)
+    return Imported(contents.counts(), list(contents.meta.get("notes", ())))
 
 
 def read_source(
@@ -153,23 +198,30 @@ def read_source(
 
     An importer may say in `meta["notes"]`, a list of lines, what a user should know of the import.
     """
+    return _read(*_chosen(source, importer, map_file))
+
+
+def _chosen(
+    source: Source, importer: str | None, map_file: str | os.PathLike[str] | None
+) -> tuple[list[Path], Importer, Path | None]:
+    """Return the files, who reads them, and the file that explains them."""
     sources = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(one) for one in source]
     if not sources:
         raise ArgumentError("found no files, expected a path or several", parameter="source")
     row = _importer(sources[0], importer)
     if map_file is not None and row.map_help is None:
         raise ArgumentError(f"map_file: importer {row.name!r} takes none")
-    explained = None if map_file is None else Path(map_file)
-    contents = row.read(sources[0], explained) if len(sources) == 1 else _read_all(row, sources, explained)
+    if len(sources) > 1 and row.read_all is None:
+        raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
+    return sources, row, None if map_file is None else Path(map_file)
+
+
+def _read(sources: list[Path], row: Importer, map_file: Path | None) -> Contents:
+    several = row.read_all if len(sources) > 1 else None
+    contents = several(sources, map_file) if several else row.read(sources[0], map_file)
     if not isinstance(contents, Contents):
         raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
     return contents
-
-
-def _read_all(row: Importer, sources: list[Path], map_file: Path | None) -> Contents:
-    if row.read_all is None:
-        raise ArgumentError(f"importer {row.name!r} takes one file, found {len(sources)}", parameter="source")
-    return row.read_all(sources, map_file)
 
 
 def _importer(source: Path, name: str | None) -> Importer:

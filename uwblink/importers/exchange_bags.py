@@ -22,8 +22,8 @@ import numpy as np
 from uwblink.errors import ImportTableError
 from uwblink.importers.bags import Bag, opened
 from uwblink.importers.column_map import ColumnMap, load_map
-from uwblink.importers.exchange_tables import convert
-from uwblink.importers.table_rows import read_rows
+from uwblink.importers.exchange_tables import plan
+from uwblink.importers.staged_tables import StagedTables
 from uwblink.recording.contents import Contents
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
@@ -55,7 +55,8 @@ def read_exchange_bag(source: Path, map_file: Path | None = None) -> Contents:
             raise ImportTableError(f"{source}: a message is nested too deeply") from error
         if first is None:
             raise ImportTableError(f"{source}: no message on the topics of the map")
-        found = convert(read_rows([table], _timed(column_map, first)))
+        with StagedTables([table], _timed(column_map, first)) as tables:
+            found = plan(tables).contents()
     return replace(found, meta={**found.meta, "source": "import bag", "imported_from": source.name})
 
 

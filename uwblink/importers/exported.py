@@ -7,7 +7,8 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from uwblink.errors import ImportTableError
-from uwblink.importers.table import confined, first_line
+from uwblink.importers.relations import first_line
+from uwblink.importers.staging import confined
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import TABLES
 from uwblink.recording.store import Store
@@ -54,7 +55,7 @@ def _take(store: Store, table: str, source: Path) -> None:
         query = f"SELECT {', '.join(cells)} FROM {reader}"  # noqa: S608 - names are keys of TABLES
     else:
         query = f"SELECT {names} FROM read_parquet(?)"  # noqa: S608 - names are keys of TABLES
-    with confined(source) as db:
+    with confined([source]) as db:
         try:
             store.insert(table, dict(db.execute(query, [str(source)]).fetchnumpy()))
         except duckdb.Error as error:

@@ -12,15 +12,15 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.importers.stamps import NEVER
-from uwblink.importers.table_rows import RECEIVED, SENT, Bad, Rows, take
+from uwblink.importers.table_rows import RECEIVED, SENT, Rows, take
+from uwblink.importers.unusable import Unusable
 from uwblink.twr import STAMPS
 
 _OF_MESSAGE: Final = {"fpp": "fpp", "rxp": "rxp", "skew": "skew"}
 
 
-def from_messages(rows: Rows) -> tuple[Rows, str, list[Bad]]:
-    """Return exchanges of rows that are messages, their protocol, and the rows that belong to no whole exchange.
+def from_messages(rows: Rows, unusable: Unusable) -> tuple[Rows, str]:
+    """Return exchanges of rows that are messages, and their protocol; notes the rows that belong to no whole exchange.
 
     Messages are 1, 2 and 3, by a column or by their order. The first one's sender is the initiator; who sends the third
     tells "ds" from "ds-alt".
@@ -50,14 +50,14 @@ def from_messages(rows: Rows) -> tuple[Rows, str, list[Bad]]:
             cells |= {name: _put(rows.cells[theirs], group, mine, count) for name, theirs in named.items()}
     counts = np.bincount(group, weights=good, minlength=count)
     whole = counts == (3 if three else 2)
-    bad = [Bad(int(rows.origin[row]), "message", "messages 1, 2 (and 3) of one exchange") for row in start[~whole]]
+    unusable.add("message", rows.origin[start[~whole]], "messages 1, 2 (and 3) of one exchange")
     exchanges = take(rows, start)
     exchanges.cells, exchanges.ids = cells, {"from_id": initiator, "to_id": target}
-    return take(exchanges, np.flatnonzero(whole)), protocol, bad
+    return take(exchanges, np.flatnonzero(whole)), protocol
 
 
-def from_single_stamps(rows: Rows) -> tuple[Rows, list[Bad]]:
-    """Return rows that are messages, of rows that each have one stamp, and the rows whose message lacks one or has two.
+def from_single_stamps(rows: Rows, unusable: Unusable) -> Rows:
+    """Return rows that are messages, of rows that each have one stamp; notes those whose message lacks one or has two.
 
     Rows belong together by sender, receiver, number of the message, and sequence number or time.
     """
@@ -73,8 +73,8 @@ def from_single_stamps(rows: Rows) -> tuple[Rows, list[Bad]]:
     others = {name: column for name, column in rows.cells.items() if name not in ("stamp", "event")}
     messages = take(rows, start)
     messages.cells = {name: np.fmax.reduceat(column, start) for name, column in others.items()} | found if count else {}
-    bad = [Bad(int(rows.origin[row]), "event", "one tx and one rx of a message") for row in start[~whole]]
-    return take(messages, np.flatnonzero(whole)), bad
+    unusable.add("event", rows.origin[start[~whole]], "one tx and one rx of a message")
+    return take(messages, np.flatnonzero(whole))
 
 
 def _stamps_of_messages(rows: Rows) -> tuple[Ints, Ints]:
@@ -94,8 +94,8 @@ def _key(column: Floats) -> Ints:
     return np.nan_to_num(column, nan=-1).astype(np.int64)
 
 
-def from_parts(rows: Rows) -> tuple[Rows, list[Bad]]:
-    """Return exchanges of rows that each have some of the columns, and the rows in which one has two values."""
+def from_parts(rows: Rows, unusable: Unusable) -> Rows:
+    """Return exchanges of rows that each have some of the columns; notes those in which one has two values."""
     order, group, _ = _groups(rows, numbered=False)
     rows = take(rows, order)
     count = int(group[-1]) + 1 if len(group) else 0
@@ -110,8 +110,8 @@ def from_parts(rows: Rows) -> tuple[Rows, list[Bad]]:
     for name in STAMPS:
         if name in rows.cells:
             twice |= np.bincount(group, weights=np.isfinite(rows.cells[name]), minlength=count) > 1
-    bad = [Bad(int(rows.origin[row]), "sequence", "one value of each column an exchange") for row in start[twice]]
-    return take(exchanges, np.flatnonzero(~twice)), bad
+    unusable.add("sequence", rows.origin[start[twice]], "one value of each column an exchange")
+    return take(exchanges, np.flatnonzero(~twice))
 
 
 def _groups(rows: Rows, *, numbered: bool = True) -> tuple[Ints, Ints, Ints]:
@@ -142,9 +142,3 @@ def _put(values: Floats, group: Ints, mine: Bools, count: int) -> Floats:
     found = np.full(count, np.nan)
     found[group[mine]] = values[mine]
     return found
-
-
-def has_ends(rows: Rows) -> Bools:
-    """Return which rows name two different devices, (n,)."""
-    one, other = rows.ids["from_id"], rows.ids["to_id"]
-    return np.asarray((one != NEVER) & (other != NEVER) & (one != other))

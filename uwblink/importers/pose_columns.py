@@ -32,7 +32,7 @@ def poses_of_table(path: Path, body: str | None) -> Poses | None:
                 return None
             numbers, words = table.read([*NUMBERS, times[0]], [] if body is not None else ["body"])
             time_ns = _times(table, times[0], numbers.pop(times[0]))
-            if table.rejected():
+            if len(table.rejected()):
                 return None
     except ImportTableError:
         return None

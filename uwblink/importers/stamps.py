@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -69,26 +70,45 @@ def to_ticks(
     return found
 
 
+_WIDTHS: Final = ((32, "wrapped"), (32, "signed"), (40, "wrapped"), (40, "signed"))
+"""Widths and ways to write a counter, in the order in which they are tried."""
+
+
+@dataclass(slots=True)
+class Counted:
+    """How many stamps there are, and how many of them each width and way to write a counter can have shown."""
+
+    stamps: int = 0
+    fitting: dict[tuple[int, str], int] = field(default_factory=lambda: dict.fromkeys(_WIDTHS, 0))
+
+    def add(self, ticks: Mapping[str, Floats]) -> None:
+        """Count some rows, columns by name in ticks."""
+        for column in ticks.values():
+            self.stamps += int(np.count_nonzero(np.isfinite(column)))
+            for width, counter in _WIDTHS:
+                low = -(2.0 ** (width - 1)) if counter == "signed" else 0.0
+                self.fitting[width, counter] += int(np.count_nonzero((column >= low) & (column < low + 2.0**width)))
+
+    def told(self, bits: int | None, counter: str | None) -> tuple[int, str]:
+        """Return a counter's bits and how it is written, as far as they are not given.
+
+        Numbers that fit 32 bits are taken for 32, larger ones for 40, and those that fit neither for unwrapped;
+        negative ones for signed where they fit. Less than `MANY` of the rows do not count: they are faults.
+        """
+        if self.stamps < ENOUGH_ROWS:
+            return bits or 32, counter or "wrapped"
+        for width, kind in _WIDTHS:
+            beside = self.stamps - self.fitting[width, kind]
+            if bits in (None, width) and counter in (None, kind) and beside <= MANY * self.stamps:
+                return width, kind
+        return bits or 32, counter or "unwrapped"
+
+
 def how_counted(ticks: Mapping[str, Floats], bits: int | None, counter: str | None) -> tuple[int, str]:
-    """Return a counter's bits and how it is written, as far as they are not given, from stamps in ticks.
-
-    Numbers that fit 32 bits are taken for 32, larger ones for 40, and those that fit neither for unwrapped; negative
-    ones for signed where they fit. Less than `MANY` of the rows do not count: they are faults.
-    """
-    count = sum(np.count_nonzero(np.isfinite(column)) for column in ticks.values())
-    if count < ENOUGH_ROWS:
-        return bits or 32, counter or "wrapped"
-
-    def fit(low: float, high: float) -> bool:
-        inside = sum(np.count_nonzero((column >= low) & (column < high)) for column in ticks.values())
-        return bool(count - inside <= MANY * count)
-
-    for width in (bits,) if bits else (32, 40):
-        if counter in (None, "wrapped") and fit(0, 2.0**width):
-            return width, "wrapped"
-        if counter in (None, "signed") and fit(-(2.0 ** (width - 1)), 2.0 ** (width - 1)):
-            return width, "signed"
-    return bits or 32, counter or "unwrapped"
+    """Return a counter's bits and how it is written, as far as they are not given; see `Counted.told`."""
+    counted = Counted()
+    counted.add(ticks)
+    return counted.told(bits, counter)
 
 
 def beyond(ticks: Floats, bits: int, counter: str) -> Bools:

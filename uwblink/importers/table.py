@@ -6,14 +6,10 @@ ours, by their place, and what a JSON line calls a value is bound.
 
 from __future__ import annotations
 
-import gzip
-import json
-import zlib
-from collections.abc import Iterable
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,54 +17,55 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.csv_dialect import CsvDialect, detect
-
-if TYPE_CHECKING:
-    import duckdb
-
-LONGEST_LINE: Final = 4_000_000
-"""Bytes; an impulse response in one cell takes 6,000."""
+from uwblink.importers.file_lines import check_file, lines_of
+from uwblink.importers.relations import csv_relation, first_line, json_relation, parquet_relation
+from uwblink.importers.staging import Kept, Stage, confined
 
 EXACT: Final = 2.0**53
 """Whole numbers above are not all floats."""
 
-LINES_LOOKED_AT: Final = 1000
 
+class Cell(NamedTuple):
+    """What becomes of a column: SQL in which nothing is a stranger's, and what is bound to it."""
 
-@dataclass(frozen=True, slots=True)
-class _Relation:
-    """What a query reads: SQL in which nothing is a stranger's, what is bound to it, and the cells by column."""
-
-    source: str
-    names: tuple[str, ...]
-    cells: tuple[str, ...]
-    numeric: tuple[bool, ...]
-    bound: tuple[str | None, ...]
-    decimal_comma: bool = False
+    sql: str
+    bound: tuple[str, ...]
 
 
 class Table:
     """One file, whose columns are read when asked for. Close it, or use it as a context manager."""
 
-    def __init__(self, path: Path, delimiter: str | None = None, decimal: str | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        delimiter: str | None = None,
+        decimal: str | None = None,
+        *,
+        stage: Stage | None = None,
+        number: int = 0,
+    ) -> None:
         """Open a CSV file (plain or gzipped), a Parquet file or JSON lines, by its suffix; raises `ImportTableError`.
 
-        `delimiter` and `decimal` override what a CSV file looks like.
+        `delimiter` and `decimal` override what a CSV file looks like. Its columns can be put aside on a `stage`, on
+        which each table has a `number` of its own.
         """
-        _check(path)
+        check_file(path)
         self.path = path
+        self._stage = stage
         self._dialect: CsvDialect | None = None
-        self._rejected: list[int] = []
+        self._rejects = f"rejects{number}"
+        self._rejected: Ints = np.empty(0, dtype=np.int64)
         ending = path.name.lower().removesuffix(".gz")
         if ending.endswith(".parquet"):
-            self._db = confined(path)
-            self._relation = self._parquet()
+            self._db = stage.db if stage else confined([path])
+            self._relation = parquet_relation(self._db, path)
         elif ending.endswith((".jsonl", ".ndjson", ".json")):
-            self._relation = _json_lines(path)
-            self._db = confined(path)
+            self._relation = json_relation(path)
+            self._db = stage.db if stage else confined([path])
         else:
             self._dialect = detect(path, delimiter, decimal)
-            self._relation = _csv(self._dialect)
-            self._db = confined(path)
+            self._relation = csv_relation(self._dialect, self._rejects)
+            self._db = stage.db if stage else confined([path])
         self.names = self._relation.names
 
     def __enter__(self) -> Self:
@@ -77,7 +74,8 @@ class Table:
 
     def __exit__(self, *_error: object) -> None:
         """Close the file."""
-        self._db.close()
+        if self._stage is None:
+            self._db.close()
 
     def require(self, names: Iterable[str]) -> None:
         """Raise `ImportTableError` for the first name that no column has, or that two have."""
@@ -92,9 +90,7 @@ class Table:
     def read(self, numbers: Iterable[str] = (), words: Iterable[str] = ()) -> tuple[dict[str, Floats], dict[str, Any]]:
         """Return columns as float64 (n,), NaN where a cell is empty or no number, and columns as text (n,)."""
         wanted, texts = list(dict.fromkeys(numbers)), list(dict.fromkeys(words))
-        cells = [(name, self._number(self._place(name))) for name in wanted]
-        cells += [(name, self._word(self._place(name))) for name in texts]
-        found = self._read(cells)
+        found = self._read([*map(self.number, wanted), *map(self.word, texts)])
         columns = [np.ma.filled(column.astype(np.float64, copy=False), np.nan) for column in found[: len(wanted)]]
         text = [np.ma.filled(column, "").astype(np.str_) for column in found[len(wanted) :]]
         return dict(zip(wanted, columns, strict=True)), dict(zip(texts, text, strict=True))
@@ -105,51 +101,81 @@ class Table:
 
     def words_at(self, name: str, rows: Iterable[int]) -> dict[int, str]:
         """Return cells of a column as text, by their rows (0 is the first)."""
-        import duckdb
-
-        place = self._place(name)
-        cell = self._word(place)
-        counted = f"SELECT {cell} AS word, row_number() OVER () - 1 AS row FROM {self._relation.source}"  # noqa: S608 - columns by place
+        cell = self.word(name)
+        counted = f"SELECT {cell.sql} AS word, row_number() OVER () - 1 AS row FROM {self._relation.source}"  # noqa: S608 - columns by place
         query = f"SELECT row, word FROM ({counted}) WHERE row IN (SELECT unnest(?::BIGINT[]))"  # noqa: S608 - as above
-        bound = [*self._keys(place, cell), str(self.path), sorted(set(rows))]
-        try:
+        bound = [*cell.bound, str(self.path), sorted(set(rows))]
+        with self._reading():
             return {int(row): str(word) for row, word in self._db.execute(query, bound).fetchall()}
-        except duckdb.Error as error:
-            raise ImportTableError(f"{self.path}: cannot be read as a table ({first_line(error)})") from error
 
-    def whole_numbers(self, name: str, missing: int) -> Ints:
-        """Return a column of whole numbers exactly, also those that a float does not hold; others are `missing`."""
-        (found,) = self._read([(name, f"TRY_CAST({self._word(self._place(name))} AS BIGINT)")])
-        return np.ma.filled(found.astype(np.int64), missing)
+    def keep(self, cells: Mapping[str, Cell]) -> Kept:
+        """Put columns aside by names of the caller's, which become SQL; raises `ImportTableError`."""
+        if self._stage is None:
+            raise TypeError("a table without a stage puts nothing aside")
+        chosen = ", ".join(f"{cell.sql} AS {name}" for name, cell in cells.items())
+        bound = [key for cell in cells.values() for key in cell.bound]
+        query = f"SELECT {chosen} FROM {self._relation.source}"  # noqa: S608 - columns by place, names of the caller's
+        with self._reading():
+            kept = self._stage.keep(query, [*bound, str(self.path)], cells)
+            self._note_rejected()
+        return kept
 
-    def times_ns(self, name: str) -> Ints:
-        """Return ISO 8601 times as nanoseconds since 1970 (n,), UTC where no zone is named; the least where none is."""
+    def number(self, name: str) -> Cell:
+        """Return what a column is as numbers, null where a cell is empty or no number."""
+        place = self._place(name)
+        if self._relation.numeric[place]:
+            return self._cell(place, f"CAST({self._relation.cells[place]} AS DOUBLE)")
+        # Not the bare column: a cast of that is done while the file is read, where a cell that is no number makes the
+        # whole row vanish among those with too many cells.
+        text = f"coalesce({self._text(place)}, '')"
+        text = f"replace({text}, ',', '.')" if self._relation.decimal_comma else text
+        return self._cell(place, f"TRY_CAST({text} AS DOUBLE)")
+
+    def word(self, name: str) -> Cell:
+        """Return what a column is as text without blanks around it."""
+        place = self._place(name)
+        return self._cell(place, f"coalesce(trim({self._text(place)}), '')")
+
+    def whole_number(self, name: str) -> Cell:
+        """Return what a column is as whole numbers, also those that a float does not hold; null where it is none."""
+        return self._cell(self._place(name), f"TRY_CAST({self.word(name).sql} AS BIGINT)")
+
+    def time_ns(self, name: str) -> Cell:
+        """Return what a column of ISO 8601 times is as nanoseconds since 1970, UTC where no zone is named, or null."""
         place = self._place(name)
         if self._relation.numeric[place]:
             raise ImportTableError(f"{self.path}: column {name[:60]!r} holds numbers, not times as 2024-05-06T07:08:09")
-        text = self._word(place)
+        text = self.word(name).sql
         # A zone is a shift of whole minutes, which the finer type would drop.
         shift = f"TRY_CAST({text} AS TIMESTAMPTZ)"
         zone = f"regexp_matches({text}, '[T ].*[+-][0-9]{{2}}:?([0-9]{{2}})?$')"
         time = f"CASE WHEN {zone} THEN epoch_ns({shift}) ELSE epoch_ns(TRY_CAST({text} AS TIMESTAMP_NS)) END"
-        (found,) = self._read([(name, time)])
-        return np.ma.filled(found.astype(np.int64), np.iinfo(np.int64).min)
+        return self._cell(place, time)
+
+    def whole_numbers(self, name: str, missing: int) -> Ints:
+        """Return a column of whole numbers exactly, also those that a float does not hold; others are `missing`."""
+        (found,) = self._read([self.whole_number(name)])
+        return np.ma.filled(found.astype(np.int64), missing)
 
     def lists(self, name: str) -> NDArray[np.object_]:
         """Return a column of lists such as `[1, 2]` as arrays of whole numbers, None where a cell is no such list."""
-        (found,) = self._read([(name, f"TRY_CAST({self._word(self._place(name))} AS USMALLINT[])")])
+        place = self._place(name)
+        (found,) = self._read([self._cell(place, f"TRY_CAST({self.word(name).sql} AS USMALLINT[])")])
         filled = np.empty(len(found), dtype=object)
         filled[:] = [None if value is np.ma.masked else value for value in found]
         return filled
 
-    def lines(self, rows: Ints) -> list[int]:
-        """Return where in the file some rows are: its lines, the first being 1; rows of Parquet from 1."""
-        if self._dialect is None and self._relation.source.startswith("read_parquet"):
-            return [int(row) + 1 for row in rows]
-        skip = self._dialect.skip if self._dialect else 0
-        return _lines(self.path, skip, self.rejected(), rows)
+    def lines(self, rows: Ints, *, rejected: bool = True) -> Ints:
+        """Return where in the file some rows are: its lines, the first being 1; rows of Parquet from 1.
 
-    def rejected(self) -> list[int]:
+        Lines that were `rejected` are passed over, unless one looks for what was before anything was.
+        """
+        if self._dialect is None and self._relation.source.startswith("read_parquet"):
+            return np.asarray(rows + 1, dtype=np.int64)
+        skip = self._dialect.skip if self._dialect else 0
+        return lines_of(self.path, skip, self._rejected if rejected else self._rejected[:0], rows)
+
+    def rejected(self) -> Ints:
         """Return the lines that were left out of everything read so far: they have more cells than the header."""
         return self._rejected
 
@@ -160,157 +186,34 @@ class Table:
     def _text(self, place: int) -> str:
         return f"CAST({self._relation.cells[place]} AS VARCHAR)"
 
-    def _word(self, place: int) -> str:
-        return f"coalesce(trim({self._text(place)}), '')"
+    def _cell(self, place: int, sql: str) -> Cell:
+        key = self._relation.bound[place]
+        return Cell(sql, () if key is None else (key,) * sql.count(self._relation.cells[place]))
 
-    def _number(self, place: int) -> str:
-        if self._relation.numeric[place]:
-            return f"CAST({self._relation.cells[place]} AS DOUBLE)"
-        # Not the bare column: a cast of that is done while the file is read, where a cell that is no number makes the
-        # whole row vanish among those with too many cells.
-        text = f"coalesce({self._text(place)}, '')"
-        text = f"replace({text}, ',', '.')" if self._relation.decimal_comma else text
-        return f"TRY_CAST({text} AS DOUBLE)"
-
-    def _read(self, cells: list[tuple[str, str]]) -> list[NDArray[Any]]:
-        import duckdb
-
-        chosen = ", ".join(f"{cell} AS r{k}" for k, (_, cell) in enumerate(cells))
-        places = [self.names.index(name) for name, _ in cells]
-        keys = [key for k, place in enumerate(places) for key in self._keys(place, cells[k][1])]
+    def _read(self, cells: list[Cell]) -> list[NDArray[Any]]:
+        chosen = ", ".join(f"{cell.sql} AS r{k}" for k, cell in enumerate(cells))
+        keys = [key for cell in cells for key in cell.bound]
         query = f"SELECT {chosen} FROM {self._relation.source}"  # noqa: S608 - columns by place, r0, r1 ...
-        try:
+        with self._reading():
             found = self._db.execute(query, [*keys, str(self.path)]).fetchnumpy()
-            if self._dialect is not None:
-                bad = self._db.execute("SELECT DISTINCT line FROM reject_errors ORDER BY line").fetchall()
-                self._rejected = [int(line) for (line,) in bad]
-        except duckdb.Error as error:
-            raise ImportTableError(f"{self.path}: cannot be read as a table ({first_line(error)})") from error
+            self._note_rejected()
         return [found[f"r{k}"] for k in range(len(cells))]
 
-    def _keys(self, place: int, cell: str) -> list[str]:
-        key = self._relation.bound[place]
-        return [] if key is None else [key] * cell.count("?")
+    def _note_rejected(self) -> None:
+        if self._dialect is not None:
+            found = self._db.execute(f"SELECT DISTINCT line FROM {self._rejects} ORDER BY line").fetchnumpy()  # noqa: S608 - a name of ours
+            self._rejected = np.ma.filled(found["line"].astype(np.int64), 0)
 
-    def _parquet(self) -> _Relation:
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Have what DuckDB says of a file, or of the disk, as an error of this project."""
         import duckdb
 
         try:
-            rows = self._db.execute("DESCRIBE SELECT * FROM read_parquet(?)", [str(self.path)]).fetchall()
+            yield
+        except (duckdb.OutOfMemoryException, duckdb.IOException) as error:
+            if self._stage is None or str(self.path) in str(error):
+                raise ImportTableError(f"{self.path}: cannot be read as a table ({first_line(error)})") from error
+            raise self._stage.unwritable(error) from error
         except duckdb.Error as error:
-            raise ImportTableError(f"{self.path}: cannot be read as Parquet ({first_line(error)})") from error
-        cells = tuple(f"c{k}" for k in range(len(rows)))
-        kinds = ("INT", "DOUBLE", "FLOAT", "DECIMAL")
-        return _Relation(
-            f"read_parquet(?) AS t({', '.join(cells)})",
-            tuple(str(row[0]) for row in rows),
-            cells,
-            tuple(any(kind in str(row[1]) for kind in kinds) and "[" not in str(row[1]) for row in rows),
-            (None,) * len(rows),
-        )
-
-
-def _csv(dialect: CsvDialect) -> _Relation:
-    cells = tuple(f"c{k}" for k in range(len(dialect.names)))
-    columns = ", ".join(f"'{cell}': 'VARCHAR'" for cell in cells)
-    delimiter = "\\t" if dialect.delimiter == "\t" else dialect.delimiter
-    source = (
-        f"read_csv(?, auto_detect=false, header=false, skip={dialect.skip}, delim='{delimiter}', quote='\"', "
-        f"escape='\"', columns={{{columns}}}, null_padding=true, store_rejects=true, rejects_limit=0, "
-        f"max_line_size={LONGEST_LINE})"
-    )
-    none = (None,) * len(cells)
-    return _Relation(source, dialect.names, cells, (False,) * len(cells), none, dialect.decimal_comma)
-
-
-def _json_lines(path: Path) -> _Relation:
-    """Return the fields of the first lines; those of objects in objects are called as `pose.x`."""
-    fields: dict[str, str] = {}
-    for line in _first_lines(path):
-        try:
-            row = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(row, dict):
-            fields |= dict(_fields(row, "", ""))
-    if not fields:
-        raise ImportTableError(f"{path}: holds no JSON objects, one a line")
-    count = len(fields)
-    cells = ("json_extract_string(json, ?)",) * count
-    source = "read_ndjson_objects(?, ignore_errors=true)"
-    return _Relation(source, tuple(fields), cells, (False,) * count, tuple(fields.values()))
-
-
-def _fields(row: dict[str, Any], name: str, pointer: str) -> Iterable[tuple[str, str]]:
-    for key, value in row.items():
-        where = f"{pointer}/{key.replace('~', '~0').replace('/', '~1')}"
-        if isinstance(value, dict) and pointer.count("/") < 5:
-            yield from _fields(value, f"{name}{key}.", where)
-        else:
-            yield f"{name}{key}", where
-
-
-def _first_lines(path: Path) -> list[str]:
-    try:
-        with (gzip.open if path.suffix == ".gz" else open)(path, "rt", encoding="utf-8-sig") as file:
-            return list(islice(file, LINES_LOOKED_AT))
-    except (OSError, EOFError, UnicodeDecodeError) as error:
-        raise ImportTableError(f"{path}: cannot be read as JSON lines ({first_line(error)})") from error
-
-
-def _lines(path: Path, skip: int, rejected: list[int], rows: Ints) -> list[int]:
-    """Return the lines of rows (0 is the first that was not rejected), past empty lines and breaks in quotes."""
-    wanted = iter(sorted({int(row) for row in rows}))
-    row, found, out, quoted = next(wanted, None), -1, {}, False
-    with (gzip.open if path.suffix == ".gz" else open)(path, "rt", encoding="utf-8-sig", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            if row is None:
-                break
-            begins = not quoted
-            quoted ^= bool(line.count('"') % 2)
-            if number <= skip or not begins or not line.strip() or number in rejected:
-                continue
-            found += 1
-            if found == row:
-                out[row] = number
-                row = next(wanted, None)
-    return [out.get(int(row), int(row) + 1 + skip) for row in rows]
-
-
-def _check(path: Path) -> None:
-    if path.is_dir():
-        raise ImportTableError(f"{path}: is a directory, expected a table (.csv, .csv.gz, .parquet or .jsonl)")
-    if not path.exists():
-        raise ImportTableError(f"{path}: no such table")
-    if path.suffix == ".gz":
-        _check_gzip(path)
-
-
-def _check_gzip(path: Path) -> None:
-    """Read a compressed file through: DuckDB reads a broken one for ever."""
-    try:
-        with gzip.open(path, "rb") as file:
-            while file.read(1 << 20):
-                pass
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise ImportTableError(f"{path}: broken or truncated gzip ({error})") from error
-    except OSError as error:
-        raise ImportTableError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def first_line(error: Exception) -> str:
-    """Return the first line of an error's text."""
-    return (str(error).splitlines() or [""])[0][:200]
-
-
-def confined(path: Path) -> duckdb.DuckDBPyConnection:
-    """Return a connection that can open this file and no other, and whose settings are locked."""
-    import duckdb
-
-    db = duckdb.connect(":memory:")
-    db.execute("SET TimeZone = 'UTC'")
-    db.execute("SET enable_progress_bar = false")
-    db.execute("SET allowed_paths = ?", [[str(path)]])
-    db.execute("SET enable_external_access = false")
-    db.execute("SET lock_configuration = true")
-    return db
+            raise ImportTableError(f"{self.path}: cannot be read as a table ({first_line(error)})") from error

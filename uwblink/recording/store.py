@@ -179,11 +179,15 @@ class Store:
         if not lengths or not lengths[names[0]]:
             return
         batch: dict[str, NDArray[Any]] = {}
-        values = []
+        values, bound = [], list[Any]()
         for name in names:
             column = columns[name]
             batch[name] = np.ascontiguousarray(np.ma.getdata(column))
             values.append(f'"{name}"')
+            if len(batch) > 1 and _is_one_word(column):
+                # Words of an array are looked at one by one, by far the longest part of an insertion.
+                bound.append(str(batch.pop(name)[0]))
+                values[-1] = "CAST(? AS VARCHAR)"
             if TABLES[table][name] == "BLOB":
                 # Not every version takes bytes from an array; all take digits.
                 batch[name] = np.array([data.hex() for data in batch[name].tolist()], dtype=object)
@@ -194,7 +198,7 @@ class Store:
         listed = ", ".join(f'"{name}"' for name in names)
         self._db.register("batch", batch)
         with self._fitting(table):
-            self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch")  # noqa: S608 - keys of TABLES
+            self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch", bound)  # noqa: S608 - keys of TABLES
         self._db.unregister("batch")
 
     def insert_row(self, table: str, values: list[Any]) -> None:
@@ -292,3 +296,9 @@ class Store:
             missing = sorted(columns.keys() - present - (later if not (present and came_whole) else set()))
             if missing:
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
+
+
+def _is_one_word(column: NDArray[Any]) -> bool:
+    """Return whether a column, which has rows, is of text and the same in each of them."""
+    plain = column.dtype.kind == "U" and not isinstance(column, np.ma.MaskedArray)
+    return plain and bool((column == column[0]).all())

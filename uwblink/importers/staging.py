@@ -1,0 +1,125 @@
+"""Columns of strangers' files, put aside once they are parsed: however long they are, little of them is in memory.
+
+They lie in a database of the process that keeps `STAGED_MB` of them in memory, and the rest in a folder for temporary
+files (`TMPDIR`) that vanishes with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uwblink.arrays import Ints
+from uwblink.errors import ImportTableError
+from uwblink.importers.relations import first_line
+
+if TYPE_CHECKING:
+    import duckdb
+
+STAGED_MB: Final = 250
+"""Of what is put aside so much is kept in memory."""
+
+
+def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBPyConnection:
+    """Return a connection that can open these files and no others, and whose settings are locked.
+
+    With a `folder` it keeps no more than `STAGED_MB` in memory, and the rest there.
+    """
+    import duckdb
+
+    db = duckdb.connect(":memory:")
+    db.execute("SET TimeZone = 'UTC'")
+    db.execute("SET enable_progress_bar = false")
+    if folder is not None:
+        db.execute("SET temp_directory = ?", [folder])
+        db.execute(f"SET memory_limit = '{STAGED_MB}MB'")
+    db.execute("SET allowed_paths = ?", [[str(path) for path in paths]])
+    db.execute("SET enable_external_access = false")
+    db.execute("SET lock_configuration = true")
+    return db
+
+
+class Stage:
+    """Where columns are put aside. Close it, or use it as a context manager."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        """Make room for what is in some files."""
+        self._folder = TemporaryDirectory(prefix="uwblink-")
+        self.db = confined(paths, self._folder.name)
+        self._made = 0
+
+    def __enter__(self) -> Self:
+        """Return the stage itself."""
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        """Forget everything."""
+        self.close()
+
+    def close(self) -> None:
+        """Forget everything."""
+        self.db.close()
+        self._folder.cleanup()
+
+    def keep(self, query: str, bound: Sequence[Any], columns: Iterable[str]) -> Kept:
+        """Put the result of a query aside, in its order; `columns` are what its columns are called.
+
+        Raises what DuckDB raises.
+        """
+        self._made += 1
+        table = f"kept{self._made}"
+        self.db.execute(f"CREATE TABLE {table} AS {query}", list(bound))
+        ((count,),) = self.db.execute(f"SELECT count(*) FROM {table}").fetchall()  # noqa: S608 - a name of ours
+        return Kept(self, table, tuple(columns), int(count))
+
+    def add(self, kept: Kept, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Append rows to what was put aside."""
+        self.db.register("more", dict(columns))
+        self.db.execute(f"INSERT INTO {kept.table} SELECT {', '.join(kept.columns)} FROM more")  # noqa: S608 - names of ours
+        self.db.unregister("more")
+
+    def unwritable(self, error: Exception) -> ImportTableError:
+        """Return the error for a disk that does not take what is put aside."""
+        return ImportTableError(
+            f"{gettempdir()}: what does not fit into memory cannot be put there ({first_line(error)}); "
+            "TMPDIR names another folder"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """Columns that were put aside, by names of ours; `count` rows, of which the first is 0."""
+
+    stage: Stage
+    table: str
+    columns: tuple[str, ...]
+    count: int
+
+    def between(self, start: int, stop: int, columns: Iterable[str]) -> dict[str, NDArray[Any]]:
+        """Return columns of the rows from `start` until before `stop`, masked where there is nothing."""
+        # Rows come in their order without being asked to, which would sort them.
+        return self._read(columns, f"WHERE rowid >= {int(start)} AND rowid < {int(stop)}")
+
+    def at(self, rows: Ints, columns: Iterable[str]) -> dict[str, NDArray[Any]]:
+        """Return columns of some rows, in ascending order without repetition."""
+        self.stage.db.register("chosen", {"chosen": np.asarray(rows, dtype=np.int64)})
+        found = self._read(columns, "WHERE rowid IN (SELECT chosen FROM chosen) ORDER BY rowid")
+        self.stage.db.unregister("chosen")
+        return found
+
+    def ask(self, query: str) -> list[tuple[Any, ...]]:
+        """Return the rows of what follows SELECT, FROM these columns."""
+        return self.stage.db.execute(f"SELECT {query} FROM {self.table}").fetchall()  # noqa: S608 - of ours
+
+    def _read(self, columns: Iterable[str], where: str) -> dict[str, NDArray[Any]]:
+        wanted = list(columns)
+        if not wanted:
+            return {}
+        query = f"SELECT {', '.join(wanted)} FROM {self.table} {where}"  # noqa: S608 - names of ours
+        return dict(self.stage.db.execute(query).fetchnumpy())
