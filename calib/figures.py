@@ -5,7 +5,7 @@ Each takes matplotlib axes, or makes new ones where there are none, and returns 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
-from calib.error_mixture import fit_error_mixture
+from calib.error_mixture import fit_error_mixtures
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
 from calib.ranges import Ranges
 from uwblink.arrays import Floats
@@ -92,19 +92,35 @@ def binned(lifted: Floats, error_m: Floats, loss: str, bins: int) -> Binned:
     The curve of a robust fit follows the errors' core: reflections only lengthen, so medians and means lie above it.
     Least squares follow the mean.
     """
-    groups = np.array_split(np.argsort(lifted), max(1, min(bins, len(lifted) // FEWEST_IN_BIN)))
-    found = np.array([_centre(error_m[rows], loss) for rows in groups])
-    median = [float(np.median(error_m[rows])) for rows in groups]
-    return Binned(np.array([np.median(lifted[rows]) for rows in groups]), found[:, 0], found[:, 1], np.array(median))
+    return _all_binned([(lifted, error_m, bins)], loss)[0]
 
 
-def _centre(error_m: Floats, loss: str) -> tuple[float, float]:
+def _all_binned(sets: Sequence[tuple[Floats, Floats, int]], loss: str) -> list[Binned]:
+    """Return the same of some sets of lifted powers, errors and a number of bins; all their cores are found at once."""
+    rows = [np.array_split(np.argsort(x), max(1, min(bins, len(x) // FEWEST_IN_BIN))) for x, _, bins in sets]
+    errors = [error_m[some] for (_, error_m, _), groups in zip(sets, rows, strict=True) for some in groups]
+    centres = iter(_centres(errors, loss))
+    found = []
+    for (lifted, error_m, _), groups in zip(sets, rows, strict=True):
+        own = np.array([next(centres) for _ in groups])
+        median = np.array([np.median(error_m[some]) for some in groups])
+        found.append(Binned(np.array([np.median(lifted[some]) for some in groups]), own[:, 0], own[:, 1], median))
+    return found
+
+
+def _centres(groups: Sequence[Floats], loss: str) -> list[tuple[float, float]]:
+    """Return centre and spread of each group of errors (n,)."""
     if loss == "l2":
-        return float(np.mean(error_m)), float(np.std(error_m))
-    if len(error_m) < FEWEST_IN_BIN or float(np.ptp(error_m)) < 1e-9:
-        return float(np.median(error_m)), float(np.std(error_m))
-    core = fit_error_mixture(error_m, np.zeros(len(error_m), dtype=np.int64), 1)
-    return core.location_m, float(core.sigma_m[0])
+        return [(float(np.mean(error_m)), float(np.std(error_m))) for error_m in groups]
+    told = [len(error_m) >= FEWEST_IN_BIN and float(np.ptp(error_m)) >= 1e-9 for error_m in groups]
+    cores = iter(fit_error_mixtures([error_m for error_m, so in zip(groups, told, strict=True) if so]))
+    found = []
+    for error_m, so in zip(groups, told, strict=True):
+        core = next(cores) if so else None
+        found.append(
+            (core.location_m, float(core.sigma_m[0])) if core else (float(np.median(error_m)), float(np.std(error_m)))
+        )
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +133,10 @@ class OverPower:
 
 def over_power(ranges: Ranges, lifted: Floats, error_m: Floats, loss: str) -> OverPower:
     """Return what errors (n,) come to by lifted power (n,): pair by pair in a few bins, and all in more."""
-    pairs = {name: binned(lifted[rows], error_m[rows], loss, BINS_OF_PAIR) for name, rows in pair_rows(ranges).items()}
-    return OverPower(pairs, binned(lifted, error_m, loss, BINS))
+    pairs = pair_rows(ranges)
+    sets = [(lifted[rows], error_m[rows], BINS_OF_PAIR) for rows in pairs.values()]
+    *each, everything = _all_binned([*sets, (lifted, error_m, BINS)], loss)
+    return OverPower(dict(zip(pairs, each, strict=True)), everything)
 
 
 def biases(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> OverPower:

@@ -6,6 +6,7 @@ from uwblink.lazy import offer
 
 if TYPE_CHECKING:
     from calib.evaluation.consistency import summarize
+    from calib.evaluation.error_statistics import ErrorStatistics
     from calib.evaluation.localization import PAPER_RMSE_M
     from calib.evaluation.localization_display import (
         as_tum,
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
         write_tum,
     )
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
-    from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation
+    from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation
     from calib.evaluation.tracking import FILTERS, Settings
 
 __all__ = [
@@ -41,7 +42,7 @@ __all__ = [
 
 _HOMES: Final = {
     "CORRECTION_STAGES": "calib.evaluation.statistics",
-    "ErrorStatistics": "calib.evaluation.statistics",
+    "ErrorStatistics": "calib.evaluation.error_statistics",
     "Evaluation": "calib.evaluation.statistics",
     "FILTERS": "calib.evaluation.tracking",
     "PAPER_RMSE_M": "calib.evaluation.localization",

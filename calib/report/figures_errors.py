@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
 from typing import Final
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.statistics import pair_rows
@@ -14,6 +17,7 @@ from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, INK, MUTED, PALE
 from uwblink.pages.figures import NARROW_IN, label, legend, sheet
+from uwblink.pages.small_multiples import many_alike, on_figure, share_axes
 
 REACH: Final = 6.0
 POINTS: Final = 3000
@@ -23,6 +27,7 @@ MOST_PAIRS: Final = 24
 """Pairs whose errors are drawn over time, those with the largest spread; more would be too small to see."""
 
 POINTS_OF_PAIR: Final = 800
+PANEL_IN: Final = 1.05
 
 
 def distribution(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
@@ -36,8 +41,6 @@ def distribution(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> F
 
 def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
     """Errors over their sigma: a histogram beside the normal density, and quantiles against normal quantiles."""
-    from scipy.special import ndtri
-
     z = (applied.corrected_m - ranges.truth_m) / applied.sigma_m
     figure, (left, right) = sheet(width_in, 2)
     edges = np.linspace(-REACH, REACH, 61)
@@ -48,7 +51,8 @@ def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figur
     left.plot(grid, np.exp(-0.5 * grid**2) / np.sqrt(2 * np.pi), color=INK, lw=1.2, label="standard normal")
     label(left, "error over its σ; all beyond ±6 in the last bins", "density")
     shares = (np.arange(300) + 0.5) / 300
-    right.plot(ndtri(shares), np.clip(np.quantile(z, shares), -REACH, 2 * REACH), ".", ms=3, color=BLUE)
+    normal = [NormalDist().inv_cdf(share) for share in shares.tolist()]
+    right.plot(normal, np.clip(np.quantile(z, shares), -REACH, 2 * REACH), ".", ms=3, color=BLUE)
     right.plot([-3, 3], [-3, 3], color=INK, lw=1.2)
     right.set_ylim(-REACH, 2 * REACH)
     label(right, "quantile of the standard normal", "quantile of error over σ")
@@ -85,28 +89,22 @@ def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figu
     error = 100 * (applied.corrected_m - ranges.truth_m)
     pairs = most_spread(ranges, error)
     columns = 2 if width_in < NARROW_IN else 4
-    down = -(-len(pairs) // columns)
-    height_in = 1.05 * down + 0.6
-    figure = Figure(figsize=(width_in, height_in))
-    panels = figure.subplots(down, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    start = ranges.time_ns.min()
-    for panel, (name, rows) in zip(panels, pairs.items(), strict=False):
-        time = (ranges.time_ns[rows] - start) * 1e-9
-        order = np.argsort(time)
-        every = order[:: max(1, len(order) // POINTS_OF_PAIR)]
-        panel.plot(time[every], error[rows][every], ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
-        band = 196 * applied.sigma_m[rows][order[:: max(1, len(order) // 120)]]
-        for side in (-band, band):
-            panel.plot(time[order[:: max(1, len(order) // 120)]], side, color=INK, lw=0.6)
-        panel.set_title(f"tags {name}", loc="left", pad=2)
-        panel.grid(True)
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylim(*_reach_cm(error))
-    for panel in panels[len(pairs) :]:
-        panel.set_visible(False)
-    # All panels are alike, so a layout that measures every label, which takes seconds, would find just this.
-    edges = {"left": 0.62 / width_in, "right": 1 - 0.1 / width_in, "bottom": 0.42 / height_in}
-    figure.subplots_adjust(**edges, top=1 - 0.2 / height_in, wspace=0.12, hspace=0.32)
+    time = (ranges.time_ns - ranges.time_ns.min()) * 1e-9
+    figure, panels = many_alike(width_in, [f"tags {name}" for name in pairs], columns, height_in=PANEL_IN)
+    last = float(time.max())
+    share_axes(figure, panels, columns, (-0.05 * last - 1e-9, 1.05 * last + 1e-9), _reach_cm(error))
+    clouds, bands = [], []
+    for panel, rows in zip(panels, pairs.values(), strict=True):
+        order = rows[np.argsort(time[rows])]
+        shown, some = order[:: max(1, len(order) // POINTS_OF_PAIR)], order[:: max(1, len(order) // 120)]
+        clouds.append(on_figure(panel, time[shown], error[shown]))
+        bands += [on_figure(panel, time[some], side * applied.sigma_m[some]) for side in (-196, 196)]
+    # All points are one picture: one a panel takes longer to write than everything else.
+    points = np.concatenate(clouds).T
+    figure.add_artist(
+        Line2D(*points, ls="", marker=".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True, transform=figure.transFigure)
+    )
+    figure.add_artist(LineCollection(bands, colors=INK, linewidths=0.6, transform=figure.transFigure, zorder=3))
     figure.supxlabel("time (s)", fontsize="medium")
     figure.supylabel("calibrated error (cm)", fontsize="medium")
     return figure

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from typing import Final
 
-from calib.calibration.foundations import rests_on
-from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.report import sections
-from calib.report.blocks import Block, Document, Heading, Listing, Table, Text
+from calib.report.blocks import Block, Document, Heading, Text
 from calib.report.campaign import Campaign
 from calib.report.localization_section import localization
-from calib.report.origin import Origin
+from calib.report.provenance import provenance, warnings
 from calib.report.verdict import Judged, verdict
 
 Section = Callable[[Campaign], list[Block]]
@@ -67,27 +64,6 @@ def _checked(name: str, blocks: object) -> list[Block]:
             "(Heading, Text, Table, Picture or Listing)"
         )
     return blocks
-
-
-def warnings(sentences: list[str]) -> list[Block]:
-    """Return a paragraph a warning."""
-    return [Text(f"Warning: {sentence}", "warning") for sentence in sentences]
-
-
-SHOWN: Final = {"surveyed", "reflected"}
-"""Of a calibration's provenance what a section shows as tables and figures."""
-
-
-def provenance(calibration: Calibration, origin: Origin) -> list[Block]:
-    """Return where a report and its calibration come from."""
-    made = [["report", origin.made], ["version", origin.version], ["command", origin.command]]
-    made.append(["distances", rests_on(calibration.provenance)])
-    rows = [row for row in made if row[1]] + [[path, f"SHA-256 {digest}"] for path, digest in origin.files.items()]
-    return [
-        Heading("Provenance"),
-        Table(["of", "what"], rows, words=True),
-        Listing(json.dumps({k: v for k, v in calibration.provenance.items() if k not in SHOWN}, indent=1)),
-    ]
 
 
 def _verdict(campaign: Campaign) -> list[Block]:

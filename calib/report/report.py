@@ -11,8 +11,8 @@ from calib.evaluation.statistics import Evaluation, evaluate
 from calib.ranges import Ranges, concatenate
 from calib.report import sections
 from calib.report.blocks import Document, Heading, Text
-from calib.report.layout import provenance, warnings
 from calib.report.origin import Origin, origin_of
+from calib.report.provenance import provenance, warnings
 from calib.report.verdict import Judged, verdict
 from calib.report.without_truth import foundations
 from calib.report.writing import check_places, html_of, write_document

@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from calib.calibration.display import pair_rows as offset_rows
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
-from calib.error_mixture import fit_error_mixture
-from calib.estimation.passive_listeners import OverheardDelay
-from calib.estimation.result import FitResult
-from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation, PlantedComparison, pair_rows
+from calib.error_mixture import fit_error_mixtures
+from calib.evaluation.error_statistics import ErrorStatistics
+from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, PlantedComparison, pair_rows
 from calib.ranges import Ranges
 from calib.report.blocks import Block, Heading, Picture, Table, Text
+
+if TYPE_CHECKING:
+    from calib.estimation.passive_listeners import OverheardDelay
+    from calib.estimation.result import FitResult
 
 OUTLIER_SIGMAS: Final = 3.0
 NOT_SPLIT: Final = (
@@ -281,12 +284,14 @@ def errors(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -
 
 def outliers(ranges: Ranges, applied: CorrectedRanges) -> list[Block]:
     """Say what the calibrated errors are made of, by pair."""
+    from calib import figures
+
     rows = []
     error, z = applied.corrected_m - ranges.truth_m, (applied.corrected_m - ranges.truth_m) / applied.sigma_m
-    for name, mine in [*pair_rows(ranges).items(), ("all", np.ones(len(ranges), dtype=bool))]:
-        if np.count_nonzero(mine) < 60:
-            continue
-        mixture = fit_error_mixture(error[mine], np.zeros(np.count_nonzero(mine), dtype=np.int64), 1)
+    groups = {**pair_rows(ranges), "all": np.ones(len(ranges), dtype=bool)}
+    told = {name: mine for name, mine in groups.items() if np.count_nonzero(mine) >= figures.FEWEST_IN_BIN}
+    mixtures = fit_error_mixtures([error[mine] for mine in told.values()])
+    for (name, mine), mixture in zip(told.items(), mixtures, strict=True):
         rows.append(
             [
                 name,

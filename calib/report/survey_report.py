@@ -10,8 +10,8 @@ from calib.calibration.model import Calibration, require_calibration
 from calib.report import sections
 from calib.report.blocks import Document, Heading, Table, Text
 from calib.report.grades import BAD, Criterion, judgement
-from calib.report.layout import provenance, warnings
 from calib.report.origin import Origin, origin_of
+from calib.report.provenance import provenance, warnings
 from calib.report.verdict import settled
 from calib.report.without_truth import criteria, foundations
 from calib.report.writing import check_places, write_document

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.statistics import Evaluation
-from calib.evaluation.tracking import Localization
 from calib.figures import TWO_SIDED_95
 from calib.ranges import Ranges
 from calib.report.blocks import Block
 from calib.report.grades import BAD, DOUBT, GOOD, Criterion, graded, judgement
 from calib.report.without_truth import criteria
+
+if TYPE_CHECKING:
+    from calib.evaluation.tracking import Localization
 
 MOST_BIAS: Final = 0.5
 """Of the spread of one range: a bias half as large adds an eighth to the error of a single range."""

@@ -17,7 +17,7 @@ from calib.calibration.model import Calibration
 from calib.figures import TWO_SIDED_95
 from calib.report.blocks import Block, Heading, Picture, Table, Text
 from calib.report.grades import Criterion, graded
-from calib.surveys.result import SurveyedArrangement
+from calib.surveys.surveyed import SurveyedArrangement
 
 MOST_REFLECTED: Final = 0.05
 WORST_REFLECTED: Final = 0.2

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from io import BytesIO
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from calib.surveys.surveyed import SurveyedArrangement
 from uwblink.arrays import Floats
-
-if TYPE_CHECKING:
-    from calib.surveys.result import SurveyedArrangement
 
 ACROSS: Final = 3
 PANEL_IN: Final = 3.0

@@ -19,8 +19,8 @@ from calib.surveys.frames import framed
 from calib.surveys.gathering import Gathered
 from calib.surveys.pair_means import LIFT
 from calib.surveys.power import PowerModel
-from calib.surveys.result import SurveyedArrangement, SurveyedBoard
 from calib.surveys.scales import M_PER_NS
+from calib.surveys.surveyed import SurveyedArrangement, SurveyedBoard
 from calib.surveys.taken_curve import TakenCurve
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,59 +14,13 @@ from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.information import Verdict
 from calib.surveys.minima import SecondBest
-from uwblink.arrays import Floats
+from calib.surveys.surveyed import SurveyedArrangement, SurveyedBoard
 from uwblink.output import write_bytes, write_text
 
 FORMATS = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml"}
 
 
 PICTURES = (".svg", ".png", ".pdf")
-
-
-@dataclass(frozen=True, slots=True)
-class SurveyedBoard:
-    """Where a tag's antenna was: metres, and the covariance (3, 3); zero along what the frame or the shape fixes.
-
-    `determined` is whether the ranges determine the place.
-    """
-
-    tag: int
-    position_m: tuple[float, float, float]
-    covariance_m2: Floats
-    determined: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class SurveyedArrangement:
-    """An arrangement: its name, what was said of it ("line", "plane" or ""), its boards, and the frame in words."""
-
-    name: str
-    known: str
-    boards: tuple[SurveyedBoard, ...]
-    frame: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything as JSON takes it, in metres."""
-        boards = [
-            {
-                "tag": board.tag,
-                "position_m": [round(value, 5) for value in board.position_m],
-                "covariance_m2": [[float(f"{value:.4g}") for value in line] for line in board.covariance_m2.tolist()],
-                "determined": board.determined,
-            }
-            for board in self.boards
-        ]
-        return {"name": self.name, "known": self.known, "frame": self.frame, "boards": boards}
-
-    @classmethod
-    def from_dict(cls, row: Mapping[str, Any]) -> SurveyedArrangement:
-        """Return the arrangement that `to_dict` wrote."""
-        boards = []
-        for one in row["boards"]:
-            x, y, z = map(float, one["position_m"])
-            covariance = np.array(one["covariance_m2"], dtype=float)
-            boards.append(SurveyedBoard(int(one["tag"]), (x, y, z), covariance, bool(one["determined"])))
-        return cls(str(row["name"]), str(row["known"]), tuple(boards), str(row["frame"]))
 
 
 @dataclass(frozen=True, slots=True)
