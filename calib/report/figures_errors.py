@@ -17,7 +17,7 @@ from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, INK, MUTED, PALE
 from uwblink.pages.figures import NARROW_IN, label, legend, sheet
-from uwblink.pages.small_multiples import many_alike, on_figure, share_axes
+from uwblink.pages.figures_alike import many_alike, on_figure, share_axes
 
 REACH: Final = 6.0
 POINTS: Final = 3000

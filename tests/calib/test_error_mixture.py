@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import exponnorm
 
-from calib.error_mixture import ErrorMixture, e_step, fit_error_mixture
+from calib.error_mixture import ErrorMixture, e_step, fit_error_mixture, fit_error_mixtures
 
 
 def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):
@@ -56,3 +56,17 @@ def test_density_is_that_of_scipy_and_integrates_to_one():
     at = int(np.argmin(np.abs(e - 0.2)))
     assert found.noise[at] == pytest.approx(np.sum(weight * (0.2 - t)) / weight.sum(), abs=1e-5)
     assert found.noise_square[at] == pytest.approx(np.sum(weight * (0.2 - t) ** 2) / weight.sum(), abs=1e-5)
+
+
+def test_mixtures_found_together_are_those_found_alone():
+    # Of unlike sizes, shares and places, so that each settles after another number of steps.
+    groups = [mixed(n, share, seed=n)[0] + n for n, share in ((70, 0.3), (300, 0.0), (5000, 0.1), (900, 0.45))]
+    alone = [fit_error_mixture(error, np.zeros(len(error), dtype=np.int64), 1) for error in groups]
+    for one, other in zip(fit_error_mixtures(groups), alone, strict=True):
+        assert (one.location_m, *one.sigma_m) == (other.location_m, *other.sigma_m)
+        assert (one.tail_share, one.tail_mean_m, one.outlier_share) == (
+            other.tail_share,
+            other.tail_mean_m,
+            other.outlier_share,
+        )
+    assert fit_error_mixtures([]) == []

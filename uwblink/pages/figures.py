@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from uwblink.pages.colours import GRID, INK, MUTED
+from uwblink.pages.figures_placed import Placed
 
 COLUMN_IN: Final = 3.5
 """Width of a column of a two-column page, inches."""
@@ -84,7 +85,7 @@ def sheet(width_in: float, count: int = 1, *, height_in: float = 2.3, **kwargs: 
     """
     across = 1 if width_in < NARROW_IN else count
     down = -(-count // across)
-    figure = Figure(figsize=(width_in, height_in * down), layout="constrained")
+    figure = Figure(figsize=(width_in, height_in * down), layout=Placed())
     panels = figure.subplots(down, across, squeeze=False, **kwargs)
     return figure, list(panels.ravel())
 
