@@ -10,7 +10,7 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.protocols.formulas import Intervals
-from uwblink.protocols.table import PROTOCOLS, single_sided
+from uwblink.protocols.table import PROTOCOLS, is_single_sided
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals, names_in, without_stamps
 
@@ -50,7 +50,7 @@ that have any, in m."""
 
 def skew_terms(exchanges: Exchanges) -> Terms:
     """Return of some exchanges what `left_in` asks of all."""
-    names = [name for name in names_in(exchanges.protocol) if name in single_sided() and not corrected(name)]
+    names = [name for name in names_in(exchanges.protocol) if is_single_sided(name) and not corrected(name)]
     rows = np.isin(exchanges.protocol, names) & ~without_stamps(exchanges)
     some = exchanges[rows]
     reply_s = intervals(some).dt32 * TICK_S

@@ -14,7 +14,7 @@ from calib.estimation.problem import Problem
 from calib.ranges import NO_STAMPS, Ranges
 from calib.single_sided import LeftSkew, corrected
 from uwblink.arrays import Floats
-from uwblink.protocols.table import single_sided
+from uwblink.protocols.table import is_single_sided
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import names_in
 
@@ -31,7 +31,7 @@ def limits(ranges: Ranges, problem: Problem, residuals_m: Floats, fixed: Mapping
         yield _without_stamps(bare, len(ranges), "constants" if unknowns.of_pairs else "delays")
     if ranges.left_skew is not None:
         yield told(ranges.left_skew)
-    elif any(name in single_sided() and not corrected(name) for name in names_in(ranges.protocol)):
+    elif any(is_single_sided(name) and not corrected(name) for name in names_in(ranges.protocol)):
         yield (
             "single-sided ranges without their reply times and carrier readings: what clock skew has left in them "
             "cannot be said, and looks like antenna delays"

@@ -53,7 +53,7 @@ class Prior:
         return found
 
 
-def begin(errors: Errors, layout: Layout, start: Floats, ridge: Floats, lasting: float) -> tuple[Floats, Prior]:
+def begin(errors: Errors, layout: Layout, start: Floats, ridge: Floats) -> tuple[Floats, Prior]:
     """Return first parameters, from robust spreads of the residuals, and what is known beforehand."""
     where = layout.slices()
     fitted = errors.design.times(start)
@@ -82,7 +82,7 @@ def begin(errors: Errors, layout: Layout, start: Floats, ridge: Floats, lasting:
     _set(precision, where["cell_noise"], 1e-6)
     return theta, between_pairs(
         theta,
-        Prior(columns=layout.columns, precision=precision, centre=centre, variances={}, lasting=lasting),
+        Prior(columns=layout.columns, precision=precision, centre=centre, variances={}),
         layout,
         None,
     )

@@ -10,7 +10,7 @@ and curves contains what the rest leaves open.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -111,23 +111,39 @@ class Top:
 
 
 def fit_pair_mixture(errors: Errors, start: Floats, ridge: Floats, lasting: float = 1.0) -> PairMixture:
-    """Return the likeliest parameters and what is known of them; takes what `climbed` takes."""
-    return described(errors, climbed(errors, start, ridge, lasting))
+    """Return the likeliest parameters and what is known of them; takes what `foot_of` takes."""
+    return described(errors, climbed(foot_of(errors, start, ridge), lasting))
 
 
-def climbed(errors: Errors, start: Floats, ridge: Floats, lasting: float = 1.0) -> Top:
-    """Return the likeliest parameters, from a robust `start` (m,) of those of the design.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Foot:
+    """Where a climb begins: samples of growing size, everything last, parameters (D,) and what is known beforehand."""
+
+    layout: Layout
+    samples: list[Errors]
+    parameters: Floats
+    prior: Prior
+
+
+def foot_of(errors: Errors, start: Floats, ridge: Floats) -> Foot:
+    """Return where to climb from, by a robust `start` (m,) of the parameters of the design.
 
     `ridge` (m, m) is the inverse covariance of what is known of them beforehand, in 1/m^2.
     """
     layout = Layout(columns=errors.design.shape[1], pairs=errors.pairs)
-    theta, prior = begin(errors, layout, start, ridge, lasting)
+    theta, prior = begin(errors, layout, start, ridge)
+    return Foot(layout=layout, samples=list(_levels(errors)), parameters=theta, prior=prior)
+
+
+def climbed(foot: Foot, lasting: float = 1.0) -> Top:
+    """Return the likeliest parameters, where ranges count for independent that last so many times longer."""
+    theta, prior = foot.parameters, replace(foot.prior, lasting=lasting)
     steps, success = 0, False
-    for some in _levels(errors):
-        nearly = NEARLY if some is errors else ROUGHLY
-        theta, prior, taken, success = _climb(some, layout, theta, prior, nearly)
+    for some in foot.samples:
+        nearly = NEARLY if some is foot.samples[-1] else ROUGHLY
+        theta, prior, taken, success = _climb(some, foot.layout, theta, prior, nearly)
         steps += taken
-    return Top(layout=layout, parameters=theta, prior=prior, steps=steps, success=success)
+    return Top(layout=foot.layout, parameters=theta, prior=prior, steps=steps, success=success)
 
 
 def described(errors: Errors, top: Top) -> PairMixture:

@@ -12,7 +12,7 @@ from calib.estimation.gauge import stating
 from calib.estimation.intervals import blocks_of, intervals
 from calib.estimation.losses import MIXTURE
 from calib.estimation.mixture_slopes import Errors
-from calib.estimation.pair_mixture import PairMixture, climbed, described
+from calib.estimation.pair_mixture import PairMixture, climbed, described, foot_of
 from calib.estimation.persistence import Persistence, lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of, terms
@@ -139,10 +139,11 @@ def _likeliest(problem: Problem, start: Floats, ridge: Floats) -> PairMixture:
     place = computed(len(pairs.number), lambda rows: pairs.number[rows] * CELLS + problem.cell_of(rows), np.int32)
     errors = Errors.of(problem.error, problem.design, place, len(pairs.ends))
     del place
-    top = climbed(errors, start, ridge)
+    foot = foot_of(errors, start, ridge)
+    top = climbed(foot)
     lasting = lasting_in_pairs(top.slope(errors, "share"), pairs.number, problem.ranges.time_ns)
     if lasting > LASTING:
-        again = climbed(errors, start, ridge, lasting)
+        again = climbed(foot, lasting)
         top = replace(again if again.success else top, steps=top.steps + again.steps)
     return described(errors, top)
 

@@ -106,6 +106,11 @@ def single_sided() -> tuple[str, ...]:
     return tuple(row.name for row in PROTOCOLS.values() if row.third_sender is None)
 
 
+def is_single_sided(name: str) -> bool:
+    """Return whether a protocol has two messages; one of the project's own is known without looking for others."""
+    return name in PROTOCOLS and PROTOCOLS[name].third_sender is None
+
+
 def third_from_target() -> tuple[str, ...]:
     """Return the names of the protocols whose third message the target sends."""
     return tuple(row.name for row in PROTOCOLS.values() if row.third_sender == "target")
