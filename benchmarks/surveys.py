@@ -22,7 +22,9 @@ import numpy as np
 
 import calib
 from benchmarks.standing import DIMENSIONS, Standing, power_dbm, standing_boards
-from calib.planning.candidates import Layout, delay_information
+from calib.planning.candidates import Layout
+from calib.planning.having import having
+from calib.planning.promise import promises
 from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "without-motion-capture.md"
@@ -106,14 +108,16 @@ def orders_of(world: Standing, wrong: int | None) -> tuple[dict[str, tuple[int, 
     return {name: tuple(order) for name, order in orders.items()}, text
 
 
-def promised(world: Standing, dimensions: int, curve_m: float) -> Floats:
+def promised(world: Standing, dimensions: int, curve_m: float, reflected: float) -> Floats:
     """Return how well delays (tags,) can be known, ns, by Fisher's information of the very arrangements.
 
-    Of the curve over power, where one is planted, its size is known and that it bends over 8 dB, and no more.
+    That is a plan's promise, with a share of the pairs reflected, those of any draw. Of the curve over power, where one
+    is planted, its size is known and that it bends over 8 dB, and no more.
     """
     if not curve_m:
-        total = sum(delay_information(Layout(place, dimensions), PAIR_M, 0.005) for place in world.places)
-        return np.asarray(np.sqrt(np.diag(np.linalg.pinv(total))) / C_M_PER_NS)
+        shape = next(name for name, size in DIMENSIONS.items() if size == dimensions)
+        given = having(len(world.delays_ns), shape, None, 0, 0.005, (), 0.01, PAIR_M, 1, reflected)
+        return promises(given, [Layout(place, dimensions) for place in world.places])[-1].each
     boards = len(world.places[0])
     pairs = np.array(list(combinations(range(boards), 2)))
     lines, powers = [], []
@@ -154,9 +158,12 @@ def row(name: str, outcomes: dict[int, Outcome]) -> str:
     spreads = []
     for seed, found in some.items():
         world = standing_boards(seed, **settings)
-        spread = promised(world, DIMENSIONS[settings["shape"]], settings.get("bias_size_m", 0.0))
+        spread = promised(
+            world, DIMENSIONS[settings["shape"]], settings.get("bias_size_m", 0.0), settings.get("reflected", 0.0)
+        )
         spreads.append(spread[np.array(found.tags) - 1])
-    rms, promise = (float(np.sqrt(np.mean(v**2))) for v in (errors, np.concatenate(spreads)))
+    every = np.concatenate(spreads)
+    rms, promise = (float(np.sqrt(np.mean(v**2))) for v in (errors, every[np.isfinite(every)]))
     left = sum(settings["boards"] - len(found.tags) for found in some.values())
     cells = [
         f"{1e3 * rms:.0f} ps",

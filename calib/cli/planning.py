@@ -84,6 +84,10 @@ def plan(
         float | None,
         typer.Option(rich_help_panel=STANDING, help="Constant error of a pair in an arrangement (m); 0.02 by default."),
     ] = None,
+    reflected: Annotated[
+        float | None,
+        typer.Option(help="Share of pairs that are reflected, of a flight of ranges; 0 by default, 0.08 of a flight."),
+    ] = None,
     seconds: Annotated[
         float | None, typer.Option(rich_help_panel=FLYING, help="How long robots fly; 60 by default.")
     ] = None,
@@ -139,9 +143,6 @@ def plan(
     noise: Annotated[
         float | None, typer.Option(rich_help_panel=FLYING, help="Noise of a range (m); 0.04 by default.")
     ] = None,
-    reflected: Annotated[
-        float | None, typer.Option(rich_help_panel=FLYING, help="Share of ranges that are reflected; 0.08 by default.")
-    ] = None,
     delays_only: Annotated[
         bool, typer.Option("--delays-only", rich_help_panel=FLYING, help="No curve over power will be fitted.")
     ] = False,
@@ -158,6 +159,7 @@ def plan(
         "rate_hz": rate,
         "taped": taped,
         "tape_sigma_m": tape_sigma,
+        "reflected": reflected,
     }
     standing = {
         "arrangements": arrangements,
@@ -175,7 +177,6 @@ def plan(
         "anchor_places": anchor_places,
         "still_s": still,
         "noise_m": noise,
-        "reflected": reflected,
         "delays_only": delays_only or None,
     }
     if output or figures:

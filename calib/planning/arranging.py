@@ -16,7 +16,8 @@ from calib.planning.candidates import Layout
 from calib.planning.choosing import Choice, best_tape, choose, mean_std
 from calib.planning.having import Having, having
 from calib.planning.procedure import named, steps, where
-from calib.planning.result import NextBest, Plan
+from calib.planning.promise import Promise, promises
+from calib.planning.result import Halves, NextBest, Plan
 from calib.surveys.network import DIMENSIONS
 from calib.surveys.scales import DELAY_SCALE_NS, M_PER_NS, TWO_SIDED, widened
 from uwblink.arrays import Floats
@@ -39,6 +40,7 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
     anchors: Sequence[int] = (),
     anchor_sigma_m: float = 0.01,
     pair_error_m: float = 0.02,
+    reflected: float = 0.0,
     rate_hz: float = 50.0,
     seed: int = 1,
 ) -> Plan:
@@ -48,13 +50,14 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
     `size_m` (up to three lengths). `taped` distances will be measured, to `tape_sigma_m`; `anchors` are boards that
     stay where they are, at places known to `anchor_sigma_m`. Each of `arrangements` (by default as many as are worth
     it, at most 12) is the best of sixty random ones after those before it. `pair_error_m` is the constant error that a
-    pair has in an arrangement. Raises `BadInputError` for what cannot be.
+    pair has in an arrangement, and `reflected` the share of pairs that are reflected and say nothing: what is promised
+    is then the mean over which pairs those are. Raises `BadInputError` for what cannot be.
 
     >>> import calib
     >>> calib.plan(3, on="line", arrangements=1).undetermined
     (1, 3)
     """
-    given = having(boards, on, size_m, taped, tape_sigma_m, anchors, anchor_sigma_m, pair_error_m, seed)
+    given = having(boards, on, size_m, taped, tape_sigma_m, anchors, anchor_sigma_m, pair_error_m, seed, reflected)
     if arrangements is not None and not 1 <= arrangements <= len(NAMES):
         raise BadInputError(f"found {arrangements}, expected 1 to {len(NAMES)}", parameter="arrangements")
     if not (math.isfinite(rate_hz) and rate_hz > 0):
@@ -66,7 +69,9 @@ def _promised(choice: Choice, rate_hz: float) -> Plan:
     given, total = choice.given, choice.total
     verdict = _verdict(total, given.tags)
     wide = _wide(given, choice.chosen)
-    after = tuple(_halves(given, choice.chosen[:count]) for count in range(1, len(choice.chosen) + 1))
+    said = promises(given, choice.chosen)
+    curved = promises(given, choice.chosen, curve=True)[-1]
+    after = tuple(_halves(given, choice.chosen[:count], one.each) for count, one in enumerate(said, start=1))
     made = tuple(named(NAMES[k], layout, given.tags) for k, layout in enumerate(choice.chosen))
     pairs = len(list(combinations(given.tags, 2)))
     seconds = max(FEWEST_S, math.ceil(RANGES_A_PAIR * pairs / rate_hz / 10) * 10.0)
@@ -76,12 +81,14 @@ def _promised(choice: Choice, rate_hz: float) -> Plan:
         arrangements=made,
         half_ns=after[-1],
         after_ns=after,
-        common_ns=wide * _common(verdict),
+        common_ns=wide * said[-1].common,
+        with_curve_ns=_halved(curved, wide),
         verdict=verdict,
         next_best=tuple(_next_best(choice, total, wide)),
         rate_hz=rate_hz,
         seconds_each=seconds,
         pair_error_m=given.pair_error_m,
+        reflected=given.reflected,
         known_beside=bool(given.anchors) or given.taped > 0,
         steps=tuple(steps(given, made, seconds)),
     )
@@ -96,19 +103,15 @@ def _wide(given: Having, chosen: list[Layout]) -> float:
     return TWO_SIDED * widened(_freedom(given, chosen))
 
 
-def _halves(given: Having, chosen: list[Layout]) -> dict[int, float]:
-    """Return the half interval of each delay (ns) by so many arrangements, infinite where undetermined."""
-    total = np.sum([given.information(layout) for layout in chosen], axis=0)
-    std, wide = _verdict(total, given.tags).std, _wide(given, chosen)
-    return {tag: wide * float(s) for tag, s in zip(given.tags, std, strict=True)}
+def _halves(given: Having, chosen: list[Layout], std_ns: Floats) -> dict[int, float]:
+    """Return the half interval of each delay (ns) from standard deviations by so many arrangements."""
+    wide = _wide(given, chosen)
+    return {tag: wide * float(s) for tag, s in zip(given.tags, std_ns, strict=True)}
 
 
-def _common(verdict: Verdict) -> float:
-    """Return how well the mean of all delays is known, in ns; infinite where one of them is not."""
-    if not verdict.determined.all():
-        return math.inf
-    share = np.full(len(verdict.std), 1 / len(verdict.std))
-    return math.sqrt(float(share @ verdict.covariance @ share))
+def _halved(promise: Promise, wide: float) -> Halves:
+    each, apart = (wide * float(np.sqrt(np.mean(std**2))) for std in (promise.each, promise.apart))
+    return Halves(each, apart, wide * promise.common)
 
 
 def _freedom(given: Having, chosen: list[Layout]) -> float:

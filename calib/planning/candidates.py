@@ -65,11 +65,18 @@ def delay_information(
 
     `place_sigma_m` are boards whose place is known, by number, and how well.
     """
+    return beside(*rows_of(layout, pair_error_m, tape_sigma_m, place_sigma_m or {}))
+
+
+def rows_of(
+    layout: Layout, pair_error_m: float, tape_sigma_m: float, place_sigma_m: dict[int, float]
+) -> tuple[Floats, Floats]:
+    """Return the derivatives by delays in metres (n, boards) and by coordinates (n, k): pairs, tapes, known places."""
     place, dimensions = layout.place_m, layout.dimensions
     pairs = list(combinations(range(len(place)), 2))
     rows = [_length(place, dimensions, i, j) / pair_error_m for i, j in pairs]
     rows += [_length(place, dimensions, i, j) / tape_sigma_m for i, j in layout.taped]
-    for board, sigma in (place_sigma_m or {}).items():
+    for board, sigma in place_sigma_m.items():
         for axis in range(dimensions):
             row = np.zeros(len(place) * dimensions)
             row[board * dimensions + axis] = 1 / sigma
@@ -77,7 +84,7 @@ def delay_information(
     delays = np.zeros((len(rows), len(place)))
     for k, (i, j) in enumerate(pairs):
         delays[k, [i, j]] = -0.5 / pair_error_m
-    return np.asarray(_beside(delays, np.array(rows)))
+    return delays, np.array(rows)
 
 
 def _length(place: Floats, dimensions: int, i: int, j: int) -> Floats:
@@ -89,8 +96,10 @@ def _length(place: Floats, dimensions: int, i: int, j: int) -> Floats:
     return row.ravel()
 
 
-def _beside(wanted: Floats, others: Floats) -> Floats:
+def beside(wanted: Floats, others: Floats) -> Floats:
     """Return the information on the wanted unknowns (n, m) that the others (n, k) cannot take up."""
+    if not len(others):
+        return np.zeros((wanted.shape[1],) * 2)
     basis, size, _ = np.linalg.svd(others, full_matrices=False)
     basis = basis[:, size > EQUAL * size[0]]
     left = wanted - basis @ (basis.T @ wanted)

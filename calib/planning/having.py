@@ -13,6 +13,9 @@ from calib.surveys.network import DIMENSIONS
 from uwblink.arrays import Floats
 
 SIZES_M: Final = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "": (6.0, 5.0, 2.5)}
+MOST_REFLECTED: Final = 0.3
+"""Share of reflected pairs beyond which nobody could tell which they are."""
+
 SHAPE_OF: Final = {"line": "line", "plane": "plane", "space": ""}
 
 
@@ -29,11 +32,16 @@ class Having:
     anchors: tuple[int, ...]
     anchor_sigma_m: float
     seed: int
+    reflected: float = 0.0
+
+    @property
+    def known_places(self) -> dict[int, float]:
+        """Boards whose place is known, by number, and how well."""
+        return {self.tags.index(tag): self.anchor_sigma_m for tag in self.anchors}
 
     def information(self, layout: Layout) -> Floats:
         """Return what an arrangement of these boards says of their delays (boards, boards), in 1/m^2."""
-        known = {self.tags.index(tag): self.anchor_sigma_m for tag in self.anchors}
-        return delay_information(layout, self.pair_error_m, self.tape_sigma_m, known)
+        return delay_information(layout, self.pair_error_m, self.tape_sigma_m, self.known_places)
 
 
 def having(  # noqa: PLR0913 - what `plan` takes, checked
@@ -46,6 +54,7 @@ def having(  # noqa: PLR0913 - what `plan` takes, checked
     anchor_sigma_m: float,
     pair_error_m: float,
     seed: int,
+    reflected: float,
 ) -> Having:
     """Return what `calib.plan` was given; raises `BadInputError` for what cannot be."""
     tags = tuple(range(1, boards + 1)) if isinstance(boards, int) else tuple(int(tag) for tag in boards)
@@ -63,6 +72,8 @@ def having(  # noqa: PLR0913 - what `plan` takes, checked
             raise BadInputError(f"found {value}, expected more than 0", parameter=name)
     if taped < 0:
         raise BadInputError(f"found {taped}, expected 0 or more", parameter="taped")
+    if not 0 <= reflected <= MOST_REFLECTED:
+        raise BadInputError(f"found {reflected}, expected 0 to {MOST_REFLECTED}", parameter="reflected")
     strangers = sorted(set(anchors) - set(tags))
     if strangers:
         raise BadInputError(f"{strangers[0]} is none of the boards", parameter="anchors")
@@ -80,6 +91,7 @@ def having(  # noqa: PLR0913 - what `plan` takes, checked
         anchors=tuple(anchors),
         anchor_sigma_m=anchor_sigma_m,
         seed=seed,
+        reflected=reflected,
     )
 
 

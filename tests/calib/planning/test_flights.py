@@ -294,3 +294,12 @@ def test_settings_of_the_other_kind_of_plan_are_refused_by_their_flag(words, fla
     done = CliRunner().invoke(app, ["plan", *words])
     assert isinstance(done.exception, calib.BadInputError)
     assert flag in with_flags(str(done.exception))
+
+
+def test_four_anchors_more_are_at_known_places_whatever_is_said_of_anchors_that_there_are_not():
+    short: Any = {"seconds": 8.0, "rate_hz": 30.0, "poses_until_s": 0.0}
+    given, sought = (calib.plan_flight(3, **short, anchor_places=places) for places in ("given", "sought"))
+    mean = [
+        {best.what: best.mean_ns for best in plan.next_best}["4 anchors at known places"] for plan in (given, sought)
+    ]
+    assert mean[0] == pytest.approx(mean[1], rel=1e-9)
