@@ -51,10 +51,14 @@ MOSTLY_REFLECTED: Final = 0.8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Doubts:
-    """The covariance (tags, tags) of the stated delays in ns^2 with what doubts add, and the doubts as sentences."""
+    """The covariance (tags, tags) of the stated delays in ns^2 with what doubts add, and the doubts as sentences.
+
+    `of_places_ns2` (tags, tags) is what of it errors add that belong to places.
+    """
 
     covariance_ns2: Floats
     sentences: list[str]
+    of_places_ns2: Floats
 
 
 def doubts(problem: Problem, found: Solved) -> Doubts:
@@ -76,7 +80,7 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
     places = of_places(problem, found.scores, judged.pairs, kept(blocks))
     covariance, sentences = weighed(problem, found, judged, places)
     sentences += [*reflected(problem, found), *short(found), *_confounded(problem, found)]
-    return Doubts(covariance_ns2=covariance, sentences=sentences)
+    return Doubts(covariance_ns2=covariance, sentences=sentences, of_places_ns2=places.widening_ns2)
 
 
 def weighed(problem: Problem, found: Solved, judged: Judgement, places: OfPlaces) -> tuple[Floats, list[str]]:

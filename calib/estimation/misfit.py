@@ -103,13 +103,15 @@ class Tested:
     """A family's kind and names, and its efficient slopes: sums (k,), their covariance (k, k), information (k, k), and
     effects (tags, k) in ns/m.
 
-    `whole` is the largest information that an alternative would have, were nothing else fitted.
+    `by_time` (k,) are sums of the slopes that the covariance is made of, `whole` is the largest information that an
+    alternative would have, were nothing else fitted.
     """
 
     kind: str
     names: list[str]
     total: Floats
     covariance: Floats
+    by_time: Floats
     information: Floats
     whole: float
     effects: Floats
@@ -273,6 +275,7 @@ def _test(
         names=family.names,
         total=efficient.sum(axis=0),
         covariance=lasting.factor * (efficient.T @ efficient),
+        by_time=efficient.sum(axis=0),
         information=information,
         whole=whole,
         effects=-delays @ taken[:, : delays.shape[1]].T,

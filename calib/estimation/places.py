@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from calib.estimation.intervals import NORMAL95
-from calib.estimation.misfit import REACHED, Tested
+from calib.estimation.misfit import Tested
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
 from calib.long_columns import let_go, spans
@@ -40,9 +40,11 @@ In rooms of the simulator it was 1.2 to 4 times as large, in smooth fields of er
 WALLS_M: Final = 0.02
 """What stays, to a factor of e, where nothing comes and goes: a partition or two that are always in between."""
 
+LEFT: Final = 0.03
+"""Share of an offset's information that delays and trajectories must leave: of less, slopes say nothing of its size."""
+
 LARGEST_M: Final = 0.1
-"""An offset of more is a detour, which has its place among reflections; slopes of pairs of which hardly a range is
-direct would speak of half a metre."""
+"""An offset of more is a detour, which has its place among reflections."""
 
 SIZES_M: Final = np.geomspace(3e-4, 2 * LARGEST_M, 60)
 """Standard deviations of offsets that are thought of."""
@@ -143,9 +145,9 @@ def _lasting(pairs: Tested, sums: Floats, blocks: int) -> _Lasting:
     """Return what is left of offsets that all pairs of a group have; `sums` (groups, pairs) says whose pairs are."""
     total, information = sums @ pairs.total, sums @ pairs.information @ sums.T
     # An offset that lasts is in every block: it is no scatter between them.
-    scatter = pairs.covariance - pairs.lasting.factor * np.outer(pairs.total, pairs.total) / blocks
+    scatter = pairs.covariance - pairs.lasting.factor * np.outer(pairs.by_time, pairs.by_time) / blocks
     values, vectors = np.linalg.eigh(information)
-    base = vectors[:, values > REACHED * pairs.whole]
+    base = vectors[:, values > LEFT * pairs.whole]
     variances, turned = np.linalg.eigh(base.T @ sums @ scatter @ sums.T @ base)
     sure = variances > 1e-9 * variances.max(initial=0.0)
     root = base @ turned[:, sure] / np.sqrt(variances[sure])
@@ -171,7 +173,7 @@ def _moving(problem: Problem, scores: Scores, sums: Floats, blocks: Ints) -> tup
     slope, known = _by_time(problem, scores, blocks)
     # Of a robust loss, a pair of which most ranges lie far out may know less than nothing.
     whole = known.sum(axis=0)
-    some = whole > REACHED * whole.max()
+    some = whole > LEFT * whole.max()
     slope, known, sums = slope[:, some], known[:, some], sums[:, some]
     slope = slope - known * (slope.sum(axis=0) / whole[some])
     product, expected = (((of @ sums.T) ** 2 - of**2 @ sums.T) / 2 for of in (slope, known))

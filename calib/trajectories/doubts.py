@@ -45,7 +45,8 @@ class Taken:
     """What trajectories take of a range's derivatives: derivatives by the band (n, L) and the arrow they are solved by.
 
     `rest` (n, r) are derivatives by standing bodies and biases when trajectories have taken what they can, `schur`
-    (r, r) what is known of them; `held` are those of what is known beside ranges, by the band.
+    (r, r) what is known of them; `held` are those of what is known beside ranges, by the band, and `held_design` by the
+    parameters of the design when trajectories have taken what they can.
     """
 
     local: csr_array[Any]
@@ -53,17 +54,18 @@ class Taken:
     rest: Floats
     schur: Floats
     held: csr_array[Any]
+    held_design: Floats
     informed: Floats
 
     def left(self, offsets: Floats) -> tuple[Floats, Floats]:
-        """Return what is left of offsets (n, k), and what prior knowledge adds to the covariance of slopes (k, k)."""
+        """Return what is left of offsets (n, k), and how they pull at what is known beside ranges (l, k)."""
         weighed = offsets * self.informed[:, None]
         reach = self.whole.inverse_on(np.ascontiguousarray(self.local.T @ weighed))
         found = offsets - self.local @ reach
         pulls = self.held @ reach
         if self.rest.shape[1]:
             found = found - self.rest @ np.linalg.lstsq(self.schur, self.rest.T @ weighed, rcond=1e-13)[0]
-        return np.asarray(found), np.asarray(pulls.T @ pulls)
+        return np.asarray(found), np.asarray(pulls)
 
 
 def doubted(problem: Problem, found: Solved, taken: Taken) -> Doubts:
@@ -73,21 +75,24 @@ def doubted(problem: Problem, found: Solved, taken: Taken) -> Doubts:
     """
     blocks, seconds = blocks_of(problem.ranges.time_ns)
     kept = found.scores.design.kept
-    tested = [
-        _test(family, found, taken, kept(blocks), seconds)
-        for family in families(problem, of_a_decibel(problem, found), seconds)
-    ]
+    alternatives = list(families(problem, of_a_decibel(problem, found), seconds))
+    tested = [_test(family, found, taken, kept(blocks), seconds) for family in alternatives]
+    by_pair = next(family for family in alternatives if family.kind == "pair")
     several = sum(len(one.names) for one in tested)
     judged = Judgement(
         findings=sorted(
             (one for each in tested for one in findings(each, several)), key=lambda finding: -abs(finding.deviation)
         ),
         widening_ns2=np.asarray(sum(widening_of_pairs(each) for each in tested if each.kind == "pair")),
-        pairs=next((one for one in tested if one.kind == "pair"), None),
+        pairs=_test(by_pair, found, taken, kept(blocks), seconds, pulling=True),
     )
     places = of_places(problem, found.scores, judged.pairs, kept(blocks))
     covariance, sentences = weighed(problem, found, judged, places)
-    return Doubts(covariance_ns2=covariance, sentences=[*sentences, *reflected(problem, found), *short(found)])
+    return Doubts(
+        covariance_ns2=covariance,
+        sentences=[*sentences, *reflected(problem, found), *short(found)],
+        of_places_ns2=places.widening_ns2,
+    )
 
 
 def _offsets(family: Family, kept_rows: int) -> Floats:
@@ -99,19 +104,29 @@ def _offsets(family: Family, kept_rows: int) -> Floats:
     return found
 
 
-def _test(family: Family, found: Solved, taken: Taken, blocks: Ints, seconds: float) -> Tested:
-    """Return a family's efficient slopes, beside trajectories and all that was fitted."""
+def _test(
+    family: Family, found: Solved, taken: Taken, blocks: Ints, seconds: float, *, pulling: bool = False
+) -> Tested:
+    """Return a family's efficient slopes, beside trajectories and all that was fitted.
+
+    With `pulling`, it is reckoned with that a delay whose offsets trajectories follow pulls at known places just as
+    such an offset does: what delays can take up is then left out to the last, as offsets that last ask for.
+    """
     scores, design = found.scores, found.scores.design
     offsets = design.given(_offsets(family, len(design)))
-    left, of_prior = taken.left(offsets)
+    left, pulls = taken.left(offsets)
     score, mine = scores.score, design.kept(left)
     information = (offsets * taken.informed[:, None]).T @ left
     link = _linked(scores, mine)
+    if pulling:
+        link[:, : taken.held_design.shape[1]] -= pulls.T @ taken.held_design
     reach = link @ found.inverse
     count = len(found.by_block)
     plain = np.column_stack([np.bincount(blocks, score * column, minlength=count) for column in mine.T])
     efficient = plain - found.by_block @ reach.T
     information = information - reach @ link.T
+    # At the optimum all that was fitted has no slope left, what is known beside ranges included.
+    known = 0.0 if pulling else found.by_block.sum(axis=0) @ reach.T
     whole = max(float(np.diag((offsets * taken.informed[:, None]).T @ offsets).max()), 1e-300)
     free = max(int(np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True)), 1)
     spans = segments(seconds) if family.kind == "time" else SPANS
@@ -119,8 +134,9 @@ def _test(family: Family, found: Solved, taken: Taken, blocks: Ints, seconds: fl
     return Tested(
         kind=family.kind,
         names=family.names,
-        total=score @ design.kept(offsets) - found.by_block.sum(axis=0) @ reach.T,
-        covariance=lasting.factor * (efficient.T @ efficient) + of_prior,
+        total=score @ design.kept(offsets) - known,
+        covariance=lasting.factor * (efficient.T @ efficient) + pulls.T @ pulls,
+        by_time=efficient.sum(axis=0),
         information=information,
         whole=whole,
         effects=-found.delays @ reach[:, : found.delays.shape[1]].T,

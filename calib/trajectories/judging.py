@@ -117,12 +117,14 @@ def judged(climbed: Climbed, problem: Problem, reference: float | None, curve: C
     if curve is not None:
         covariance = covariance + unsure_of_curve(problem, curve, solved, climbed.informed)
     covariance = beyond_linear(covariance, climbed.scene)
+    # What places add is no matter of what ranges determine: with motion capture it is as large.
+    of_ranges = covariance - beyond_linear(doubts.of_places_ns2, climbed.scene)
     ridge = climbed.ridge[:columns, :columns]
     with_truth = delays @ np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + ridge) @ delays.T
     plain = np.linalg.pinv(_information(reduced.design, climbed.informed) + precision[:columns, :columns])
     return Judged(
         solved=solved,
-        verdict=verdict_on(covariance, with_truth, problem),
+        verdict=verdict_on(of_ranges, with_truth, problem),
         absorbed=_absorbed(delays @ plain @ delays.T, with_truth),
         distance_std_m=spread,
         covariance_ns2=covariance,
@@ -169,6 +171,7 @@ def _reduced(climbed: Climbed) -> _Reduced:
         rest=left[:, columns:],
         schur=schur[columns:, columns:],
         held=known.local,
+        held_design=held @ turn,
         informed=climbed.informed,
     )
     return _Reduced(taken=taken, schur=schur, design=left @ turn, held=held @ turn)

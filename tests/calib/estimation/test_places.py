@@ -50,9 +50,9 @@ def test_errors_that_come_and_go_are_named_where_bodies_are_as_many_as_their_pai
 
 @pytest.mark.parametrize("bodies", [3, 4])
 def test_sound_flights_keep_their_intervals(bodies):
-    ranges, _ = ranges_with_field(2, bodies=bodies, seconds=40.0)
+    ranges, _ = ranges_with_field(2, bodies=bodies, seconds=25.0)
     result, alone = calib.fit(ranges), calib.fit(replace(ranges, bodies=()))
-    assert not result.warnings
+    assert not named(result)
     assert result.calibration.delays_std_ns == pytest.approx(alone.calibration.delays_std_ns, rel=1e-9)
 
 
