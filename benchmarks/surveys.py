@@ -45,8 +45,6 @@ WORLDS: dict[str, dict[str, Any]] = {
     "line, 5 % reflected, by 5 to 20 cm": LINE | {"reflected": 0.05, "detour_m": (0.05, 0.2)},
     "plane, 5 % of pairs reflected": PLANE | {"reflected": 0.05},
     "space, 5 % of pairs reflected": SPACE | {"reflected": 0.05},
-    "line, 5 % of pairs reflected, orders said": LINE | {"reflected": 0.05, "said": ""},
-    "line, 10 % of pairs reflected, orders said": LINE | {"reflected": 0.1, "said": ""},
     "plane, bias over power": PLANE | {"bias_size_m": 0.05, "size_m": 8.0},
     "space, one arrangement": {"shape": "space", "boards": 5, "arrangements": 1},
 }

@@ -147,13 +147,13 @@ def _rows(found: SurveyedArrangement) -> Iterator[tuple[SurveyedBoard, list[floa
 
 def _toml(found: SurveyedArrangement) -> Iterator[str]:
     yield f"# Arrangement {found.name}, surveyed from ranges. Frame: {found.frame}. Metres."
-    yield "# covariance_m2: xx xy xz yy yz zz."
+    yield "# covariance_m2: xx xy xz yy yz zz, m^2."
     for board, position, upper in _rows(found):
         yield ""
         yield "[[anchors]]"
         yield f"id = {board.tag}"
         yield f"position_m = [{', '.join(map(str, position))}]"
-        yield f"# covariance_m2 = [{', '.join(map(str, upper))}]"
+        yield f"covariance_m2 = [{', '.join(map(str, upper))}]"
 
 
 def _yaml(found: SurveyedArrangement) -> Iterator[str]:

@@ -23,7 +23,8 @@ def load_tags(path: Path) -> tuple[Tag, ...]:
 def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, float, float]]]:
     """Read the `[[tags]]` of a file and the places in metres of its `[[anchors]]`, which stand still, by id.
 
-    Raises `PlanError` where there are neither, or an id is there twice.
+    An anchor may have `covariance_m2` (xx xy xz yy yz zz), as `calib survey --anchors` writes it; poses have no place
+    for it. Raises `PlanError` where there are neither, or an id is there twice.
     """
     file = TomlReader(path, PlanError)
     tags, rows = read_tags(file), file.table.get("anchors", [])
@@ -34,13 +35,14 @@ def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, flo
     found: dict[int, tuple[float, float, float]] = {}
     taken = {tag.tag for tag in tags}
     for k, row in enumerate(rows):
-        file.known(row, ("id", "position_m"), f"anchors[{k}].")
+        file.known(row, ("id", "position_m", "covariance_m2"), f"anchors[{k}].")
         number, place = row.get("id"), row.get("position_m")
         file.check(f"anchors[{k}].id", number, is_board_id(number), f"a whole number 0 to {LARGEST_BOARD_ID}")
         if number in found or number in taken:
             raise PlanError(f"{path}: anchors[{k}].id: found a second {number}, ids must differ")
-        good = isinstance(place, list) and len(place) == 3 and all(map(is_number, place))
-        file.check(f"anchors[{k}].position_m", place, good, "three numbers (metres)")
+        file.check(f"anchors[{k}].position_m", place, _are_numbers(place, 3), "three numbers (metres)")
+        spread = row.get("covariance_m2", [0.0] * 6)
+        file.check(f"anchors[{k}].covariance_m2", spread, _are_numbers(spread, 6), "xx xy xz yy yz zz, six numbers")
         found[number] = (float(place[0]), float(place[1]), float(place[2]))
     return tags, found
 
@@ -58,10 +60,13 @@ def read_tags(file: TomlReader) -> tuple[Tag, ...]:
         if any(tag.tag == number for tag in tags):
             raise file.error(f"{file.path}: tags[{k}].id: found a second {number}, ids must differ")
         file.check(f"tags[{k}].body", body, isinstance(body, str) and bool(body), "the name of a body")
-        good = isinstance(arm, list) and len(arm) == 3 and all(map(is_number, arm))
-        file.check(f"tags[{k}].lever_arm_m", arm, good, "three numbers (metres)")
+        file.check(f"tags[{k}].lever_arm_m", arm, _are_numbers(arm, 3), "three numbers (metres)")
         tags.append(Tag(number, body, (float(arm[0]), float(arm[1]), float(arm[2]))))
     return tuple(tags)
+
+
+def _are_numbers(value: Any, count: int) -> bool:
+    return isinstance(value, list) and len(value) == count and all(map(is_number, value))
 
 
 def is_board_id(value: Any) -> bool:

@@ -17,6 +17,7 @@ from calib.surveys.knowledge import load_knowledge
 from calib.surveys.samples import DELAYS_NS
 from uwblink import Arrangement, Contents, Exchanges
 from uwblink.recording.schema import KnownDistance
+from uwblink.recording.tags import load_places
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 
@@ -285,6 +286,10 @@ def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_rea
     rows = tomllib.loads(anchors.read_text())["anchors"]
     assert [row["id"] for row in rows] == [1, 2, 3, 4]
     assert rows[0]["position_m"] == [0.0, 0.0, 0.0]
+    std = np.sqrt([row["covariance_m2"][0] for row in rows])
+    assert std[0] == 0
+    assert std[1:] == pytest.approx([std[1]] * 3, rel=0.8)
+    assert sorted(load_places(anchors)[1]) == [1, 2, 3, 4]
     # A corrected recording comes of it as of any other calibration.
     assert calib.apply(recording[0], known, tmp_path / "corrected.uwb").count == 600
 
