@@ -29,7 +29,7 @@ from uwblink.boards.listeners import Heard
 from uwblink.boards.ports import Transport
 from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.recorder import FILE_MB, record
+from uwblink.boards.record import FILE_MB, record
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import FrameRow, Poses

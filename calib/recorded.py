@@ -18,17 +18,13 @@ from calib.planted import check_planted
 from calib.ranges import COLUMNS, Ranges, bodies_of, columns_of, usable_rows
 from calib.single_sided import Terms, left_in, skew_terms
 from uwblink.recording.file import Recording
+from uwblink.recording.target_reports import single_exchange_blocks
 from uwblink.twr import Exchanges, names_in
 
 FINGERPRINT: Final = 32
 """Digits of a hash that tells exchanges from all others."""
 
 EXCHANGES_AT_ONCE: Final = 131_072
-
-
-def reported_twice(exchanges: Exchanges) -> bool:
-    """Return whether targets reported, too, so that an exchange may stand there twice."""
-    return bool(np.any((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target)))
 
 
 class _Columns:
@@ -74,14 +70,12 @@ class _Columns:
 def read_ranges(recording: Recording, name: str, *, need_power: bool, rows: int = EXCHANGES_AT_ONCE) -> Ranges | None:
     """Return the ranges of a recording that can be used, reading so many `rows` at once.
 
-    None where all exchanges have to be looked at together: targets reported too, or none of them can be used, and why
-    is a matter of all.
+    Of an exchange that both ends reported one report counts. None where none can be used, and why is a matter of all.
     """
     reading = _Reading(recording, need_power=need_power)
-    for block in recording.exchange_blocks(rows):
-        if reported_twice(block):
-            return None
-        reading.add(block)
+    for block in single_exchange_blocks(recording, rows):
+        if len(block):
+            reading.add(block)
     return reading.ranges(name)
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from uwblink.boards.board import Board
     from uwblink.boards.listeners import Heard, Listener
     from uwblink.boards.ranging_plan import RangingPlan
-    from uwblink.boards.recorder import record
+    from uwblink.boards.record import record
     from uwblink.errors import UwblinkError
     from uwblink.importers import import_recording, register_importer
     from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
@@ -79,7 +79,7 @@ _HOMES: Final = {
     "import_recording": "uwblink.importers",
     "load": "uwblink.recording.contents",
     "raw_range": "uwblink.twr",
-    "record": "uwblink.boards.recorder",
+    "record": "uwblink.boards.record",
     "register_importer": "uwblink.importers",
     "register_message": "uwblink.wire.messages",
     "register_protocol": "uwblink.protocols.table",

@@ -5,7 +5,7 @@ Every check raises `ArgumentError` that names the column, the first row that is 
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,6 +74,33 @@ def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
     if bad.any():
         _refuse(name, found, np.asarray(bad), "finite numbers")
     return found
+
+
+MOST_WORDS: Final = 16
+"""Different words of a column up to which it is quicker to compare with each than to sort."""
+
+
+def few_words(column: NDArray[Any]) -> tuple[NDArray[np.str_], Ints] | None:
+    """Return the different words of a column of text (n,), as they first come, and which each row has (n,), from 0.
+
+    None where there are more than `MOST_WORDS`, and for a column that is not of text, or empty.
+
+    >>> words, which = few_words(np.array(["b", "a", "b"]))
+    >>> words.tolist(), which.tolist()
+    (['b', 'a'], [0, 1, 0])
+    """
+    if column.dtype.kind != "U" or isinstance(column, np.ma.MaskedArray) or not len(column):
+        return None
+    which = np.zeros(len(column), dtype=np.int64)
+    words: list[Any] = []
+    row = 0
+    while row < len(column):
+        if len(words) == MOST_WORDS:
+            return None
+        words.append(column[row])
+        which[column == column[row]] = len(words)
+        row += int(np.argmin(which[row:])) if not which[row:].all() else len(column)
+    return np.array(words), which - 1
 
 
 def reject(name: str, values: NDArray[Any], bad: Bools, expected: str) -> None:

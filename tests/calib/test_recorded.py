@@ -1,6 +1,7 @@
 """Ranges read some exchanges at a time are those of all exchanges and all poses, to the last bit."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from calib.long_columns import empty, joined, let_go, picked
 from calib.ranges import APART, COLUMNS, Ranges
 from calib.recorded import read_ranges
 from calib.samples import sample_flight
-from uwblink.recording import blocks
+from calib.sources import fingerprint
+from uwblink.recording import blocks, target_reports
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.target_reports import single_reports
+from uwblink.twr import Exchanges
 
 ROWS = 300
 
@@ -130,12 +134,40 @@ def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeyp
     assert max(held) < len(flight.poses) / 10
 
 
-def test_what_takes_all_exchanges_at_once_is_left_to_others(tmp_path):
+def both_ends(exchanges, poses, tags):
+    """The same with a second report, some time later, of two in three, in no order of time; some of them alone."""
+    rng = np.random.default_rng(8)
+    again = exchanges[np.flatnonzero(rng.random(ROWS) < 0.67)]
+    second = replace(
+        again, time_ns=again.time_ns + rng.integers(0, 50_000_000, len(again)), reporter=again.target.copy()
+    )
+    kept = exchanges[np.flatnonzero(np.arange(ROWS) % 10 > 0)]
+    columns: dict[str, Any] = {n: np.concatenate([getattr(kept, n), getattr(second, n)]) for n in kept.to_dict()}
+    order = np.argsort(columns["time_ns"] + rng.integers(0, 10**9, len(columns["time_ns"])))
+    return Exchanges(**{name: column[order] for name, column in columns.items()}), poses, tags
+
+
+@pytest.mark.parametrize("rows", [19, 10 * ROWS])
+def test_of_two_reports_one_counts_wherever_blocks_and_stretches_end(tmp_path, monkeypatch, rows):
+    path = written(tmp_path / "it.uwb", *both_ends(*awkward()))
+    with Recording.open(path) as recording:
+        reports = single_reports(recording.exchanges())
+        alone = reports.exchanges
+        whole = Ranges.from_exchanges(
+            alone, poses=recording.poses(), tags=recording.tags(), planted=recording.meta()["planted"], source="it"
+        ).usable()
+        monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", 23)
+        found = read_ranges(recording, "it", need_power=True, rows=rows)
+    assert found is not None
+    assert reports.repeated > ROWS / 3
+    assert_same(found, whole)
+    assert found.recordings == (("it", fingerprint(alone)),)
+
+
+def test_why_no_range_can_be_used_is_a_matter_of_all(tmp_path):
     flight = sample_flight(ROWS)
-    twice = replace(flight.exchanges, reporter=flight.exchanges.target)
-    for name, exchanges, poses in (("twice", twice, flight.poses), ("no truth", flight.exchanges, flight.poses[:0])):
-        with Recording.open(written(tmp_path / f"{name}.uwb", exchanges, poses, flight.tags)) as recording:
-            assert read_ranges(recording, name, need_power=True) is None
+    with Recording.open(written(tmp_path / "it.uwb", flight.exchanges, flight.poses[:0], flight.tags)) as recording:
+        assert read_ranges(recording, "it", need_power=True) is None
 
 
 def test_long_columns_are_arrays_like_any_other(monkeypatch):

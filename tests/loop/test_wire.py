@@ -9,7 +9,7 @@ from tests import processes
 from tests.boards import served
 from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.recorder import record
+from uwblink.boards.record import record
 from uwblink.importers.motion_capture import add_poses
 from uwblink.recording.tags import load_tags
 from uwbsim.boards.server import extended

@@ -71,7 +71,7 @@ def done(tmp_path_factory):
         for name, *words in (shlex.split(line.replace(*SHORTER)) for line in COMMANDS):
             if words[0] == "serve":
                 bench = Bench(words[1], words[words.index("--link-dir") + 1])
-                patch.setattr("uwblink.boards.recorder.SerialPorts", lambda ports=bench.ports: ports)
+                patch.setattr("uwblink.boards.record.SerialPorts", lambda ports=bench.ports: ports)
                 continue
             result = bench.record(words) if name == "uwblink" else CliRunner().invoke(calib_app, words)
             assert result.exit_code == 0, (name, words, result.output, result.exception)

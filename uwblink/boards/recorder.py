@@ -6,153 +6,33 @@ would collide on the air. A board that is unplugged leaves the others running an
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from uwblink.boards.board import PROTOCOL_FLAGS, Board
 from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, CommandOutcome
-from uwblink.boards.listeners import Heard, Listener, Pair, Turn, as_listeners
+from uwblink.boards.listeners import Heard, Listener, Pair, Turn
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.progress import PairState, Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.report_check import ReportCheck
 from uwblink.boards.station import Station
-from uwblink.boards.writer import RecordingWriter
-from uwblink.errors import BoardError, PlanError, PortError, PortLostError
-from uwblink.output import check_output
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import SHAPES, Arrangement, Fault, Tag
+from uwblink.errors import BoardError, PortError, PortLostError
+from uwblink.recording.schema import Fault
 from uwblink.wire.codec import Event
 from uwblink.wire.messages import IdReport, Message, RangeCommand, RangeReport, Skipped, TextLine
 
 LONGEST_WAIT_S: Final = 0.05
 NOBODY_READY_S: Final = 0.005
 WATCH_EVERY_S: Final = 0.25
-FILE_MB: Final = 200
-"""Of the file so much is kept in memory; without a limit all of it would be, and a recording of hours is long."""
-
 MOST_FAULT_TEXT: Final = 200
 EXPECTED_TEXTS: Final = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
 """Lines that every ranging brings; any other one is noted as a fault."""
 
 
-def record(  # noqa: PLR0913 - the settings of a recording, by keyword
-    ports: Iterable[str],
-    output: str | os.PathLike[str],
-    plan: RangingPlan,
-    *,
-    duration_s: float = float("inf"),
-    passive: bool = False,
-    arrangement: str | None = None,
-    known: str = "",
-    order: Sequence[int] = (),
-    force: bool = False,
-    stop: Callable[[], bool] = lambda: False,
-    watch: Callable[[Progress], None] | None = None,
-    listeners: Iterable[Listener | Callable[[Heard], object]] = (),
-    using: Ports | None = None,
-) -> Progress:
-    """Record from boards until `stop` says so or the time is over; returns what was done.
-
-    `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are told what the file gets
-    (see `uwblink.boards.listeners`), and `using` are other ports than this computer's serial ones (`VirtualPorts`).
-    `arrangement` names the places of boards that stand still meanwhile, `known` to be on a "line" or a "plane", and
-    `order` says in which order their ids lie along a line; it is marked in the recording, for a survey.
-    `KeyboardInterrupt` ends a recording like `stop`, with everything in the file. Raises the errors of `Board.open`,
-    `PlanError` (a tag of plan or order is absent, two boards have one id, a duration that is none), and
-    `RecordingError` (cannot be written, disk full); the file stays readable.
-
-    >>> import uwblink, uwbsim
-    >>> ports = uwbsim.VirtualPorts(
-    ...     uwbsim.load(
-    ...         '''
-    ...         run = { duration_s = 10.0 }
-    ...         ranging = { rate_hz = 50 }
-    ...         bodies = [
-    ...             { name = "near", motion = { model = "static", position_m = [0.0, 0.0, 1.0] } },
-    ...             { name = "far", motion = { model = "static", position_m = [3.0, 0.0, 1.0] } },
-    ...         ]
-    ...         tags = [{ id = 10, body = "near" }, { id = 20, body = "far" }]
-    ...         '''
-    ...     )
-    ... )
-    >>> plan = uwblink.RangingPlan(rate_hz=20.0)
-    >>> done = uwblink.record(ports.names.values(), "flight.uwb", plan, duration_s=1.0, using=ports)
-    >>> len(uwblink.load("flight.uwb").exchanges) == done.exchanges > 15
-    True
-    """
-    if not duration_s > 0:
-        raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
-    if known not in SHAPES or (known and not arrangement):
-        raise PlanError(f"known: found {known!r:.40}, allowed: line, plane, of an arrangement that has a name")
-    if order and known != "line":
-        raise PlanError("order: is that of boards on a line; say that they are known to be on one")
-    path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
-    check_output(path, force=force)
-    found = identify(ports, using)
-    turns = plan.turns(sorted(found))
-    if order and sorted(order) != sorted(found):
-        there = ", ".join(map(str, sorted(found)))
-        raise PlanError(f"order: found {', '.join(map(str, order))}, expected each of the boards at the ports, {there}")
-    meta = _meta(found, plan, turns, passive)
-    with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
-        seats = {tag.tag: tag for tag in plan.tags}
-        recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
-        with RecordingWriter(recording) as writer:
-            recorder = Recorder(found, plan, turns, [writer, *others], passive=passive, ports=using)
-
-            def tell(progress: Progress) -> None:
-                progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
-                if watch:
-                    watch(progress)
-
-            try:
-                recorder.run(duration_s, stop, tell)
-            finally:
-                recorder.close()
-        if arrangement:
-            last_ns = max(using.host_ns(), recorder.progress.start_ns + 1)
-            mark = Arrangement(arrangement, recorder.progress.start_ns, last_ns, known, tuple(order))
-            recording.append_arrangements([mark])
-    return recorder.progress
-
-
-def _meta(found: dict[int, str], plan: RangingPlan, turns: Iterable[Pair], passive: bool) -> dict[str, Any]:
-    return {
-        "source": "boards",
-        "ports": {str(board): name for board, name in sorted(found.items())},
-        "plan": {
-            "pairs": [list(pair) for pair in turns],
-            "rate_hz": plan.rate_hz,
-            "protocol": plan.protocol,
-            "target_reports": plan.target_reports,
-            "get_cir": plan.get_cir,
-            "passive": passive,
-        },
-    }
-
-
-def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]:
-    """Return which board is at each port; raises `PlanError` when two have one id, and what `Board.open` raises."""
-    using = ports or SerialPorts()
-    found: dict[int, str] = {}
-    for name in names:
-        port = using.open(name)
-        try:
-            number = Board(port).id
-        finally:
-            using.close(port)
-        if number in found:
-            raise PlanError(f"{found[number]} and {name} both say they are board {number}; ids must differ")
-        found[number] = name
-    return found
-
-
 class Recorder:
-    """The loop of `record`: `boards` maps ids to ports, `turns` are the pairs that take turns."""
+    """The loop of a recording: `boards` maps ids to ports, `turns` are the pairs that take turns."""
 
     def __init__(
         self,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from uwblink.columns import few_words
 from uwblink.errors import ImportTableError
 from uwblink.importers.poses import read_poses
 from uwblink.recording.distances import distances_m
@@ -56,7 +57,7 @@ def add_poses(
         seats = [tag for tag in (given or opened.tags()) if tag.tag not in anchors] + standing
         if not len(exchanges):
             raise ImportTableError(f"{recording}: holds no exchanges to add truth to")
-        bodies = set(np.unique(poses.body).tolist())
+        bodies = _bodies(poses)
         sitting = [tag for tag in seats if tag.body in bodies]
         if len(sitting) < 2:
             found = ", ".join(sorted({tag.body for tag in seats})) or "none"
@@ -77,6 +78,11 @@ def add_poses(
         meta = {"poses_from": ", ".join(path.name for path in files.values()), "poses_offset_s": shift_ns * 1e-9}
         opened.replace_poses(moved, meta, seats if tags_from else None)
     return AddedPoses(len(poses), tuple(sorted(bodies)), shift_ns * 1e-9, len(exchanges), covered)
+
+
+def _bodies(poses: Poses) -> set[str]:
+    few = few_words(poses.body)
+    return set((few[0] if few else np.unique(poses.body)).tolist())
 
 
 def _joined(parts: list[Poses]) -> Poses:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Ints
+from uwblink.arrays import Bools, Ints
 from uwblink.display import printable
 from uwblink.errors import RecordingError
 from uwblink.recording.blocks import ROWS_AT_ONCE, PoseWindows, exchange_blocks, filled, read_exchanges
@@ -68,6 +68,24 @@ class TableReaders:
         """Return the exchanges from `start_ns` until before `end_ns`, in the order in which they were written."""
         where = f"WHERE time_ns >= {int(start_ns)} AND time_ns < {int(end_ns)} ORDER BY rowid"
         return read_exchanges(self._store, self._bits(), where)
+
+    def rows_between(self, start_ns: int, end_ns: int) -> Ints:
+        """Return the numbers of the rows of `exchanges_between`, in their order."""
+        where = f"WHERE time_ns >= {int(start_ns)} AND time_ns < {int(end_ns)} ORDER BY rowid"
+        return filled(self._store.read(f"SELECT rowid AS row FROM exchanges {where}")["row"])  # noqa: S608 - numbers
+
+    def exchange_blocks_without(self, left_out: Bools, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
+        """Yield what `exchange_blocks` yields without some exchanges: `left_out` (n,) says which, by row number."""
+        starts = range(0, len(left_out), rows)
+        for start, block in zip(starts, self.exchange_blocks(rows), strict=True):
+            where = f"WHERE rowid >= {start} AND rowid < {start + rows} ORDER BY rowid"
+            numbers = filled(self._store.read(f"SELECT rowid AS row FROM exchanges {where}")["row"])  # noqa: S608 - numbers
+            yield block[~left_out[numbers]]
+
+    def row_end(self) -> int:
+        """Return the number after the last row of the exchanges."""
+        ((last,),) = self._store.rows("SELECT max(rowid) FROM exchanges")
+        return 0 if last is None else int(last) + 1
 
     def stretches(self, rows: int) -> list[tuple[int, int]]:
         """Return spans of time (from, until before, in ns), one after the other, with about so many exchanges each."""

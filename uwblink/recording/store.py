@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.columns import few_words
 from uwblink.errors import RecordingError, RecordingInUseError
 from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
@@ -184,10 +185,11 @@ class Store:
             column = columns[name]
             batch[name] = np.ascontiguousarray(np.ma.getdata(column))
             values.append(f'"{name}"')
-            if len(batch) > 1 and _is_one_word(column):
-                # Words of an array are looked at one by one, by far the longest part of an insertion.
-                bound.append(str(batch.pop(name)[0]))
-                values[-1] = "CAST(? AS VARCHAR)"
+            if (coded := few_words(column)) is not None:
+                # Words of an array are sorted, which would be the longest part of an insertion.
+                bound.append(coded[0].tolist())
+                batch[name] = coded[1] + 1
+                values[-1] = f'CAST(? AS VARCHAR[])["{name}"]'
             if TABLES[table][name] == "BLOB":
                 # Not every version takes bytes from an array; all take digits.
                 batch[name] = np.array([data.hex() for data in batch[name].tolist()], dtype=object)
@@ -296,9 +298,3 @@ class Store:
             missing = sorted(columns.keys() - present - (later if not (present and came_whole) else set()))
             if missing:
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
-
-
-def _is_one_word(column: NDArray[Any]) -> bool:
-    """Return whether a column, which has rows, is of text and the same in each of them."""
-    plain = column.dtype.kind == "U" and not isinstance(column, np.ma.MaskedArray)
-    return plain and bool((column == column[0]).all())

@@ -82,6 +82,20 @@ def single_report_blocks(recording: TableReaders) -> Iterator[tuple[SingleReport
         yield _within(single_reports(both), both, start_ns, end_ns), both
 
 
+def single_exchange_blocks(recording: TableReaders, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
+    """Yield the exchanges of `single_reports` of a recording, in the order of their rows, about so many at once."""
+    if not recording.has_target_reports():
+        yield from recording.exchange_blocks(rows)
+        return
+    second = np.zeros(recording.row_end(), dtype=bool)
+    for start_ns, end_ns in recording.stretches(ROWS_AT_ONCE):
+        around = start_ns - APART_NS, end_ns + APART_NS
+        both = recording.exchanges_between(*around)
+        found = _within(single_reports(both), both, start_ns, end_ns)
+        second[recording.rows_between(*around)[found.seconds]] = True
+    yield from recording.exchange_blocks_without(second, rows)
+
+
 def _within(found: SingleReports, both: Exchanges, start_ns: int, end_ns: int) -> SingleReports:
     """Return the exchanges, and the second reports, of a stretch of time."""
     here = (found.exchanges.time_ns >= start_ns) & (found.exchanges.time_ns < end_ns)

@@ -15,6 +15,7 @@ from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.tracks import Tracks, tracks_of
 from uwblink.twr import Exchanges, raw_range
 
 STEP_S: Final = 0.1
@@ -52,13 +53,14 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
         low, high = max(low, -int(within_s * 1e9)), min(high, int(within_s * 1e9))
     step = max(int(STEP_S * 1e9), (high - low) // MOST_OFFSETS)
     offsets = np.arange(low, high + step, step, dtype=np.int64)
-    spreads = np.array([_spread(some, ranges, poses, tags, int(o)) for o in offsets])
+    tracks = tracks_of(poses, tags)
+    spreads = np.array([_spread(some, ranges, tracks, tags, int(o)) for o in offsets])
     if not np.isfinite(spreads).any():
         raise ImportTableError("no offset puts the poses over the exchanges; are the bodies of the tags in the file?")
     typical = float(np.nanmedian(spreads))
     best = int(offsets[np.nanargmin(spreads)])
-    best = _refined(some, ranges, poses, tags, best, float(np.nanmin(spreads)), step)
-    spread = _spread(some, ranges, poses, tags, best)
+    best = _refined(some, ranges, tracks, tags, best, float(np.nanmin(spreads)), step)
+    spread = _spread(some, ranges, tracks, tags, best)
     if spread > CLEARLY * typical:
         raise ImportTableError(
             f"the ranges do not tell the offset: their spread is {100 * spread:.0f} cm at the best offset and "
@@ -68,38 +70,40 @@ def find_offset(exchanges: Exchanges, poses: Poses, tags: list[Tag], within_s: f
 
 
 def _refined(
-    exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], start: int, scale_m: float, step: int
+    exchanges: Exchanges, ranges: Floats, tracks: Tracks, tags: list[Tag], start: int, scale_m: float, step: int
 ) -> int:
     """Move to the least Cauchy loss, which uses more of the data than their median: grids, then a parabola."""
     best = start
     for _ in range(3 + max(step // int(STEP_S * 1e9) - 1, 0).bit_length()):
         step //= 5
         near = best + step * np.arange(-6, 7, dtype=np.int64)
-        losses = np.array([_loss(exchanges, ranges, poses, tags, int(o), scale_m) for o in near])
+        losses = np.array([_loss(exchanges, ranges, tracks, tags, int(o), scale_m) for o in near])
         best = int(near[np.nanargmin(losses)])
     # The last grid is finer than what noise lets through, so the parabola runs over a wider one.
     near = best + int(PARABOLA_S * 1e9) * np.arange(-5, 6, dtype=np.int64)
-    losses = np.array([_loss(exchanges, ranges, poses, tags, int(o), scale_m) for o in near])
+    losses = np.array([_loss(exchanges, ranges, tracks, tags, int(o), scale_m) for o in near])
     curve, slope, _ = np.polyfit((near - best) * 1e-9, losses, 2)
     move_s = -slope / (2 * curve) if curve > 0 else 0.0
     return best + round(float(np.clip(move_s, -5 * PARABOLA_S, 5 * PARABOLA_S)) * 1e9)
 
 
-def _loss(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], offset_ns: int, scale_m: float) -> float:
-    centred = _centred(exchanges, ranges, poses, tags, offset_ns)
+def _loss(
+    exchanges: Exchanges, ranges: Floats, tracks: Tracks, tags: list[Tag], offset_ns: int, scale_m: float
+) -> float:
+    centred = _centred(exchanges, ranges, tracks, tags, offset_ns)
     return float(np.mean(np.log1p((centred / scale_m) ** 2))) if len(centred) else float("nan")
 
 
-def _spread(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], offset_ns: int) -> float:
+def _spread(exchanges: Exchanges, ranges: Floats, tracks: Tracks, tags: list[Tag], offset_ns: int) -> float:
     """Median absolute difference of range and distance, after each pair's own median; NaN where too few overlap."""
-    centred = _centred(exchanges, ranges, poses, tags, offset_ns)
+    centred = _centred(exchanges, ranges, tracks, tags, offset_ns)
     return float(np.median(np.abs(centred))) if len(centred) else float("nan")
 
 
-def _centred(exchanges: Exchanges, ranges: Floats, poses: Poses, tags: list[Tag], offset_ns: int) -> Floats:
+def _centred(exchanges: Exchanges, ranges: Floats, tracks: Tracks, tags: list[Tag], offset_ns: int) -> Floats:
     """Differences of range and distance, less each pair's median; empty where too few exchanges overlap."""
     e = exchanges
-    error = ranges - distances_m(poses, tags, e.initiator, e.target, e.time_ns - offset_ns)
+    error = ranges - distances_m(tracks, tags, e.initiator, e.target, e.time_ns - offset_ns)
     good = np.isfinite(error)
     if np.count_nonzero(good) < LEAST_OVERLAP * 0.8 * len(error):
         return np.empty(0)

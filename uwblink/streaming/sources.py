@@ -16,7 +16,8 @@ from uwblink.boards.corrections import Correction, load_correction
 from uwblink.boards.listeners import Heard, Listener, Turn, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.recorder import Recorder, identify
+from uwblink.boards.record import identify
+from uwblink.boards.recorder import Recorder
 from uwblink.errors import ArgumentError
 from uwblink.recording.file import Recording
 from uwblink.streaming.ranges import LEVELS, StreamedRange, streamed

@@ -4,7 +4,8 @@ import pytest
 
 import uwblink
 from tests.boards import bench_scenario
-from uwblink.boards.recorder import Recorder, identify
+from uwblink.boards.record import identify
+from uwblink.boards.recorder import Recorder
 from uwblink.recording.file import Recording
 from uwblink.wire.messages import RangeReport
 from uwbsim.boards.virtual_port import VirtualPorts

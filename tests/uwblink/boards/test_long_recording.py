@@ -2,18 +2,22 @@
 
 import gc
 import sys
+from time import process_time
 
+import numpy as np
 import pytest
 
 from benchmarks.hours import RATE_HZ, AnsweringPorts
 from uwblink.boards.listeners import Listener
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.recorder import Recorder, identify
+from uwblink.boards.record import FILE_MB, identify, record
+from uwblink.boards.recorder import Recorder
 from uwblink.boards.writer import Batch
 from uwblink.recording.file import Recording
 
 WARM, LATER, LONG = 1_200, 3_600, 3_700
 EVERY = 100
+MINUTES = 16_000
 
 
 class Committing(Listener):
@@ -86,9 +90,28 @@ def test_nothing_grows_with_the_recording(tmp_path, statements):
     assert len({tuple(asked) for asked in committing.asked}) == 1
 
 
-def test_the_time_of_a_recording_is_that_of_its_boards(tmp_path):
-    from uwblink.boards.recorder import record
+def test_neither_slower_nor_later_as_it_gets_longer(tmp_path):
+    """A minute and a half at a multiple of its speed; `make bench-hours` records eight hours so."""
+    spent: list[float] = []
+    ports = AnsweringPorts()
+    with Recording.create(tmp_path / "long.uwb", live=True, memory_mb=FILE_MB) as recording:
+        committing = Committing(recording)
+        found = identify(ports.names, ports)
+        plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ)
+        recorder = Recorder(found, plan, plan.turns(sorted(found)), [committing], ports=ports)
+        for _ in recorder.steps(stop=lambda: committing.exchanges >= MINUTES):
+            if committing.exchanges >= EVERY * len(spent):
+                spent.append(process_time())
+        recorder.finish()
+    taken = np.diff(spent)
+    third = len(taken) // 3
+    # Medians, for others work on the machine too; what looks at everything so far would take twice as long at the end.
+    assert np.median(taken[-third:]) < 1.5 * np.median(taken[5 : 5 + third])
+    # Fifty times as fast as it was, on a machine of its own; half of that wherever the tests run.
+    assert np.median(taken) < EVERY / RATE_HZ / 25
 
+
+def test_the_time_of_a_recording_is_that_of_its_boards(tmp_path):
     ports = AnsweringPorts()
     plan = RangingPlan(ports.pairs, rate_hz=RATE_HZ)
     done = record(ports.names, tmp_path / "r.uwb", plan, duration_s=3.0, using=ports)

@@ -13,7 +13,7 @@ from tests.boards import bench_scenario, served
 from uwblink.boards.listeners import Listener
 from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.recorder import record
+from uwblink.boards.record import record
 from uwblink.boards.replay import decode_again
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
 from uwblink.recording.file import Recording

@@ -1,0 +1,43 @@
+"""Ports of virtual boards hold no more after many exchanges than after some."""
+
+import gc
+import sys
+
+import uwblink
+import uwbsim
+from uwblink.boards.record import identify
+from uwblink.boards.recorder import Recorder
+from uwbsim.boards import virtual_port
+
+WARM, LATER = 300, 1_100
+
+
+def two_boards():
+    near, far = ({"model": "static", "position_m": [x, 0.0, 1.0]} for x in (0.0, 3.0))
+    bodies = [{"name": "near", "motion": near}, {"name": "far", "motion": far}]
+    tags = [{"id": 10, "body": "near"}, {"id": 20, "body": "far"}]
+    scenario = {"run": {"duration_s": 10.0}, "ranging": {"rate_hz": 50.0}, "bodies": bodies, "tags": tags}
+    return uwbsim.VirtualPorts(uwbsim.load(scenario))
+
+
+def test_nothing_grows_with_what_boards_sent(monkeypatch):
+    monkeypatch.setattr(virtual_port, "MOST_TRANSFERS", 50)
+    held: list[tuple[int, int]] = []
+    ports = two_boards()
+    found = identify(ports.names.values(), ports)
+    plan = uwblink.RangingPlan(rate_hz=100.0)
+    recorder = Recorder(found, plan, plan.turns(sorted(found)), [], ports=ports)
+    for _ in recorder.steps(stop=lambda: len(held) == 2):
+        if recorder.progress.exchanges == (WARM, LATER)[len(held)]:
+            gc.collect()
+            held.append((len(gc.get_objects()), sys.getallocatedblocks()))
+    recorder.finish()
+    recorder.close()
+    assert len(ports.transfers) == 50
+    time_ns, _, data = ports.transfers[-1]
+    assert data
+    assert time_ns <= ports.now_ns()
+    (objects, blocks), (objects_later, blocks_later) = held
+    # Each exchange that stayed would be some of either, and there were 800 in between.
+    assert objects_later - objects < 100
+    assert blocks_later - blocks < 800
