@@ -22,8 +22,6 @@ MANY: Final = 1_000_000
 """Rows from which a column lies in a file."""
 
 ROWS_AT_ONCE: Final = 1 << 20
-WIDE: Final = 1 << 31
-"""Rows whose numbers take eight bytes."""
 
 
 def empty(rows: int, dtype: DTypeLike = np.float64, *, each: tuple[int, ...] = ()) -> NDArray[Any]:
@@ -86,13 +84,35 @@ def let_go(*columns: NDArray[Any] | None) -> None:
 def picked(column: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
     """Return some rows of a column (n,), as `column[rows]` does; one value for all of them stays one."""
     if column.strides == (0,) and len(column):
-        return np.broadcast_to(np.asarray(column[0]), np.arange(len(column))[rows].shape)
+        return np.broadcast_to(np.asarray(column[0]), _count(rows, len(column)))
     if len(column) < MANY or column.ndim > 1 or isinstance(rows, slice):
         return np.asarray(column[rows])
-    where = np.flatnonzero(rows).astype(np.int32 if len(column) < WIDE else np.int64) if rows.dtype == bool else rows
-    found = empty(len(where), column.dtype)
-    for some in spans(len(where)):
-        found[some] = column[where[some]]
+    return _kept(column, rows) if rows.dtype == bool else _gathered(column, rows)
+
+
+def _count(rows: NDArray[Any] | slice, length: int) -> int:
+    """Return how many rows are chosen of a column of a length."""
+    if isinstance(rows, slice):
+        return len(range(*rows.indices(length)))
+    return int(np.count_nonzero(rows)) if rows.dtype == bool else len(rows)
+
+
+def _kept(column: NDArray[Any], keep: NDArray[Any]) -> NDArray[Any]:
+    """Return the rows of a column (n,) to keep (n,), in their order."""
+    found, begin = empty(int(np.count_nonzero(keep)), column.dtype), 0
+    for some in spans(len(column)):
+        part = column[some][keep[some]]
+        found[begin : begin + len(part)] = part
+        begin += len(part)
+        let_go(found, column)
+    return found
+
+
+def _gathered(column: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
+    """Return rows of a column (n,), anywhere in it, in the order of `rows`."""
+    found = empty(len(rows), column.dtype)
+    for some in spans(len(rows)):
+        found[some] = column[rows[some]]
         let_go(found)
     let_go(column)
     return found

@@ -64,7 +64,7 @@ def build_problem(
         raise UnanswerableError(
             f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST} are needed"
         )
-    if np.any(np.diff(ranges.time_ns) < 0):
+    if np.any(ranges.time_ns[1:] < ranges.time_ns[:-1]):
         ranges = ranges[np.argsort(ranges.time_ns, kind="stable")]
     fpp1, fpp2 = ranges.fpp1_dbm, ranges.fpp2_dbm
     lifted = computed(len(ranges), lambda rows: lifted_power(fpp1[rows], fpp2[rows], lift, alpha_dbm))
@@ -73,7 +73,9 @@ def build_problem(
     if not powered.all():
         # What has no power stands at the middle of the others, where it bends nothing.
         lifted[~powered] = np.median(lifted[powered]) if powered.any() else 1.0
-    ordered = np.sort(lifted)
+    ordered = empty(len(lifted))
+    ordered[:] = lifted
+    ordered.sort()
     low, high = populated(ordered)
     unknowns = (unknowns or Unknowns()).at_powers(varied=high - low > SAME_POWER)
     # Beyond the populated powers a curve is held constant: what it is there is not for these ranges to say.
@@ -87,6 +89,7 @@ def build_problem(
     _known_tags(everyone, fixed)
     knots, averages = _splines(ordered, (low, high), unknowns)
     bins = _bins(lifted, ordered)
+    del ordered
     kinds, kind = np.unique(_shares_of(pairs.ends, groups), axis=0, return_inverse=True)
     raw = _raw(ranges, everyone, pairs, lifted, bins, knots, kind.ravel(), unknowns)
     carriers = raw.shape[1] - len(kinds) * len(averages)
@@ -238,8 +241,8 @@ def _raw(
         cell = bins.number[rows] * CELLS // len(bins.count)
         return np.asarray((pairs.number[rows] * CELLS + cell) * several + first[rows])
 
-    key = computed(len(lifted), place, np.int64)
-    order = stable_order(key).astype(np.int32)
+    key = computed(len(lifted), place, np.int32)
+    order = stable_order(key)
     sizes = np.bincount(key)
     del key
     which = np.flatnonzero(sizes)

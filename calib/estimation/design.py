@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.long_columns import empty, let_go, picked
+from calib.long_columns import empty, let_go, picked, spans
 from uwblink.arrays import Bools, Floats, Ints
 
 Order = NDArray[np.signedinteger[Any]]
@@ -29,6 +29,9 @@ MANY: Final = 64
 """Rows a block from which blocks are worth a product of matrices each."""
 
 DIGIT: Final = 1 << 16
+WIDE: Final = 1 << 31
+"""Rows whose numbers take more than four bytes."""
+
 PIECES_AT_ONCE: Final = 128
 """Pieces after which entries that lie in files are let go of."""
 
@@ -223,8 +226,11 @@ class Design:
     def part(self, parameters: slice) -> Design:
         """Return some columns of the matrix, without the entries that stand in none of them."""
         turn = self.turn[:, parameters]
-        used = np.any(np.any(turn != 0, axis=1)[self.columns], axis=0)
-        return Design(self.values[used], self.order, self.starts, self.columns[:, used], turn)
+        used = np.flatnonzero(np.any(np.any(turn != 0, axis=1)[self.columns], axis=0))
+        # Those that stand together need no copy.
+        together = len(used) and used[-1] - used[0] + 1 == len(used)
+        chosen = slice(int(used[0]), int(used[-1]) + 1) if together else used
+        return Design(self.values[chosen], self.order, self.starts, self.columns[:, chosen], turn)
 
     def chosen(self, rows: Ints | Bools | slice) -> Ints:
         """Return which of the kept rows some given ones are."""
@@ -309,11 +315,29 @@ def _within(parts: Ints) -> Ints:
     return np.asarray(np.arange(int(parts.sum())) - np.repeat(np.cumsum(parts) - parts, parts))
 
 
-def stable_order(key: Ints) -> Ints:
+def stable_order(key: Ints) -> Order:
     """Return what sorts keys from 0 (n,), equal ones in their order: by digits, much faster than by comparison."""
+    if len(key) and int(key.max()) < DIGIT and len(key) < WIDE:
+        return _few_sorted(key)
     order = np.argsort((key % DIGIT).astype(np.uint16), kind="stable")
     high = key // DIGIT
     while high.any():
         order = order[np.argsort((high[order] % DIGIT).astype(np.uint16), kind="stable")]
         high = high // DIGIT
     return order
+
+
+def _few_sorted(key: Ints) -> Order:
+    """Return what sorts keys (n,) of one digit, some rows at a time, each to its place behind the equal ones before."""
+    found, size = empty(len(key), np.int32), int(key.max()) + 1
+    counts = np.zeros(size, dtype=np.int64)
+    for rows in spans(len(key)):
+        counts += np.bincount(key[rows], minlength=size)
+    free = np.cumsum(counts) - counts
+    for rows in spans(len(key)):
+        own = np.argsort(key[rows].astype(np.uint16), kind="stable")
+        sizes = np.bincount(key[rows], minlength=size)
+        found[np.repeat(free - np.cumsum(sizes) + sizes, sizes) + np.arange(len(own))] = own + rows.start
+        free += sizes
+        let_go(found, key)
+    return found
