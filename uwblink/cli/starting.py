@@ -27,8 +27,6 @@ def start(command: Callable[[], NoReturn]) -> NoReturn:
         command()
     finally:
         signal.signal(signal.SIGINT, before)
-        # What is left goes with the process: searching it for cycles once more takes a tenth of a short command.
-        gc.freeze()
 
 
 def _leave(_number: int, _frame: Any) -> NoReturn:
