@@ -15,6 +15,13 @@ def test_the_scaled_complementary_error_function_is_exact():
     assert erfcx(np.zeros(0)).shape == (0,)
 
 
+def test_it_is_the_same_to_the_last_bit_of_few_values_and_of_many():
+    many = erfcx(WIDE)
+    for k in range(0, len(WIDE) - 3, 50):
+        assert erfcx(WIDE[k : k + 3]).tolist() == many[k : k + 3].tolist()
+    assert erfcx(WIDE[:6].reshape(2, 3)).tolist() == many[:6].reshape(2, 3).tolist()
+
+
 def test_normal_shares_are_exact_in_both_tails():
     x = np.linspace(-37, 37, 2001)
     np.testing.assert_allclose(normal_below(x), special.ndtr(x), rtol=1e-12)
