@@ -52,12 +52,13 @@ MANY_A_ROUND: Final = 80_000
 
 LINES_EVERY_S: Final = 1_800.0
 
+FILE: Final = "long.uwb"
 COMMANDS: Final = (
-    ("uwblink", "show", "long.uwb"),
-    ("calib", "doctor", "long.uwb"),
-    ("calib", "fit", "long.uwb", "-o", "long.json", "--force"),
-    ("calib", "apply", "long.uwb", "-c", "long.json", "-o", "corrected.uwb", "--force"),
-    *(("uwblink", "export", "long.uwb", "--to", to, "-o", to, "--force") for to in ("parquet", "csv", "tum", "mcap")),
+    ("uwblink", "show", FILE),
+    ("calib", "doctor", FILE),
+    ("calib", "fit", FILE, "-o", "long.json", "--force"),
+    ("calib", "apply", FILE, "-c", "long.json", "-o", "corrected.uwb", "--force"),
+    *(("uwblink", "export", FILE, "--to", to, "-o", to, "--force") for to in ("parquet", "csv", "tum", "mcap")),
 )
 
 
@@ -263,10 +264,10 @@ def commands(path: Path) -> None:
 def measured(path: Path) -> Iterator[tuple[str, float, float]]:
     """Yield each command, its processor time, and the most memory that it had."""
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "long.uwb").symlink_to(path.absolute())
         for words in COMMANDS:
+            named = [str(path.absolute()) if word == FILE else word for word in words]
             process = subprocess.Popen(
-                [sys.executable, "-m", *words], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+                [sys.executable, "-m", *named], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
             )
             _, status, used = os.wait4(process.pid, 0)
             if os.waitstatus_to_exitcode(status):

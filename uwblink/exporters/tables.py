@@ -39,14 +39,16 @@ def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapp
     paths = {table: folder / f"{table}.{suffix}" for table in TABLES}
     with duckdb.connect(":memory:") as db:
         try:
-            allowed = [str(recording), f"{recording}.wal", *map(str, paths.values())]
+            # What a link leads to has its log beside it, not beside the link.
+            place = recording.resolve()
+            allowed = [str(place), f"{place}.wal", *map(str, paths.values())]
             db.execute("SET allowed_paths = ?", [allowed])
             db.execute("SET enable_progress_bar = false")
             db.execute("SET preserve_insertion_order = true")
             db.execute(f"SET memory_limit = '{MEMORY}'")
             db.execute("SET enable_external_access = false")
             db.execute("SET lock_configuration = true")
-            db.execute(f"ATTACH {_literal(recording)} AS source (READ_ONLY)")
+            db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
             for table, path in paths.items():
                 if counts[table] or table == "exchanges":
                     db.execute(f"COPY ({_query(db, table, cells)}) TO {_literal(path)} ({_options(options, table)})")

@@ -10,8 +10,10 @@ from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is
 from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 from uwblink.importers import import_recording
+from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, Fault, Poses
+from uwblink.twr import Exchanges
 
 
 @pytest.fixture
@@ -119,3 +121,13 @@ def test_a_form_of_ones_own(whole, tmp_path):
         EXPORTERS.remove("names")
     with pytest.raises(ArgumentError, match="the project's own"):
         register_exporter(Exporter("csv", write, "mine"))
+
+
+@pytest.mark.parametrize("to", ["csv", "parquet"])
+def test_a_link_to_a_recording_is_exported_like_the_recording(tmp_path, to):
+    (tmp_path / "there").mkdir()
+    exchanges = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    Contents(exchanges=exchanges).save(tmp_path / "there" / "r.uwb")
+    (tmp_path / "link.uwb").symlink_to(tmp_path / "there" / "r.uwb")
+    written = export_recording(tmp_path / "link.uwb", tmp_path / "out", to=to)
+    assert written[f"exchanges.{to}"] == 1

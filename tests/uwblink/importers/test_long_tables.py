@@ -10,7 +10,7 @@ import pytest
 import uwblink
 from tests.uwblink.importers.test_table_forms import flights, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import antenna_places, import_file, staged_tables, table_rows
+from uwblink.importers import antenna_places, import_file, row_faults, staged_tables, table_rows
 from uwblink.importers.exchange_tables import read_table
 
 SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
@@ -36,7 +36,7 @@ def told(contents):
 def few_at_once(monkeypatch):
     for room in (table_rows, staged_tables):
         monkeypatch.setattr(room, "ROWS_AT_ONCE", 20)
-    monkeypatch.setattr(staged_tables, "FAULTS_AT_ONCE", 5)
+    monkeypatch.setattr(row_faults, "FAULTS_AT_ONCE", 5)
     monkeypatch.setattr(antenna_places, "POSES_AT_ONCE", 4)
 
 
