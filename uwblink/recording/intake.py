@@ -8,11 +8,12 @@ names that nothing in a file can take (`system.main.`), and refuses the file if 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Timer
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, NoReturn
 
 from uwblink.display import printable
 from uwblink.errors import RecordingError
@@ -120,14 +121,22 @@ def interrupted_after(seconds: float, interrupt: Callable[[], None]) -> Iterator
 
 
 def decode_json(text: object, path: Path, key: str) -> Any:
-    """Return a value of `meta`; raises `RecordingError` for text that is no JSON, NaN, or nested beyond all reason."""
+    """Return a value of `meta`.
+
+    Raises `RecordingError` for what is no JSON, not finite (NaN, 1e400), or nested beyond all reason.
+    """
     if not isinstance(text, str):
         raise RecordingError(f"{path}: table meta: {printable(key)} has no value")
     try:
-        return json.loads(text, parse_constant=_refuse)
+        return json.loads(text, parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: table meta holds a value that is not JSON, that of {printable(key)}") from error
 
 
-def _refuse(word: str) -> None:
+def _refuse(word: str) -> NoReturn:
     raise ValueError(word)
+
+
+def _finite(word: str) -> float:
+    number = float(word)
+    return number if math.isfinite(number) else _refuse(word)
