@@ -2,6 +2,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
+PYTHONS ?= python3.12 python3.13
+LOCKED := --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
+ITSELF := --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
 .PHONY: $(shell sed -n 's/^\([a-z -]*\):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST)))
 
@@ -14,8 +17,8 @@ $(STAMP): pyproject.toml requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "uwbcal needs Python 3.11 or newer, and $(PYTHON) is $$($(PYTHON) --version 2>&1); try make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-dev.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	$(BIN)/python -m pip install $(LOCKED)
+	$(BIN)/python -m pip install $(ITSELF)
 	@touch $@
 
 demo: setup ## simulate three flights, fit, evaluate, localize; writes demo/report.html
@@ -47,6 +50,14 @@ lowest newest: ## run the whole test suite on the lowest versions that pyproject
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --upgrade -r .venv-$@/requirements.txt
 	.venv-$@/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation .
 	.venv-$@/bin/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+
+pythons: ## run the whole test suite on other Pythons, with the locked versions; PYTHONS names them (10 minutes each)
+	for python in $(PYTHONS); do \
+		own=.venv-$$(basename $$python); \
+		$$python -m venv $$own && $$own/bin/python -m pip install $(LOCKED) && \
+		$$own/bin/python -m pip install $(ITSELF) && \
+		$$own/bin/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder || exit; \
+	done
 
 fuzz: setup ## run commands on 2000 damaged files and options (10 minutes)
 	$(BIN)/python -m tests.fuzz.commands
@@ -144,4 +155,4 @@ installed: setup ## build wheel and sdist, install the wheel into an empty envir
 	$(BIN)/python -m tests.installed
 
 clean: ## remove .venv, caches and the demo
-	rm -rf .venv .venv-lowest .venv-newest demo .mypy_cache .ruff_cache .pytest_cache .hypothesis docs/_build docs/generated
+	rm -rf .venv .venv-* demo .mypy_cache .ruff_cache .pytest_cache .hypothesis docs/_build docs/generated

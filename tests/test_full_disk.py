@@ -116,13 +116,20 @@ ELSEWHERE = {
 """Outputs that other tests write onto a full disk: the sweep keeps what it has done, the recorder what it recorded."""
 
 
+def is_path(parameter):
+    """Whether an option takes a path, as this typer says it, or an older one."""
+    if hasattr(parameter, "type_descriptor"):
+        return parameter.type_descriptor.annotation is Path
+    return parameter.type.name == "path"
+
+
 def outputs():
     """Return every output that commands have, as `calib fit --output`."""
     found = set()
     for package in ("uwblink", "uwbsim", "calib"):
         app = importlib.import_module(f"{package}.cli.commands").app
         for words, command in leaves(typer.main.get_command(app), (package,)):
-            written = [p for p in command.params if p.name in WRITTEN and p.type_descriptor.annotation is Path]
+            written = [p for p in command.params if p.name in WRITTEN and is_path(p)]
             found |= {f"{' '.join(words)} {parameter.opts[-1]}" for parameter in written}
     return found
 
