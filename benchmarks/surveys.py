@@ -28,7 +28,6 @@ from calib.planning.promise import promises
 from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "without-motion-capture.md"
-PLACE = re.compile(r"(<!-- surveys:begin[^>]*-->\n).*?(<!-- surveys:end -->)", re.DOTALL)
 C_M_PER_NS = 0.299702547
 PAIR_M = 0.02
 LINE: dict[str, Any] = {"shape": "line", "boards": 5, "arrangements": 8}
@@ -205,6 +204,11 @@ def _stored(name: str, results: Path) -> Iterator[tuple[int, Outcome]]:
             yield line["seed"], Outcome(tags, errors, std, line["refused"], line.get("exchanged", ""))
 
 
+def _with_table(page: str, place: str, lines: list[str]) -> str:
+    marks = re.compile(rf"(<!-- {place}:begin[^>]*-->\n).*?(<!-- {place}:end -->)", re.DOTALL)
+    return marks.sub(lambda found: found[1] + "\n".join(lines) + "\n" + found[2], page)
+
+
 def main(argv: list[str]) -> int:
     """Print the table, and write it into the page."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -214,16 +218,16 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--results", type=Path, help="file of outcomes, a line each: what it has is not surveyed again")
     parser.add_argument("--write", action="store_true", help="write the table into the page")
     given = parser.parse_args(argv)
-    lines = []
+    page = PAGE.read_text(encoding="utf-8")
     with ProcessPoolExecutor(given.workers) as pool:
-        for worlds, head, line in ((WORLDS, HEAD, row), (LABELS, f"\n{LABELS_HEAD}", labels_row)):
-            lines.append(head)
+        for place, worlds, head, line in (("surveys", WORLDS, HEAD, row), ("labels", LABELS, LABELS_HEAD, labels_row)):
+            lines = [head]
             for name in filter(lambda name: given.only in name, worlds):
                 lines.append(line(name, outcomes_of(name, given.seeds, given.results, pool)))
                 print(lines[-1], flush=True)
+            page = _with_table(page, place, lines)
     if given.write:
-        page, text = PAGE.read_text(encoding="utf-8"), "\n".join(lines) + "\n"
-        PAGE.write_text(PLACE.sub(lambda found: found[1] + text + found[2], page), encoding="utf-8")
+        PAGE.write_text(page, encoding="utf-8")
     return 0
 
 

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from calib.surveys.network import DETOUR_M, Network
-from calib.surveys.reflections import choices, searched, unlikely
+from calib.surveys.reflections import choices, of_marked, searched, unlikely
 from uwblink.arrays import Bools, Floats
 
 PAIR_STD_M: Final = 0.02
@@ -170,6 +170,7 @@ def unlikely_at(network: Network, x: Floats, std_m: Floats, curve_std_m: float, 
     prior = network.prior(curve_std_m)
     known = float(np.linalg.slogdet(rows.T @ rows + prior)[1]) - float(np.linalg.slogdet(prior)[1])
     marks = unlikely(int(network.reflected.sum()), len(network.means))
+    marks += of_marked(network, x, std_m, curve_std_m)
     orders = ORDER_IS_RIGHT * len(network.out_of_order(x))
     return weighed + known + 2 * float(np.log(std_m).sum()) + marks + orders
 

@@ -95,7 +95,7 @@ def robust_mean(values: Floats) -> tuple[float, float]:
     for _ in range(20):
         size = np.abs(values - mean) / spread
         weight = np.minimum(1.0, HUBER / np.maximum(size, HUBER))
-        step = float(np.average(values, weights=weight)) - mean
+        step = float((values * weight).sum() / weight.sum()) - mean
         mean += step
         if abs(step) < 1e-6 * spread:
             break

@@ -26,8 +26,8 @@ from uwbsim.boards.stays import stays_s
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "without-motion-capture.md").read_text(encoding="utf-8")
 SCENARIO = ROOT / "scenarios" / "string" / "string.toml"
-SHORTER = ("--duration 30", "--duration 12")
-"""What a test changes of the page: eight ranges a pair instead of twenty, in a third of the time."""
+SHORTER = ("--duration 30", "--duration 10")
+"""What a test changes of the page: seven ranges a pair instead of twenty, in a third of the time."""
 
 PLANTED = {tag["id"]: tag["delay_ns"] for tag in tomllib.loads(SCENARIO.read_text())["tags"]}
 

@@ -10,7 +10,7 @@ from benchmarks import surveys
 from benchmarks.standing import places_of, standing_boards
 from calib.planning.candidates import Layout, delay_information, on_line
 from calib.planning.having import having
-from calib.planning.promise import CURVE_M, DRAWS, POWER_AT_1_M_DBM, promises
+from calib.planning.promise import CURVE_M, POWER_AT_1_M_DBM, promises
 
 
 def given(boards, on="line", **settings):
@@ -42,7 +42,7 @@ def test_reflected_pairs_cost_what_their_loss_costs():
     rng = np.random.default_rng(5)
     places = [places_of(rng, 6, 2, 4.0, 0.4) for _ in range(6)]
     of_draws = []
-    for _ in range(DRAWS):
+    for _ in range(30):
         total = np.zeros((6, 6))
         for place in places:
             rows, steps = [], []
@@ -74,7 +74,7 @@ def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
 
 
 def test_a_plan_says_what_reflections_and_a_curve_cost():
-    plain, reflected = (calib.plan(4, on="line", arrangements=6, reflected=share) for share in (0.0, 0.1))
+    plain, reflected = (calib.plan(4, on="line", arrangements=4, reflected=share) for share in (0.0, 0.1))
     assert "and 10 % of the pairs are reflected:" in str(reflected)
     assert max(reflected.half_ns.values()) > max(plain.half_ns.values())
     curved = plain.with_curve_ns
