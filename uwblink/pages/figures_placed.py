@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import LayoutEngine
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from uwblink.arrays import Floats
 
@@ -24,20 +24,21 @@ MEASURES: Final[Any] = RendererAgg
 """What tells how much room text takes; it need not have a pixel to draw on for that."""
 
 
-class Placed(LayoutEngine):
+class Placed(ConstrainedLayoutEngine):
     """Places the panels of one grid, as matplotlib's constrained layout does, which measures everything twice.
 
-    Here it is measured once where ticks stay what they are when panels have the size that labels leave them.
+    Here it is measured once where ticks stay what they are when panels have the size that labels leave them. Figures
+    with more than one grid, or bars of colours, are left to matplotlib.
     """
 
     _adjust_compatible = True
-    _colorbar_gridspec = True
 
     def execute(self, fig: Figure) -> None:
         """Place the panels of a figure."""
-        panels = [axes for axes in fig.axes if axes.get_gridspec() is not None]
+        panels = fig.axes
         grid = panels[0].get_gridspec() if panels else None
-        if grid is None:
+        if grid is None or any(axes.get_gridspec() is not grid for axes in panels):
+            super().execute(fig)
             return
         renderer = MEASURES(1, 1, fig.dpi)
         legends = sum(2 * PAD_IN + legend.get_window_extent(renderer).height / fig.dpi for legend in fig.legends)

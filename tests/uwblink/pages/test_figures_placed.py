@@ -56,6 +56,21 @@ def test_panels_are_where_matplotlib_places_them():
         np.testing.assert_allclose(ours.get_position().bounds, theirs.get_position().bounds, atol=0.004)
 
 
+def test_bars_of_colours_have_their_room():
+    with style():
+        figure, (left, right) = sheet(7.16, 2)
+        for axes in (left, right):
+            label(axes, "x", "y")
+        figure.colorbar(left.imshow([[0.0, 1000.0]], aspect="auto"), ax=left, label="seconds")
+        figure.draw_without_rendering()
+        found, page = boxes(figure)
+        bar = found[2]
+    assert found[0].x1 <= bar.x0
+    assert bar.x1 <= found[1].x0
+    assert page.x0 <= found[0].x0
+    assert found[1].x1 <= page.x1
+
+
 def alike(count=5):
     figure, panels = many_alike(7.16, [f"panel {k}" for k in range(count)], 3, height_in=1.0)
     share_axes(figure, panels, 3, (0.0, 240.0), (-20.0, 80.0))
