@@ -121,6 +121,9 @@ campaigns: setup ## what a training flight needs, into docs/tutorials/motion-cap
 worlds: setup ## fits in worlds that share nothing with the simulator, into docs/accuracy.md (20 minutes)
 	$(BIN)/python -m benchmarks.worlds_report
 
+places: setup ## fits where errors belong to places, into docs/accuracy.md (20 minutes)
+	$(BIN)/python -m benchmarks.rooms --write
+
 surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/without-motion-capture.md (10 minutes)
 	$(BIN)/python -m benchmarks.surveys --write
 

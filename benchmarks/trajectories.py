@@ -38,7 +38,8 @@ def _sines(seed: int, **more: Any) -> Any:
     return flight(seed=seed, **(ERRING | more))
 
 
-def _scenario(name: str, seed: int, seconds: float) -> Any:
+def scenario(name: str, seed: int, seconds: float) -> Any:
+    """Simulate a scenario with another seed for so long, each body with an inertial sensor."""
     table = tomllib.loads((ROOT / "scenarios" / name).read_text(encoding="utf-8"))
     table["run"] |= {"seed": seed, "duration_s": seconds}
     for body in table["bodies"]:
@@ -65,18 +66,18 @@ WORLDS: Final = {
     ),
     "sines, nothing known": World(lambda seed: _sines(seed), {"poses_until_s": 0.0}),
     "icra2023 test 1, 60 s, known for 10 s": World(
-        lambda seed: _scenario("icra2023/test1.toml", seed, 60.0), {"poses_until_s": 10.0}, False
+        lambda seed: scenario("icra2023/test1.toml", seed, 60.0), {"poses_until_s": 10.0}, False
     ),
     "icra2023 test 2, 60 s, known for 10 s, attitudes by IMU": World(
-        lambda seed: _scenario("icra2023/test2.toml", seed, 60.0),
+        lambda seed: scenario("icra2023/test2.toml", seed, 60.0),
         {"poses_until_s": 10.0, "attitudes": "imu"},
         False,
     ),
     "lasting reflections, 40 s, known for 10 s": World(
-        lambda seed: _scenario("lasting_reflections/hall.toml", seed, 40.0), {"poses_until_s": 10.0}, False
+        lambda seed: scenario("lasting_reflections/hall.toml", seed, 40.0), {"poses_until_s": 10.0}, False
     ),
     "room, 40 s, known for 10 s": World(
-        lambda seed: _scenario("room/room.toml", seed, 40.0), {"poses_until_s": 10.0}, False
+        lambda seed: scenario("room/room.toml", seed, 40.0), {"poses_until_s": 10.0}, False
     ),
 }
 
@@ -117,7 +118,7 @@ def one(name: str, seed: int) -> Outcome:
         mocap = calib.fit(flown).calibration
         differ = 1e3 * np.array([found.delays_ns[tag] - mocap.delays_ns[tag] for tag in tags])
         to_mocap = float(np.std(differ))
-        localized = _localized(flown, found) / _localized(flown, mocap)
+        localized = localized_m(flown, found) / localized_m(flown, mocap)
     return Outcome(
         claimed=int(known.sum()),
         apart_ps=float(np.sqrt(np.mean(apart**2))) if len(apart) else np.nan,
@@ -130,7 +131,7 @@ def one(name: str, seed: int) -> Outcome:
     )
 
 
-def _localized(flown: Any, calibration: calib.Calibration) -> float:
+def localized_m(flown: Any, calibration: calib.Calibration) -> float:
     """Return the position error of the robust filter with a calibration, metres.
 
     The plain one is thrown off by single reflected ranges, by luck more often with one calibration than the other.

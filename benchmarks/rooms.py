@@ -1,0 +1,165 @@
+"""How far delays are to be trusted where errors belong to places: the table of rooms in docs/accuracy.md.
+
+Scenarios whose errors all come from one room's geometry, others that have nothing of it, and fields of errors of
+`tests.calib.estimation.fields`, which share nothing with the simulator. Seeds are those from `FIRST_REPORTED` on, which
+have chosen nothing. Errors of delays are those about their mean: a scenario's planted curve is not zero where ours is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import calib
+from benchmarks.trajectories import localized_m, scenario
+from tests.calib.estimation.fields import ranges_with_field
+
+PAGE: Final = Path(__file__).parents[1] / "docs" / "accuracy.md"
+FIRST_REPORTED: Final = 10_000
+NAMED: Final = "errors belong to places"
+Floats = NDArray[np.float64]
+
+SCENARIOS: Final = {
+    "room (four bodies, seven tags)": ("room/room.toml", 40.0),
+    "office (four bodies, five tags)": ("office/office.toml", 40.0),
+    "hall with metal (three bodies, six tags)": ("hall_with_metal/hall.toml", 40.0),
+    "lasting reflections, each pair's own": ("lasting_reflections/hall.toml", 40.0),
+    "icra2023 test 1": ("icra2023/test1.toml", 40.0),
+}
+FIELDS: Final[dict[str, dict[str, Any]]] = {
+    "nothing of the kind, three bodies": {"bodies": 3},
+    "nothing of the kind, four bodies": {"bodies": 4},
+    "nothing of the kind, five bodies": {"bodies": 5},
+    "a field of 2 cm over 2 m, three bodies": {"bodies": 3, "field_m": 0.02},
+    "a field of 2 cm over 2 m, four bodies": {"bodies": 4, "field_m": 0.02},
+    "a field of 2 cm over 4 m, four bodies": {"bodies": 4, "field_m": 0.02, "wave_m": 4.0},
+    "walls of 3 cm, field of 1 cm, three bodies": {"bodies": 3, "field_m": 0.01, "between_m": 0.03},
+    "walls of 3 cm, field of 1 cm, four bodies": {"bodies": 4, "field_m": 0.01, "between_m": 0.03},
+    "walls of 3 cm, field of 1 cm, five bodies": {"bodies": 5, "field_m": 0.01, "between_m": 0.03},
+    "walls of 3 cm alone, five bodies": {"bodies": 5, "between_m": 0.03},
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """Errors of delays about their mean and their standard errors (tags,) in ps, whether places were named, and how
+    much worse a body is localized than with motion capture's calibration."""
+
+    errors_ps: Floats
+    std_ps: Floats
+    named: bool
+    localized: float = float("nan")
+
+
+def outcome_of(result: calib.FitResult, planted_ns: dict[int, float], ratio: float = float("nan")) -> Outcome:
+    """Hold a fit against what was planted."""
+    found: Any = result.calibration
+    tags = list(found.uncertainty.tags)
+    centre = np.eye(len(tags)) - 1 / len(tags)
+    errors = centre @ np.array([found.delays_ns[tag] - planted_ns[tag] for tag in tags])
+    std = np.sqrt(np.diag(centre @ np.array(found.uncertainty.delays_ns2) @ centre))
+    return Outcome(
+        errors_ps=1e3 * errors,
+        std_ps=1e3 * std,
+        named=any(NAMED in warning for warning in result.warnings),
+        localized=ratio,
+    )
+
+
+def with_capture(name: str, seed: int) -> Outcome:
+    """Fit a scenario with motion capture."""
+    flown = scenario(SCENARIOS[name][0], seed, SCENARIOS[name][1])
+    return outcome_of(calib.fit(flown), _planted(flown))
+
+
+def from_ranges(name: str, seed: int) -> Outcome:
+    """Fit a scenario of which bodies are known for the first ten seconds."""
+    flown = scenario(SCENARIOS[name][0], seed, SCENARIOS[name][1])
+    found = calib.fit_from_ranges(flown, minimum_norm=True, poses_until_s=10.0)
+    ratio = localized_m(flown, found.calibration) / localized_m(flown, calib.fit(flown).calibration)
+    return outcome_of(found, _planted(flown), ratio)
+
+
+def in_fields(name: str, seed: int) -> Outcome:
+    """Fit ranges with a field of errors."""
+    ranges, planted = ranges_with_field(seed, **FIELDS[name])
+    return outcome_of(calib.fit(ranges), dict(enumerate(planted.tolist(), 1)))
+
+
+def _planted(flown: Any) -> dict[int, float]:
+    return {int(tag): delay for tag, delay in flown.planted["delays_ns"].items()}
+
+
+KINDS: Final[dict[str, tuple[Callable[[str, int], Outcome], list[str], str]]] = {
+    "fields": (in_fields, list(FIELDS), ""),
+    "capture": (with_capture, list(SCENARIOS), ", 40 s"),
+    "ranges": (from_ranges, list(SCENARIOS)[:4], ", 40 s, from ranges, known for 10 s"),
+}
+
+HEAD: Final = (
+    "| world | seeds | delays, rms (promised), ps, median | inside 95 % | z-scores, rms | named | localization |\n"
+    "|---|---|---|---|---|---|---|"
+)
+
+
+def row(name: str, outcomes: list[Outcome]) -> str:
+    """Return a world's line of the table."""
+    errors, std = (np.concatenate([getattr(one, what) for one in outcomes]) for what in ("errors_ps", "std_ps"))
+    # One flight whose robots hardly see each other would be all of a mean.
+    each, promised = (
+        np.median([np.sqrt(np.mean(getattr(one, what) ** 2)) for one in outcomes]) for what in ("errors_ps", "std_ps")
+    )
+    ratios = [one.localized for one in outcomes if np.isfinite(one.localized)]
+    cells = [
+        name,
+        str(len(outcomes)),
+        f"{each:.0f} ({promised:.0f})",
+        f"{100 * np.mean(np.abs(errors) < 1.96 * std):.0f} %",
+        f"{np.sqrt(np.mean((errors / std) ** 2)):.2f}",
+        f"{sum(one.named for one in outcomes)}",
+        f"{np.median(ratios):.2f}" if ratios else "",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def rows(kind: str, seeds: int, pool: Executor) -> list[str]:
+    """Return the lines of a kind of worlds, as they come."""
+    fly, names, more = KINDS[kind]
+    found = []
+    for name in names:
+        every = range(FIRST_REPORTED, FIRST_REPORTED + seeds)
+        found.append(row(name + more, list(pool.map(fly, [name] * seeds, every))))
+        sys.stdout.write(found[-1] + "\n")
+        sys.stdout.flush()
+    return found
+
+
+def main(argv: list[str]) -> int:
+    """Print the table, and write it into the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--only", choices=list(KINDS), nargs="*", default=list(KINDS))
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args(argv)
+    with ProcessPoolExecutor(given.workers) as pool:
+        lines = [HEAD, *(line for kind in given.only for line in rows(kind, given.seeds, pool))]
+    if given.write:
+        table = "\n".join(["<!-- rooms -->", *lines, "<!-- end of rooms -->"])
+        page = PAGE.read_text(encoding="utf-8")
+        page = re.sub(r"<!-- rooms -->.*<!-- end of rooms -->", lambda _: table, page, flags=re.DOTALL)
+        PAGE.write_text(page, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
