@@ -129,3 +129,14 @@ def joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
         begin += len(column)
         let_go(found, column)
     return found
+
+
+def std_of(column: NDArray[Any]) -> float:
+    """Return the standard deviation of a column (n,), without copies of it."""
+    if len(column) < MANY:
+        return float(np.std(column))
+    mean, square = float(np.mean(column)), 0.0
+    for rows in spans(len(column)):
+        square += float(np.sum((column[rows] - mean) ** 2))
+        let_go(column)
+    return float(np.sqrt(square / len(column)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
@@ -12,30 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.carriers import ClocksApart, clocks_apart, farthest
 from calib.errors import BadInputError, UnanswerableError
-from calib.long_columns import joined, picked
+from calib.long_columns import joined, let_go, picked, spans
+from calib.range_columns import columns_of, measured_powers
 from calib.single_sided import LeftSkew, left_skew, worst
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
-from uwblink.recording.tracks import Tracks
-from uwblink.ticks import TICK_S
-from uwblink.twr import Exchanges, delay_weights, intervals, raw_range, without_stamps
+from uwblink.twr import Exchanges
 
 IN_MEMORY: Final = "memory"
 """The source of ranges that come from no file."""
 
-NO_STAMPS: Final = "range"
-"""What stands for the protocol of a range that came without stamps."""
 
 HALVES: Final = (0.5, 0.5)
-ROWS_AT_ONCE: Final = 65_536
-"""Exchanges whose stamps are worked on together, so that what leads to ranges stays small beside them."""
 
 LONGEST_M: Final = 1e4
-LOUDEST_DBM: Final = -30.0
-FAINTEST_DBM: Final = -140.0
-"""Powers beyond these bounds were not measured: a board that cannot tell a strong power prints 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,6 +163,7 @@ class Ranges:
     def tags(self) -> list[int]:
         """Return the ids of the tags that range, in order."""
         counts = [np.bincount(ids) > 0 for ids in (self.initiator, self.target)]
+        let_go(self.initiator, self.target)
         return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
 
     def usable(self, why_no_truth: str = "", *, need_power: bool = True) -> Ranges:
@@ -196,18 +189,23 @@ class Usable:
 
 def usable_rows(ranges: Ranges, *, need_power: bool) -> Usable:
     """Return which of some ranges can be used, and how many not for which reason."""
-    reasons = {
-        "a tag with itself": ranges.initiator != ranges.target,
-        "no true distance": np.isfinite(ranges.truth_m),
-        "no power": np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm) | (not need_power),
-        "impossible stamps": np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < LONGEST_M),
-    }
-    keep = np.ones(len(ranges), dtype=bool)
-    excluded = {}
-    for reason, good in reasons.items():
-        excluded[reason] = int(np.count_nonzero(keep & ~good))
-        keep &= good
-    return Usable(keep, excluded)
+    keep, excluded = np.ones(len(ranges), dtype=bool), Counter[str]()
+    for rows in spans(len(ranges)):
+        for reason, good in _good(ranges, rows, need_power=need_power):
+            excluded[reason] += int(np.count_nonzero(keep[rows] & ~good))
+            keep[rows] &= good
+        let_go(ranges.initiator, ranges.target, ranges.truth_m, ranges.fpp1_dbm, ranges.fpp2_dbm, ranges.raw_m)
+    return Usable(keep, dict(excluded))
+
+
+def _good(ranges: Ranges, rows: slice, *, need_power: bool) -> Iterator[tuple[str, Bools]]:
+    """Yield what some ranges may lack, and which of them do not."""
+    yield "a tag with itself", ranges.initiator[rows] != ranges.target[rows]
+    yield "no true distance", np.isfinite(ranges.truth_m[rows])
+    powers = np.isfinite(ranges.fpp1_dbm[rows]) | np.isfinite(ranges.fpp2_dbm[rows])
+    yield "no power", np.asarray(powers | (not need_power))
+    raw = ranges.raw_m[rows]
+    yield "impossible stamps", np.isfinite(raw) & (np.abs(raw) < LONGEST_M)
 
 
 def require_some(source: str, count: int, excluded: Mapping[str, int], why_no_truth: str) -> None:
@@ -283,51 +281,3 @@ def without_static(ranges: Ranges) -> Ranges:
         raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` leaves nothing")
     count = int(np.count_nonzero(~moves))
     return replace(ranges[moves], excluded=ranges.excluded | ({STATIC: count} if count else {}))
-
-
-def measured_powers(fpp_dbm: Floats) -> Floats:
-    """Return first-path powers (n,) in dBm, NaN where the number cannot be one."""
-    with np.errstate(invalid="ignore"):
-        return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
-
-
-def columns_of(
-    exchanges: Exchanges, given_m: Floats, poses: Poses | Tracks | None, tags: Sequence[Tag]
-) -> dict[str, Any]:
-    """Return exchanges as the columns of ranges, with true distances `given_m` (n,), from poses where they are NaN."""
-    raw, initiator, target, middle = _of_stamps(exchanges)
-    bare = without_stamps(exchanges)
-    return {
-        "time_ns": exchanges.time_ns,
-        "initiator": exchanges.initiator,
-        "target": exchanges.target,
-        "protocol": np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
-        "raw_m": raw,
-        "truth_m": _truth(exchanges, given_m, poses, tags, middle),
-        "weight_initiator": initiator,
-        "weight_target": target,
-        "fpp1_dbm": measured_powers(exchanges.fpp1_dbm),
-        "fpp2_dbm": measured_powers(exchanges.fpp2_dbm),
-    }
-
-
-def _of_stamps(exchanges: Exchanges) -> tuple[Floats, Floats, Floats, Ints]:
-    """Return raw ranges, both weights of delays, and the middles of the first two messages in ns, each (n,)."""
-    raw, initiator, target = (np.empty(len(exchanges)) for _ in range(3))
-    middle = np.empty(len(exchanges), dtype=np.int64)
-    for begin in range(0, len(exchanges), ROWS_AT_ONCE):
-        rows = slice(begin, begin + ROWS_AT_ONCE)
-        some = exchanges[rows]
-        raw[rows], (initiator[rows], target[rows]) = raw_range(some), delay_weights(some)
-        middle[rows] = some.time_ns + np.rint(intervals(some).dt41 * (TICK_S * 5e8)).astype(np.int64)
-    return raw, initiator, target, middle
-
-
-def _truth(
-    exchanges: Exchanges, given_m: Floats, poses: Poses | Tracks | None, tags: Sequence[Tag], middle_ns: Ints
-) -> Floats:
-    known = np.isfinite(given_m)
-    if known.all() or poses is None or not len(poses):
-        return given_m
-    # A range belongs to the middle of its first two messages.
-    return np.where(known, given_m, distances_m(poses, tags, exchanges.initiator, exchanges.target, middle_ns))

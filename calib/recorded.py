@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from calib.carriers import Asked
 from calib.long_columns import ROWS_AT_ONCE, empty, let_go
 from calib.planted import check_planted
-from calib.ranges import COLUMNS, Ranges, bodies_of, columns_of, usable_rows
+from calib.range_columns import columns_of
+from calib.ranges import COLUMNS, Ranges, bodies_of, usable_rows
 from calib.single_sided import Terms, left_in, skew_terms
 from uwblink.recording.file import Recording
 from uwblink.recording.target_reports import single_exchange_blocks

@@ -63,7 +63,7 @@ FLOORS = {
     ),
     "calib": (
         ("carriers", "errors", "samples", "single_sided", "spread", "tails"),
-        ("densities", "information", "long_columns", "planted"),
+        ("densities", "information", "long_columns", "planted", "range_columns"),
         ("error_mixture", "ranges"),
         ("recorded",),
         ("calibration", "sources"),

@@ -10,7 +10,7 @@ import numpy as np
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.doctor.base import Finding, RecordingView
 from calib.estimation.confounding import explained_by_distance
-from calib.ranges import measured_powers
+from calib.range_columns import measured_powers
 
 CONFOUNDED: Final = "power confounded with distance"
 

@@ -10,17 +10,17 @@ import numpy as np
 
 from calib.calibration.power_curves import (
     DEGREE,
-    SIGMA_BINS,
     Bins,
-    equal_bins,
     lifted_power,
     populated,
 )
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.design import PIECES_AT_ONCE, Design, stable_order
+from calib.estimation.design import PIECES_AT_ONCE, Design
 from calib.estimation.identifiability import identifiable_directions, require_determined
 from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.problem import CELLS, Problem
+from calib.estimation.row_order import stable_order
+from calib.estimation.spacing import bins_of, splines
 from calib.estimation.unknowns import Unknowns
 from calib.long_columns import computed, empty, let_go, picked
 from calib.ranges import Ranges
@@ -33,10 +33,6 @@ FEWEST: Final = 100
 SPANNED: Final = 1e-4
 """Delays can make up for a constant of a curve if no more than this of it is left, in squares."""
 
-SEGMENTS_A_FOLD: Final = 4.5
-
-SEGMENTS: Final = (10, 28)
-"""Pieces of a bias curve: so many where lifted power grows e-fold, and bounds of their number."""
 
 SAME_POWER: Final = 1e-6
 """Lifted powers that differ by no more are one."""
@@ -75,6 +71,7 @@ def build_problem(
         lifted[~powered] = np.median(lifted[powered]) if powered.any() else 1.0
     ordered = empty(len(lifted))
     ordered[:] = lifted
+    let_go(lifted, ranges.time_ns)
     ordered.sort()
     low, high = populated(ordered)
     unknowns = (unknowns or Unknowns()).at_powers(varied=high - low > SAME_POWER)
@@ -87,8 +84,8 @@ def build_problem(
     pairs = pairs_of(ranges.initiator, ranges.target, everyone)
     shares = _shares(ranges, groups, everyone)
     _known_tags(everyone, fixed)
-    knots, averages = _splines(ordered, (low, high), unknowns)
-    bins = _bins(lifted, ordered)
+    knots, averages = splines(ordered, (low, high), unknowns)
+    bins = bins_of(lifted, ordered)
     del ordered
     kinds, kind = np.unique(_shares_of(pairs.ends, groups), axis=0, return_inverse=True)
     raw = _raw(ranges, everyone, pairs, lifted, bins, knots, kind.ravel(), unknowns)
@@ -133,42 +130,6 @@ def build_problem(
         unknowns=unknowns,
         powered=powered,
     )
-
-
-def _knots(ordered: Floats, low: float, high: float) -> Floats:
-    """Return clamped knots from `low` to `high`, halfway between equal counts and equal lengths, both of square roots.
-
-    Curves are steep where lifted power is small: there the roots lie dense, and few ranges do not spread them.
-    Powers over more decades take more knots.
-    """
-    segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *SEGMENTS))
-    counts = np.interp(np.linspace(0, len(ordered) - 1, segments + 1), np.arange(len(ordered)), ordered)
-    roots = np.sqrt(np.clip(counts, low, high)) + np.linspace(np.sqrt(low), np.sqrt(high), segments + 1)
-    inner = roots**2 / 4
-    inner[[0, -1]] = low, high
-    return np.concatenate([[low] * DEGREE, inner, [high] * DEGREE])
-
-
-def _bins(lifted: Floats, ordered: Floats) -> Bins:
-    """Return bins of equal counts of powers (n,) that stand sorted in `ordered` (n,), at least 20 each."""
-    count, size = min(SIGMA_BINS, max(1, len(lifted) // 20)), len(lifted)
-    edges = -(-np.arange(count + 1) * size // count)
-    # Sorting values and looking them up is several times faster than sorting their places, which equal powers need.
-    inner = ordered[edges[1:-1]]
-    number = computed(size, lambda rows: np.searchsorted(inner, lifted[rows], side="right"), np.int32)
-    counts = np.bincount(number, minlength=count)
-    if 2 * int(counts.min()) < size // count:
-        return equal_bins(lifted)
-    return Bins(number, ordered[(edges[1:] + edges[:-1]) // 2], counts)
-
-
-def _splines(ordered: Floats, span: tuple[float, float], unknowns: Unknowns) -> tuple[Floats, Floats]:
-    """Return the knots of curves and each spline's average over their span; none where no curve is fitted."""
-    if not unknowns.curve:
-        return np.zeros(0), np.zeros(0)
-    knots = _knots(ordered, *span)
-    # The integral of a B-spline is its coefficients times a quarter of each one's span.
-    return knots, (knots[DEGREE + 1 :] - knots[: -DEGREE - 1]) / (DEGREE + 1) / (span[1] - span[0])
 
 
 def _making_up(delays: Design, share: Floats | None) -> Floats | None:

@@ -16,11 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.long_columns import empty, let_go, picked, spans
+from calib.estimation.row_order import Order, Runs, cut, stable_order
+from calib.long_columns import empty, let_go, picked
 from uwblink.arrays import Bools, Floats, Ints
-
-Order = NDArray[np.signedinteger[Any]]
-"""Numbers of rows, in as few bytes as they take."""
 
 ROWS_AT_ONCE: Final = 8192
 """Rows worked on together, so that what leads to sums stays in the cache; no block has more."""
@@ -28,33 +26,9 @@ ROWS_AT_ONCE: Final = 8192
 MANY: Final = 64
 """Rows a block from which blocks are worth a product of matrices each."""
 
-DIGIT: Final = 1 << 16
-WIDE: Final = 1 << 31
-"""Rows whose numbers take more than four bytes."""
 
 PIECES_AT_ONCE: Final = 128
 """Pieces after which entries that lie in files are let go of."""
-
-
-@dataclass(frozen=True, slots=True)
-class Runs:
-    """Stretches of kept rows within blocks of a design: `starts` (runs + 1,) bound them, `block` (runs,) is theirs."""
-
-    starts: Ints
-    block: Ints
-
-    def sums(self, *stacked: Floats) -> Floats:
-        """Return sums of columns (k, n) over the rows of each run (runs, k)."""
-        return np.vstack([np.add.reduceat(some, self.starts[:-1], axis=-1) for some in stacked]).T
-
-    @property
-    def lengths(self) -> Ints:
-        """Return the number of rows of each run (runs,)."""
-        return np.diff(self.starts)
-
-    def rows(self, values: Ints) -> Ints:
-        """Return what rows (n,) have, of what runs have (runs,)."""
-        return np.repeat(values, self.lengths)
 
 
 @dataclass(frozen=True)
@@ -75,7 +49,7 @@ class Design:
     def whole(cls, matrix: Floats) -> Design:
         """Return a matrix (n, m) of which all entries count."""
         count, columns = matrix.shape
-        starts = cut(np.array([0, count]))
+        starts = cut(np.array([0, count]), ROWS_AT_ONCE)
         own = np.tile(np.arange(columns), (len(starts) - 1, 1))
         return cls(np.ascontiguousarray(matrix.T, dtype=np.float64), None, starts, own, np.eye(columns))
 
@@ -270,7 +244,7 @@ class Design:
 
     def in_short_blocks(self) -> Design:
         """Return the same matrix, with no block longer than what is worked on at once."""
-        starts = cut(self.starts)
+        starts = cut(self.starts, ROWS_AT_ONCE)
         if len(starts) == len(self.starts):
             return self
         old = np.searchsorted(self.starts, starts[:-1], side="right") - 1
@@ -297,47 +271,3 @@ class Design:
 def as_design(matrix: Design | Floats) -> Design:
     """Return a matrix as a design."""
     return matrix if isinstance(matrix, Design) else Design.whole(matrix)
-
-
-def cut(starts: Ints) -> Ints:
-    """Return bounds of blocks with more between them, so that none is longer than what is worked on at once."""
-    counts = np.diff(starts)
-    parts = -(-counts // ROWS_AT_ONCE)
-    if not np.any(parts > 1):
-        return starts
-    within = _within(parts)
-    which = np.repeat(np.arange(len(counts)), parts)
-    return np.append(starts[which] + within * counts[which] // parts[which], starts[-1])
-
-
-def _within(parts: Ints) -> Ints:
-    """Return 0, 1, 2 ... anew for each number of parts."""
-    return np.asarray(np.arange(int(parts.sum())) - np.repeat(np.cumsum(parts) - parts, parts))
-
-
-def stable_order(key: Ints) -> Order:
-    """Return what sorts keys from 0 (n,), equal ones in their order: by digits, much faster than by comparison."""
-    if len(key) and int(key.max()) < DIGIT and len(key) < WIDE:
-        return _few_sorted(key)
-    order = np.argsort((key % DIGIT).astype(np.uint16), kind="stable")
-    high = key // DIGIT
-    while high.any():
-        order = order[np.argsort((high[order] % DIGIT).astype(np.uint16), kind="stable")]
-        high = high // DIGIT
-    return order
-
-
-def _few_sorted(key: Ints) -> Order:
-    """Return what sorts keys (n,) of one digit, some rows at a time, each to its place behind the equal ones before."""
-    found, size = empty(len(key), np.int32), int(key.max()) + 1
-    counts = np.zeros(size, dtype=np.int64)
-    for rows in spans(len(key)):
-        counts += np.bincount(key[rows], minlength=size)
-    free = np.cumsum(counts) - counts
-    for rows in spans(len(key)):
-        own = np.argsort(key[rows].astype(np.uint16), kind="stable")
-        sizes = np.bincount(key[rows], minlength=size)
-        found[np.repeat(free - np.cumsum(sizes) + sizes, sizes) + np.arange(len(own))] = own + rows.start
-        free += sizes
-        let_go(found, key)
-    return found

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import DEGREE, Curve, basis
+from calib.estimation.alternatives import families
 from calib.estimation.intervals import blocks_of
 from calib.estimation.misfit import (
     CLEARLY,
@@ -18,7 +19,6 @@ from calib.estimation.misfit import (
     Judgement,
     everywhere,
     examine,
-    families,
     told,
 )
 from calib.estimation.persistence import FEWEST_STRETCHES

@@ -34,7 +34,7 @@ from calib.estimation.solver import Ended, Solved, solve
 from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
-from calib.long_columns import computed, empty, let_go, spans
+from calib.long_columns import computed, empty, let_go, spans, std_of
 from calib.ranges import COLUMNS, Ranges
 from calib.sources import Data, load_ranges
 from uwblink.arrays import Bools, Floats
@@ -156,8 +156,8 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         ]
         provenance = _provenance(ranges, inliers, fixed, sequential, problem, ended, warnings, reference)
         provenance["error_std_m"] = {
-            "raw": float(np.std(computed(len(ranges), lambda rows: ranges.raw_m[rows] - ranges.truth_m[rows]))),
-            "corrected": float(np.std(residuals)),
+            "raw": std_of(computed(len(ranges), lambda rows: ranges.raw_m[rows] - ranges.truth_m[rows])),
+            "corrected": std_of(residuals),
         }
         return FitResult(
             calibration=replace(calibration, provenance=provenance),

@@ -11,7 +11,8 @@ from calib.calibration.power_curves import ALPHA_DBM, lifted_power
 from calib.estimation.confounding import explained_by_distance, some_of
 from calib.estimation.pairs import pairs_of
 from calib.estimation.problem import Problem
-from calib.ranges import NO_STAMPS, Ranges
+from calib.range_columns import NO_STAMPS
+from calib.ranges import Ranges
 from calib.single_sided import LeftSkew, corrected
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from calib.errors import UnanswerableError
-from calib.estimation.design import stable_order
 from calib.estimation.pairs import pairs_of
+from calib.estimation.row_order import stable_order
 from calib.long_columns import computed, let_go, picked
 from calib.ranges import STATIC, Ranges
 from calib.spread import robust_spread

@@ -15,7 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.design import PIECES_AT_ONCE, Design, Runs
+from calib.estimation.design import PIECES_AT_ONCE, Design
+from calib.estimation.row_order import Runs
 from calib.long_columns import ROWS_AT_ONCE, let_go, spans
 from uwblink.arrays import Floats, Ints
 

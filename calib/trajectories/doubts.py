@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from calib.estimation.alternatives import Family, families, segments
 from calib.estimation.doubts import Doubts, of_a_decibel, reflected, short, weighed
 from calib.estimation.intervals import blocks_of
 from calib.estimation.misfit import (
     SPANS,
-    Family,
     Judgement,
     Tested,
-    families,
     findings,
     in_spans,
-    segments,
     widening_of_pairs,
 )
 from calib.estimation.persistence import persistence

@@ -6,7 +6,8 @@ import pytest
 from calib.calibration.power_curves import basis, lifted_power
 from calib.estimation import design as designs
 from calib.estimation.building import build_problem
-from calib.estimation.design import Design, stable_order
+from calib.estimation.design import Design
+from calib.estimation.row_order import stable_order
 from tests.calib.synthetic import design as written
 from tests.calib.synthetic import ranges
 

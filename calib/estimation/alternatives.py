@@ -1,0 +1,95 @@
+"""What a fit is held against: offsets that some ranges would have beside what was fitted, by kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from calib.estimation.problem import Problem
+from calib.estimation.row_order import Runs
+from calib.long_columns import computed, let_go
+from uwblink.arrays import Floats, Ints
+
+SEGMENTS: Final = 6
+"""Spans of time of equal counts, at most, in which a tag may have an offset of its own."""
+
+SPAN_S: Final = 20.0
+"""Spans are no shorter, so that errors that last are known within them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """Alternatives of one kind: offsets times `weight` (n,), or 1; `names` (k,) say whose they are.
+
+    Whose a range is goes by its run: each of `ends` has a place among the names of every run (runs,), and a sign. A
+    range belongs to both of its tags; in a family of differences the offset is taken the other way at one.
+    """
+
+    kind: str
+    names: list[str]
+    weight: Floats | float
+    runs: Runs
+    ends: tuple[tuple[Ints, float], ...]
+
+
+def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Family]:
+    """Yield the alternatives: offsets of a pair, of a tag for a while or as its power changes, and those of arithmetic.
+
+    Rows are in the order in which the problem's design keeps them; `louder_m` (n,), in the order of given ones, is what
+    a decibel more would do to each range. Where no curve is fitted, errors of all tags may
+    change with power alike, which is no tag's fault. The last two are an error that grows with the distance, and one of
+    the opposite sign with the other tag initiating, as a clock leaves it whose skew is not corrected.
+    """
+    kept, bins = problem.design.kept, problem.bins
+    tags, truth_m = problem.ranges.tags(), problem.ranges.truth_m
+    runs = problem.design.runs()
+    pair = problem.design.first_of(kept(problem.pairs.number))
+    low, high = np.searchsorted(tags, problem.pairs.ends[pair]).T
+    both = (low, 1.0), (high, 1.0)
+    names = [f"tag {tag}" for tag in tags]
+    named = [f"pair {low}-{high}" for low, high in problem.pairs.ends.tolist()]
+    yield Family(kind="pair", names=named, weight=1.0, runs=runs, ends=((pair, 1.0),))
+    count = segments(seconds)
+    edges = -(-np.arange(count + 1) * len(truth_m) // count)
+    when = kept(np.repeat(np.arange(count, dtype=np.int32), np.diff(edges)))
+    spans = problem.design.runs(when)
+    own = when[spans.starts[:-1]]
+    yield Family(
+        kind="time",
+        names=[name for name in names for _ in range(count)],
+        weight=1.0,
+        runs=spans,
+        ends=tuple((place[spans.block] * count + own, 1.0) for place in (low, high)),
+    )
+    if problem.unknowns.curve:
+        ranks, number = np.linspace(-1, 1, len(bins.count)), kept(bins.number)
+        rank = computed(len(number), lambda rows: ranks[number[rows]])
+        let_go(number)
+        yield Family(kind="power", names=names, weight=rank, runs=runs, ends=both)
+    size = float(np.sqrt(louder_m @ louder_m / len(louder_m)))
+    let_go(louder_m, bins.number)
+    if size > 0:
+        yield Family(kind="decibels", names=names, weight=_times(kept(louder_m), 1 / size), runs=runs, ends=both)
+    first = kept(problem.ranges.initiator < problem.ranges.target)
+    forth = computed(len(first), lambda rows: np.where(first[rows], 1.0, -1.0))
+    yield Family(kind="skew", names=names, weight=forth, runs=runs, ends=((low, 1.0), (high, -1.0)))
+    reach = float(np.ptp(truth_m))
+    if reach > 0:
+        middle = float(np.median(truth_m))
+        far = kept(computed(len(truth_m), lambda rows: (truth_m[rows] - middle) / reach))
+        let_go(truth_m)
+        yield Family(kind="scale", names=["all tags"], weight=far, runs=runs, ends=((np.zeros_like(low), 1.0),))
+
+
+def _times(column: Floats, factor: float) -> Floats:
+    found = computed(len(column), lambda rows: column[rows] * factor)
+    let_go(column)
+    return found
+
+
+def segments(seconds: float) -> int:
+    """Return in how many spans of a recording a tag may have an offset of its own."""
+    return int(min(max(seconds / SPAN_S, 2), SEGMENTS))
