@@ -26,8 +26,8 @@ from uwbsim.boards.stays import stays_s
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "without-motion-capture.md").read_text(encoding="utf-8")
 SCENARIO = ROOT / "scenarios" / "string" / "string.toml"
-SHORTER = ("--duration 30", "--duration 10")
-"""What a test changes of the page: seven ranges a pair instead of twenty, in a third of the time."""
+SHORTER = ("--duration 30", "--duration 12")
+"""What a test changes of the page: eight ranges a pair instead of twenty, in a third of the time."""
 
 PLANTED = {tag["id"]: tag["delay_ns"] for tag in tomllib.loads(SCENARIO.read_text())["tags"]}
 
@@ -91,8 +91,8 @@ def test_delays_against_their_mean_are_within_the_promise(done):
     error, spread = errors_ns(folder / "calibration.json")
     plan = calib.plan(6, on="line", size_m=(4.0,), arrangements=8, rate_hz=10.0)
     assert np.abs(error - error.mean()).max() < min(plan.half_ns.values())
-    # What all share is the curve's constant as well: known as badly as it is said to be.
-    assert 0.2 < np.sqrt(spread.mean()) < 0.3
+    # What all share is the curve's constant as well: off by much more than differences, and said to be.
+    assert 0.08 < np.sqrt(spread.mean()) < 0.3
     assert abs(error.mean()) < 2.5 * np.sqrt(spread.mean())
 
 
