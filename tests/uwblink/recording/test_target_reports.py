@@ -139,8 +139,8 @@ def test_a_recorder_compares_the_two_reports_as_they_come():
     assert check.add(1, later) is None
 
 
-def test_two_million_reports_take_seconds():
-    count = 1_000_000
+def test_half_a_million_reports_take_a_second():
+    count = 250_000
     rng = np.random.default_rng(1)
     columns: dict[str, Any] = {n: rng.integers(0, 2**32, count) for n in COLUMNS}
     columns |= {"initiator": np.full(count, 1), "target": np.full(count, 2), "reporter": np.full(count, 1)}
@@ -151,4 +151,4 @@ def test_two_million_reports_take_seconds():
     start = time.process_time()
     found = single_reports(both_reports)
     assert found.repeated == count
-    assert time.process_time() - start < 5
+    assert time.process_time() - start < 1.5
