@@ -14,8 +14,17 @@ __all__: Final = ["check_apart", "check_output", "made_folder", "whole", "write_
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
-    """Write a text file as UTF-8; raises what `write_bytes` raises."""
-    write_bytes(path, text.encode(), force=force)
+    """Write a text file as UTF-8, names of files that are none with escapes; raises what `write_bytes` raises."""
+    write_bytes(path, text.encode(errors="backslashreplace"), force=force)
+
+
+def is_utf8(path: Path) -> bool:
+    """Whether the whole name of a file is UTF-8, as DuckDB needs it: the system takes any bytes."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def write_bytes(path: Path, data: bytes, *, force: bool) -> None:

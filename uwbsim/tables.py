@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.output import whole
+from uwblink.errors import OutputError
+from uwblink.output import is_utf8, whole
 
 TYPES: Final = {bool: "BOOLEAN", int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
 """Of columns, by the type of their first value that is not None."""
@@ -33,6 +34,8 @@ def write_parquet(path: Path, rows: Rows, *, force: bool) -> None:
     """Write rows as Parquet; raises what `whole` raises."""
     import duckdb
 
+    if not is_utf8(path):
+        raise OutputError(f"{path}: its name and those of its folders must be UTF-8; give another one")
     with whole(path, force=force) as partial, duckdb.connect() as db:
         _create(db, "rows", rows)
         db.table("rows").write_parquet(str(partial))

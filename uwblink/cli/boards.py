@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -208,7 +209,7 @@ def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 57 bytes in
     """Broadcast a text to every board in range."""
     from uwblink import Board
 
-    data = text.encode()
+    data = os.fsencode(text)  # the bytes that were typed, whatever they are
     with Board.open(port) as board:
         board.send(data)
     typer.echo(f"{port}: {len(data)} bytes sent; delivery is not confirmed")

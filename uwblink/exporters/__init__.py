@@ -15,6 +15,7 @@ from uwblink.exporters.rosbag2 import write_rosbag2
 from uwblink.exporters.tables import write_csv, write_parquet
 from uwblink.exporters.tum import write_tum
 from uwblink.plugins import NAME, Registry
+from uwblink.recording.soundness import check_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,7 @@ def check_export(folder: str | os.PathLike[str], *, to: str, force: bool) -> Non
     final = Path(folder)
     if to not in EXPORTERS:
         raise ArgumentError(f"found {to!r:.40}, allowed: {', '.join(EXPORTERS)}", parameter="to")
+    check_name(final)
     if final.exists() and (not force or not final.is_dir()):
         raise RecordingExistsError(f"{final}: exists already; give another name, or `force` to replace it")
     if not final.parent.is_dir():

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.relations import first_line
+from uwblink.output import is_utf8
 
 if TYPE_CHECKING:
     import duckdb
@@ -33,6 +34,9 @@ def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBP
     """
     import duckdb
 
+    for path in paths:
+        if not is_utf8(path):
+            raise ImportTableError(f"{path}: its name and those of its folders must be UTF-8; rename it")
     db = duckdb.connect(":memory:")
     db.execute("SET TimeZone = 'UTC'")
     db.execute("SET enable_progress_bar = false")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from uwblink.errors import RecordingError
+from uwblink.output import is_utf8
 from uwblink.recording.schema import SUFFIX
 
 HEADER_BYTES: Final = 3 * 4096
@@ -37,6 +38,12 @@ def damaged(path: Path, error: Exception) -> RecordingError:
 def log_of(path: Path) -> Path:
     """Return where DuckDB keeps what was committed to a file and is not in the file itself yet."""
     return path.with_name(path.name + ".wal")
+
+
+def check_name(path: Path) -> None:
+    """Raise `RecordingError` for a name that DuckDB cannot take."""
+    if not is_utf8(path):
+        raise RecordingError(f"{path}: its name and those of its folders must be UTF-8; give another one")
 
 
 def check_length(path: Path) -> None:

@@ -18,7 +18,7 @@ from uwblink.columns import few_words
 from uwblink.errors import RecordingError, RecordingInUseError
 from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
-from uwblink.recording.soundness import check_length, damaged, first_line, is_locked, log_of
+from uwblink.recording.soundness import check_length, check_name, damaged, first_line, is_locked, log_of
 
 if TYPE_CHECKING:
     import duckdb
@@ -56,6 +56,7 @@ class Store:
         """Make a file at `place` with empty tables, for a recording that is called `path`; raises `RecordingError`."""
         import duckdb
 
+        check_name(path)
         try:
             store = cls(duckdb.connect(str(place)), path, writes=True, vanishes=True)
             # Snapshots are written beside the recording, and nothing ever elsewhere.
@@ -78,6 +79,7 @@ class Store:
         """
         import duckdb
 
+        check_name(path)
         check_length(path)
         config: dict[str, Any] = dict(setting.split(" = ") for setting in _LOCKED)
         size = path.stat().st_size

@@ -46,9 +46,9 @@ def write_comparison(found: Comparison, folder: Path, *, force: bool = False) ->
     text, rows = page(found), [one.to_dict() for one in found.outcomes]
     html, table, packed = (folder / name for name in FILES)
     with made_folder(folder):
+        write_parquet(packed, rows, force=force)  # first, because it asks most of the folder's name
         write_text(html, text, force=force)
         write_csv(table, rows, force=force)
-        write_parquet(packed, rows, force=force)
 
 
 def page(found: Comparison) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from uwblink.errors import UwblinkError
-from uwblink.output import whole
+from uwblink.output import is_utf8, whole
 from uwbsim.tables import fill_csv
 
 
@@ -108,6 +108,8 @@ def export(store: Store, table: Path, parquet: Path) -> None:
 def _connect(path: Path) -> Any:
     import duckdb
 
+    if not is_utf8(path):
+        raise TableError(f"{path}: its name and those of its folders must be UTF-8; give another one")
     try:
         return duckdb.connect(str(path))
     except duckdb.Error as error:
