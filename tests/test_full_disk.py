@@ -205,7 +205,7 @@ def test_poses_that_fit_into_the_log_alone_are_kept_in_it(seeds, tmp_path):
     assert set(after.poses.body) == {"ifo001", "ifo002"}
 
 
-@pytest.mark.parametrize(("most_bytes", "said", "kept"), [(4_000, "cannot be written (", False), (700_000, "", True)])
+@pytest.mark.parametrize(("most_bytes", "said", "kept"), [(4_000, "cannot be written (", False), (900_000, "", True)])
 def test_a_stream_for_which_the_disk_has_no_room(tmp_path, most_bytes, said, kept):
     """It is full when the recording begins, or when all has been written to the log and is put into the file."""
     with served() as server:
