@@ -39,7 +39,7 @@ Message = tuple[int, str, str, Any]
 def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
     """Write the bag `rosbag2`; returns its messages.
 
-    Raises `RecordingError` where rosbags is not installed, and for times before 1970.
+    Raises `RecordingError` where rosbags is not installed, for times before 1970, and for values beyond 32-bit floats.
     """
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
@@ -58,7 +58,10 @@ def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
                 raise RecordingError(f"{recording}: has times before 1970, which bags cannot hold")
             if topic not in known:
                 known[topic] = bag.add_connection(topic, kind, typestore=store)
-            bag.write(known[topic], time_ns, store.serialize_cdr(message, kind))
+            try:
+                bag.write(known[topic], time_ns, store.serialize_cdr(message, kind))
+            except OverflowError as error:
+                raise RecordingError(f"{recording}: {topic} has a value that is too large for {kind}") from error
             count += 1
     return {"rosbag2": count}
 

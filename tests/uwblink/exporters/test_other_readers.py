@@ -114,6 +114,14 @@ def test_poses_of_an_exported_bag_come_in_again(recording, tmp_path):
     assert found == [(t, names[b], [*p, *q]) for t, b, p, q in zip(*columns, strict=True)]
 
 
+def test_ranges_beyond_what_a_message_of_ros_holds_are_refused(tmp_path):
+    far = Exchanges.from_arrays([1], [2], time_ns=[5], range_m=[1e39], tx1=[0], rx1=[5], tx2=[9], rx2=[30])
+    Contents(exchanges=far).save(tmp_path / "far.uwb")
+    with pytest.raises(RecordingError, match=r"far\.uwb: /uwb/range_1_2 has a value that is too large for sensor_m"):
+        export_recording(tmp_path / "far.uwb", tmp_path / "out", to="rosbag2")
+    assert not (tmp_path / "out").exists()
+
+
 def test_bags_without_the_extra_and_times_before_1970_are_refused(recording, tmp_path, monkeypatch):
     Contents(exchanges=Exchanges.from_arrays([1], [2], time_ns=[-5], tx1=[0], rx1=[5], tx2=[9], rx2=[30])).save(
         tmp_path / "old.uwb"
