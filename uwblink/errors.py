@@ -96,3 +96,8 @@ class RangingFailedError(BoardError):
 
 class RefusedError(BoardError, ValueError):
     """A request that would harm the board, or that it would not understand; nothing was sent."""
+
+
+def first_line(error: Exception) -> str:
+    """Return what an error says first, at most 200 letters of it; the rest is for who wrote the query."""
+    return (str(error).splitlines() or [""])[0][:200]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.errors import OutputError
+from uwblink.errors import OutputError, first_line
 from uwblink.output import is_utf8, whole
 
 TYPES: Final = {bool: "BOOLEAN", int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
@@ -38,7 +38,17 @@ def write_parquet(path: Path, rows: Rows, *, force: bool) -> None:
         raise OutputError(f"{path}: its name and those of its folders must be UTF-8; give another one")
     with whole(path, force=force) as partial, duckdb.connect() as db:
         _create(db, "rows", rows)
-        db.table("rows").write_parquet(str(partial))
+        fill_parquet(partial, db.table("rows"), path)
+
+
+def fill_parquet(partial: Path, relation: Any, path: Path) -> None:
+    """Write a relation of DuckDB as Parquet to what will be `path`; raises `OutputError` where there is no room."""
+    import duckdb
+
+    try:
+        relation.write_parquet(str(partial))
+    except duckdb.IOException as error:
+        raise OutputError(f"{path}: cannot be written ({first_line(error)})") from error
 
 
 def _create(db: Any, name: str, rows: Rows) -> None:

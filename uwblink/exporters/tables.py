@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from uwblink.errors import RecordingError
+from uwblink.errors import RecordingError, first_line
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES
 
@@ -53,7 +53,7 @@ def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapp
                 if counts[table] or table == "exchanges":
                     db.execute(f"COPY ({_query(db, table, cells)}) TO {_literal(path)} ({_options(options, table)})")
         except duckdb.Error as error:
-            raise RecordingError(f"{recording}: cannot be exported ({str(error).splitlines()[0][:200]})") from error
+            raise RecordingError(f"{recording}: cannot be exported ({first_line(error)})") from error
     return {path.name: counts[table] for table, path in paths.items() if path.exists()}
 
 

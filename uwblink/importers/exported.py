@@ -6,8 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from uwblink.errors import ImportTableError
-from uwblink.importers.relations import first_line
+from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.staging import confined
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import TABLES

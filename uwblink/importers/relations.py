@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from uwblink.errors import ImportTableError
+from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.csv_dialect import CsvDialect
 
 if TYPE_CHECKING:
@@ -101,8 +101,3 @@ def parquet_relation(db: duckdb.DuckDBPyConnection, path: Path) -> Relation:
         tuple(any(kind in str(row[1]) for kind in kinds) and "[" not in str(row[1]) for row in rows),
         (None,) * len(rows),
     )
-
-
-def first_line(error: Exception) -> str:
-    """Return the first line of an error's text."""
-    return (str(error).splitlines() or [""])[0][:200]

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Ints
-from uwblink.errors import ImportTableError
-from uwblink.importers.relations import first_line
+from uwblink.errors import ImportTableError, first_line
 from uwblink.output import is_utf8
 
 if TYPE_CHECKING:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
-from uwblink.errors import ImportTableError
+from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.csv_dialect import CsvDialect, detect
 from uwblink.importers.file_lines import check_file, lines_of
-from uwblink.importers.relations import csv_relation, first_line, json_relation, parquet_relation
+from uwblink.importers.relations import csv_relation, json_relation, parquet_relation
 from uwblink.importers.staging import Kept, Stage, confined
 
 EXACT: Final = 2.0**53

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from uwblink.errors import RecordingError
+from uwblink.errors import RecordingError, first_line
 from uwblink.output import is_utf8
 from uwblink.recording.schema import SUFFIX
 
@@ -57,8 +57,3 @@ def check_length(path: Path) -> None:
         return
     if path.stat().st_size % BLOCK_BYTES != HEADER_BYTES % BLOCK_BYTES:
         raise RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one (its length is odd)")
-
-
-def first_line(error: Exception) -> str:
-    """Return what an error says first; the rest is for who wrote the query."""
-    return str(error).splitlines()[0]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.columns import few_words
-from uwblink.errors import RecordingError, RecordingInUseError
+from uwblink.errors import RecordingError, RecordingInUseError, first_line
 from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
-from uwblink.recording.soundness import check_length, check_name, damaged, first_line, is_locked, log_of
+from uwblink.recording.soundness import check_length, check_name, damaged, is_locked, log_of
 
 if TYPE_CHECKING:
     import duckdb
@@ -129,7 +129,7 @@ class Store:
             if self.vanishes:
                 raise self._unwritable(error) from error
             raise RecordingError(
-                f"{self.path}: cannot be completed ({first_line(error)}); is the disk full? Everything is kept, "
+                f"{self.path}: cannot be completed ({first_line(error)}); everything is kept, "
                 f"some of it in {log_of(self.path).name} beside it: keep the two together"
             ) from error
 

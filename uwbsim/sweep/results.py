@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from uwblink.errors import UwblinkError
 from uwblink.output import is_utf8, whole
-from uwbsim.tables import fill_csv
+from uwbsim.tables import fill_csv, fill_parquet
 
 
 class TableError(UwblinkError, ValueError):
@@ -102,7 +102,7 @@ def export(store: Store, table: Path, parquet: Path) -> None:
     with whole(table, force=True) as rows, whole(parquet, force=True) as packed:
         fill_csv(rows, columns, store.rows())
         with duckdb.connect() as db:
-            db.read_csv(str(rows), header=True, sample_size=-1).write_parquet(str(packed))
+            fill_parquet(packed, db.read_csv(str(rows), header=True, sample_size=-1), parquet)
 
 
 def _connect(path: Path) -> Any:
