@@ -7,7 +7,7 @@ with, and the modules given; the answer is a line with, for each, its status, wh
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import io
 import json
 import os
@@ -17,7 +17,8 @@ from contextlib import redirect_stderr, redirect_stdout
 from typing import Any, Final
 
 PACKAGES: Final = ("uwblink", "uwbsim", "calib")
-ALWAYS: Final = ("typer._adapters",)
+READERS: Final = ("typer._adapters",)
+"""What typer reads options with, in the versions that have it apart."""
 
 
 def _run(words: list[str], watched: set[str]) -> dict[str, Any]:
@@ -50,7 +51,8 @@ def _child(request: dict[str, Any], answer: int) -> None:
 
 def main() -> None:
     """Answer requests until standard input ends."""
-    for name in (*(f"{package}.cli.commands" for package in PACKAGES), *ALWAYS, *sys.argv[1:]):
+    readers = (name for name in READERS if importlib.util.find_spec(name))
+    for name in (*(f"{package}.cli.commands" for package in PACKAGES), *readers, *sys.argv[1:]):
         importlib.import_module(name)
     for line in sys.stdin:
         ours, theirs = os.pipe()
