@@ -107,8 +107,8 @@ def test_neither_slower_nor_later_as_it_gets_longer(tmp_path):
     third = len(taken) // 3
     # Medians, for others work on the machine too; what looks at everything so far would take twice as long at the end.
     assert np.median(taken[-third:]) < 1.5 * np.median(taken[5 : 5 + third])
-    # Seventy times as fast as it was, on a machine of its own (`make bench-hours`); here every line may be counted too.
-    assert np.median(taken) < EVERY / RATE_HZ / 10
+    # Seventy times as fast as it was, on a machine of its own (`make bench-hours`). Counting lines takes as long again.
+    assert np.median(taken) < EVERY / RATE_HZ / (25 if sys.gettrace() is None else 10)
 
 
 def test_the_time_of_a_recording_is_that_of_its_boards(tmp_path):
