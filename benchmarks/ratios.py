@@ -72,7 +72,7 @@ def pairs(folder: Path) -> list[Pair]:
 
     return [
         Pair("a million ranges by Monte Carlo, DS-TWR, noise and skew", "NumPy, six columns of noise",
-             monte_carlo, lambda: plain.monte_carlo(COUNT), 1 / 1.5, 2.0),
+             monte_carlo, lambda: plain.monte_carlo(COUNT), 1 / 1.5, 1.5),
         Pair("simulating the training flight, all effects", "SimPy, five time-outs an exchange",
              lambda: uwbsim.simulate(scenario), lambda: plain.five_timeouts(len(flight.exchanges)), None, 5.0),
         Pair(f"`uwblink import csv` of {ROWS} rows", "DuckDB's `read_csv` of them",
