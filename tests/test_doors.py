@@ -15,7 +15,7 @@ BESIDE = {
     "uwblink.exporters.export_recording": "the front door offers no export yet",
     "uwblink.importers.guess.guess_map": "what import suggests where no map is given; read_source takes the map",
     "uwblink.__version__": "what --version prints",
-    "uwblink.cli.starting": "Ctrl-C while a command is being imported, before anything of it is there",
+    "uwblink.cli.starting": "Ctrl-C while a command is being imported, and what must come before",
     "uwblink.cli.waiting": "the line that a command shows while it works, alike in the three commands",
     "uwblink.cli.guide": "panels, examples and completion, alike in the three commands",
     "uwblink.exporters.EXPORTERS": "names of the forms that a recording can leave in, for a shell to complete",

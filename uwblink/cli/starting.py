@@ -1,6 +1,6 @@
-"""Ctrl-C while a command is still being imported, for all three commands.
+"""What a command does before anything is imported for it, and last: for all three commands.
 
-Nothing heavy is imported here: this is what must run before the rest is loaded, which takes some tenths of a second.
+Nothing heavy is imported here: Ctrl-C is answered while the rest is loaded, which takes some tenths of a second.
 """
 
 from __future__ import annotations
@@ -18,15 +18,23 @@ COLLECT_AFTER: Final = 50_000
 """New objects between two searches for cycles. Importing and drawing make many objects that stay, and spent a tenth of
 their time on being searched every 700."""
 
+THREADS: Final = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What libraries of linear algebra are told by how many threads they may take; they look when NumPy is imported."""
+
 
 def start(command: Callable[[], NoReturn]) -> NoReturn:
     """Import and run a command; until it answers Ctrl-C itself, that is one line and status 130."""
     before = signal.signal(signal.SIGINT, _leave)
     gc.set_threshold(COLLECT_AFTER)
+    # Matrices are small here, and threads that wait for large ones do so by counting: a tenth of a command's time.
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
     try:
         command()
     finally:
         signal.signal(signal.SIGINT, before)
+        # The process ends: all that is left would be searched for cycles three times over.
+        gc.freeze()
 
 
 def _leave(_number: int, _frame: Any) -> NoReturn:
