@@ -6,9 +6,7 @@ from statistics import NormalDist
 from typing import Final
 
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.statistics import pair_rows
@@ -17,7 +15,7 @@ from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, INK, MUTED, PALE
 from uwblink.pages.figures import NARROW_IN, label, legend, sheet
-from uwblink.pages.figures_alike import many_alike, on_figure, share_axes
+from uwblink.pages.figures_alike import dots, many_alike, strokes
 
 REACH: Final = 6.0
 POINTS: Final = 3000
@@ -28,6 +26,7 @@ MOST_PAIRS: Final = 24
 
 POINTS_OF_PAIR: Final = 800
 PANEL_IN: Final = 1.05
+DOT_PT: Final = 1.65
 
 
 def distribution(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
@@ -90,21 +89,23 @@ def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figu
     pairs = most_spread(ranges, error)
     columns = 2 if width_in < NARROW_IN else 4
     time = (ranges.time_ns - ranges.time_ns.min()) * 1e-9
-    figure, panels = many_alike(width_in, [f"tags {name}" for name in pairs], columns, height_in=PANEL_IN)
     last = float(time.max())
-    share_axes(figure, panels, columns, (-0.05 * last - 1e-9, 1.05 * last + 1e-9), _reach_cm(error))
+    figure = many_alike(
+        width_in,
+        [f"tags {name}" for name in pairs],
+        columns,
+        height_in=PANEL_IN,
+        x=(-0.05 * last - 1e-9, 1.05 * last + 1e-9),
+        y=_reach_cm(error),
+    )
     clouds, bands = [], []
-    for panel, rows in zip(panels, pairs.values(), strict=True):
+    for panel, rows in zip(figure.panels, pairs.values(), strict=True):
         order = rows[np.argsort(time[rows])]
         shown, some = order[:: max(1, len(order) // POINTS_OF_PAIR)], order[:: max(1, len(order) // 120)]
-        clouds.append(on_figure(panel, time[shown], error[shown]))
-        bands += [on_figure(panel, time[some], side * applied.sigma_m[some]) for side in (-196, 196)]
-    # All points are one picture: one a panel takes longer to write than everything else.
-    points = np.concatenate(clouds).T
-    figure.add_artist(
-        Line2D(*points, ls="", marker=".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True, transform=figure.transFigure)
-    )
-    figure.add_artist(LineCollection(bands, colors=INK, linewidths=0.6, transform=figure.transFigure, zorder=3))
+        clouds.append(panel.on_figure(time[shown], error[shown]))
+        bands += [panel.on_figure(time[some], side * applied.sigma_m[some]) for side in (-196, 196)]
+    dots(figure, np.concatenate(clouds), size_pt=DOT_PT, color=BLUE, alpha=0.64)
+    strokes(figure, bands, color=INK, lw=0.6, zorder=3)
     figure.supxlabel("time (s)", fontsize="medium")
     figure.supylabel("calibrated error (cm)", fontsize="medium")
     return figure

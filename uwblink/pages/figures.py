@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from uwblink.pages.colours import GRID, INK, MUTED
+from uwblink.pages.figures_alike import ManyAlike, Reach
 from uwblink.pages.figures_placed import Placed
 
 COLUMN_IN: Final = 3.5
@@ -209,24 +210,25 @@ def _file(figure: Figure, kind: str) -> bytes:
 
 def _panels(figure: Figure) -> list[dict[str, Any]]:
     """Say of each panel where it is (left, top, right, bottom in points) and what its axes run over."""
-    width, height = 72 * figure.get_figwidth(), 72 * figure.get_figheight()
     found = []
     for axes in figure.axes:
-        box = axes.get_position()
-        scales = [axes.get_xscale(), axes.get_yscale()]
+        box, scales = axes.get_position(), [axes.get_xscale(), axes.get_yscale()]
         if not axes.get_visible() or not set(scales) <= {"linear", "log"}:
             continue
-        found.append(
-            {
-                "box": [round(v, 1) for v in (box.x0 * width, (1 - box.y1) * height, box.x1 * width)]
-                + [round((1 - box.y0) * height, 1)],
-                "x": [float(f"{v:.5g}") for v in axes.get_xlim()],
-                "y": [float(f"{v:.5g}") for v in axes.get_ylim()],
-                "scale": scales,
-                "names": [axes.get_xlabel() or _shared(figure, "x"), axes.get_ylabel() or _shared(figure, "y")],
-            }
-        )
+        names = [axes.get_xlabel() or _shared(figure, "x"), axes.get_ylabel() or _shared(figure, "y")]
+        found.append(_panel(figure, (box.x0, box.x1), (box.y0, box.y1), [axes.get_xlim(), axes.get_ylim()])
+                     | {"scale": scales, "names": names})  # fmt: skip
+    if isinstance(figure, ManyAlike):
+        alike = {"scale": ["linear", "linear"], "names": [_shared(figure, which) for which in "xy"]}
+        found += [_panel(figure, one.across, one.up, [one.x, one.y]) | alike for one in figure.panels]
     return found
+
+
+def _panel(figure: Figure, across: Reach, up: Reach, views: Sequence[Reach]) -> dict[str, Any]:
+    width, height = 72 * figure.get_figwidth(), 72 * figure.get_figheight()
+    box = (across[0] * width, (1 - up[1]) * height, across[1] * width, (1 - up[0]) * height)
+    over = {which: [float(f"{v:.5g}") for v in view] for which, view in zip("xy", views, strict=True)}
+    return {"box": [round(float(v), 1) for v in box]} | over
 
 
 def _shared(figure: Figure, which: str) -> str:
