@@ -117,6 +117,7 @@ def _ratio(series: Floats, scale: int) -> float:
 
 def _expected(share: Floats, keep: Floats, factor: Floats, scale: int, blocks: int) -> Floats:
     """Return what `_ratio` is on average, where the sum over all blocks is held at zero."""
-    lags = np.arange(1, scale)[:, None]
-    free = 1 + 2 * share * np.sum((1 - lags / scale) * keep**lags, axis=0)
+    # The sum over lags h below the scale s of (1 - h/s) rho^h.
+    lasting = keep / (1 - keep) * (1 - (1 - keep**scale) / (scale * (1 - keep)))
+    free = 1 + 2 * share * lasting
     return np.asarray((blocks * free - scale * factor) / (blocks - factor))

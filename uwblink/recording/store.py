@@ -50,6 +50,7 @@ class Store:
         self._db, self._second = connection, connection.cursor()
         self.path, self.writes, self.vanishes = path, writes, vanishes
         self._longest_read_s = longest_read_s(size)
+        self._columns: dict[str, set[str]] | None = None
 
     @classmethod
     def create(cls, place: Path, path: Path, memory_mb: int | None = None) -> Self:
@@ -275,6 +276,11 @@ class Store:
 
     def columns(self) -> dict[str, set[str]]:
         """Return the names of the columns of each table that the file has."""
+        if self._columns is None or self.writes:
+            self._columns = self._listed_columns()
+        return self._columns
+
+    def _listed_columns(self) -> dict[str, set[str]]:
         found: dict[str, set[str]] = {}
         rows = self.read(
             "SELECT table_name AS t, column_name AS c FROM information_schema.columns WHERE table_schema = 'main'"
