@@ -1,4 +1,4 @@
-"""What a command does before anything is imported for it, and last: for all three commands.
+"""What a command does before anything is imported for it, for all three commands.
 
 Nothing heavy is imported here: Ctrl-C is answered while the rest is loaded, which takes some tenths of a second.
 """
@@ -33,8 +33,6 @@ def start(command: Callable[[], NoReturn]) -> NoReturn:
         command()
     finally:
         signal.signal(signal.SIGINT, before)
-        # The process ends: all that is left would be searched for cycles three times over.
-        gc.freeze()
 
 
 def _leave(_number: int, _frame: Any) -> NoReturn:
