@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -20,8 +21,17 @@ USUAL_IN: Final = (0.55, 0.12, 0.42, 0.12)
 """Room left, right, below and above a panel before its labels are measured: near what most take."""
 
 PASSES: Final = 3
-MEASURES: Final[Any] = RendererAgg
-"""What tells how much room text takes; it need not have a pixel to draw on for that."""
+
+
+@cache
+def measuring(dpi: float) -> RendererAgg:
+    """Return what tells how much room text takes, and remembers it: most words are in several figures.
+
+    It need not have a pixel to draw on for that.
+    """
+    make: Any = RendererAgg
+    found: RendererAgg = make(1, 1, dpi)
+    return found
 
 
 class Placed(ConstrainedLayoutEngine):
@@ -40,7 +50,7 @@ class Placed(ConstrainedLayoutEngine):
         if grid is None or any(axes.get_gridspec() is not grid for axes in panels):
             super().execute(fig)
             return
-        renderer = MEASURES(1, 1, fig.dpi)
+        renderer = measuring(fig.dpi)
         legends = sum(2 * PAD_IN + legend.get_window_extent(renderer).height / fig.dpi for legend in fig.legends)
         rows, columns = grid.get_geometry()
         usual = [np.full(count, side) for count, side in zip((columns, columns, rows, rows), USUAL_IN, strict=True)]
