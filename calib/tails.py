@@ -9,6 +9,9 @@ import numpy as np
 
 from uwblink.arrays import Floats
 
+TWO_SIDED_95: Final = 1.959963984540054
+"""How many standard deviations about its mean hold 95 % of a normal distribution."""
+
 CENTRE: Final = 3.0
 """Where the variable of the series below is zero."""
 

@@ -19,7 +19,7 @@ CONFINED = {
         "figures" in Path(path).name or path in {f"calib/report/{name}.py" for name in ("blocks", "pdf")}
     ),
     "fpdf": lambda path: path == "calib/report/pdf.py",
-    "pypdf": lambda path: path == "calib/report/pdf.py",
+    "pypdf": lambda path: path == "calib/report/pdf_figures.py",
     "typer": lambda path: "/cli/" in path,
     "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
@@ -68,6 +68,7 @@ FLOORS = {
         ("recorded",),
         ("calibration", "sources"),
         ("evaluation",),
+        ("over_power",),
         ("figures",),
         ("estimation", "surveys"),
         ("doctor", "trajectories"),

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
         write_onboard_tum,
         write_tum,
     )
-    from calib.evaluation.onboard import OnboardSettings, localize_onboard
+    from calib.evaluation.onboard import localize_onboard
+    from calib.evaluation.onboard_track import OnboardSettings
     from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation
     from calib.evaluation.tracking import FILTERS, Settings
 
@@ -46,7 +47,7 @@ _HOMES: Final = {
     "Evaluation": "calib.evaluation.statistics",
     "FILTERS": "calib.evaluation.tracking",
     "PAPER_RMSE_M": "calib.evaluation.localization",
-    "OnboardSettings": "calib.evaluation.onboard",
+    "OnboardSettings": "calib.evaluation.onboard_track",
     "Settings": "calib.evaluation.tracking",
     "as_tum": "calib.evaluation.localization_display",
     "localization_json": "calib.evaluation.localization_display",

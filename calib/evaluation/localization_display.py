@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.evaluation.consistency import Summary, summarize
 from calib.evaluation.localization import PAPER_RMSE_M
-from calib.evaluation.onboard import OnboardSettings, OnboardTrack
+from calib.evaluation.onboard_track import OnboardSettings, OnboardTrack
 from calib.evaluation.tracking import Localization, Settings, Track
 from uwblink.arrays import Floats, Ints
 from uwblink.output import write_files

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
-from calib.evaluation.onboard import OnboardTrack
+from calib.evaluation.onboard_track import OnboardTrack
 from calib.evaluation.tracking import Localization
 from calib.report import figures_comparison, figures_tracks
 from calib.report.blocks import Block, Document, Picture

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
-from calib.evaluation.onboard import OnboardTrack
-from calib.figures import TWO_SIDED_95, keep_strays_out
+from calib.evaluation.onboard_track import OnboardTrack
+from calib.figures import keep_strays_out
+from calib.tails import TWO_SIDED_95
 from uwblink.pages.colours import BLUE, INK, MUTED, VERMILION
 from uwblink.pages.figures import label, legend, mark, sheet
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from calib.errors import BadInputError
-from calib.report import sections
+from calib.report import error_sections, sections
 from calib.report.blocks import Block, Document, Heading, Text
 from calib.report.campaign import Campaign
 from calib.report.localization_section import localization
@@ -113,23 +113,23 @@ def _delays(campaign: Campaign) -> list[Block]:
 
 def _curves(campaign: Campaign) -> list[Block]:
     trained = campaign.trained
-    return sections.curves(trained, campaign.calibration.apply(trained), campaign.calibration)
+    return error_sections.curves(trained, campaign.calibration.apply(trained), campaign.calibration)
 
 
 def _before_after(campaign: Campaign) -> list[Block]:
     return [
         Heading("Before and after"),
-        *sections.before_after(campaign.evaluation),
-        *sections.errors(campaign.judged, campaign.corrected, campaign.calibration),
+        *error_sections.before_after(campaign.evaluation),
+        *error_sections.errors(campaign.judged, campaign.corrected, campaign.calibration),
     ]
 
 
 def _outliers(campaign: Campaign) -> list[Block]:
-    return [Heading("Outliers"), *sections.outliers(campaign.judged, campaign.corrected)]
+    return [Heading("Outliers"), *error_sections.outliers(campaign.judged, campaign.corrected)]
 
 
 def _over_time(campaign: Campaign) -> list[Block]:
-    return sections.over_time(campaign.tests or campaign.training, campaign.calibration)
+    return error_sections.over_time(campaign.tests or campaign.training, campaign.calibration)
 
 
 SECTIONS: Final[dict[str, Section]] = {

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import datetime
-import io
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from calib.report.blocks import VERDICTS, Block, Document, Heading, Listing, Picture, Table, Text, sentence_apart
+from calib.report.pdf_figures import MM_OF_INCH, Place, pages_of, size_mm, with_figures
 from uwblink.pages.figures import PAGE_IN
 
 if TYPE_CHECKING:
     from fpdf import FPDF
-    from pypdf import PageObject
 
-MM_OF_INCH: Final = 25.4
 PAPER_MM: Final = (210.0, 297.0)
 MARGIN_MM: Final = (PAPER_MM[0] - PAGE_IN * MM_OF_INCH) / 2
 """So that figures of a page's width are printed as large as they are drawn."""
@@ -44,9 +41,6 @@ FILLS: Final = {
     "doubt": (255, 244, 224),
     "bad": (253, 234, 234),
 }
-DRAWN: Final = re.compile(rb"/([\w.-]+) Do\b")
-"""Images, markers and forms that a page draws."""
-
 FAMILY: Final = "DejaVu"
 EPOCH: Final = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
 """Written as the date of creation, so that the same data give the same bytes; the title says when it was made."""
@@ -54,25 +48,21 @@ EPOCH: Final = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
 
 @dataclass(slots=True)
 class _Placed:
-    """Where figures are to stand (page from 0, left and bottom edge in mm), and on which page each section begins.
+    """Where figures are to stand, and on which page each section begins.
 
     `contents` are page and height in mm of the lines that list the sections.
     """
 
-    figures: list[tuple[str, int, float, float]] = field(default_factory=list)
+    figures: list[Place] = field(default_factory=list)
     sections: list[int] = field(default_factory=list)
     contents: list[tuple[int, float]] = field(default_factory=list)
 
 
 def to_pdf(document: Document, printed: bytes, pages: Mapping[str, int]) -> bytes:
     """Return the document as PDF; its figures are `pages` of a PDF, `printed`, by name, of a page's width."""
-    from pypdf import PdfReader
-
-    reader = PdfReader(io.BytesIO(printed)) if pages else None
-    pictures = {name: reader.pages[number] for name, number in pages.items()} if reader else {}
-    sizes = {name: _size_mm(page) for name, page in pictures.items()}
-    text, placed = _set(document, sizes)
-    return _with_figures(text, pictures, placed)
+    pictures = pages_of(printed, pages)
+    text, placed = _set(document, {name: size_mm(page) for name, page in pictures.items()})
+    return with_figures(bytes(text.output()), pictures, placed.figures)
 
 
 def _set(document: Document, sizes: Mapping[str, tuple[float, float]]) -> tuple[FPDF, _Placed]:
@@ -189,7 +179,7 @@ def _picture(page: FPDF, block: Picture, caption: str, size: tuple[float, float]
     height = size[1]
     if page.will_page_break(height + 10):
         page.add_page()
-    placed.figures.append((block.name, page.page_no() - 1, page.l_margin, page.h - page.get_y() - height))
+    placed.figures.append(Place(block.name, page.page_no() - 1, page.l_margin, page.h - page.get_y() - height))
     page.ln(height)
     _write(page, caption, SMALL)
     page.ln(1.5)
@@ -267,78 +257,3 @@ def _table(page: FPDF, table: Table) -> None:
             for text in texts:
                 row.cell(text)
     page.ln(2)
-
-
-def single_pages(printed: bytes) -> list[bytes]:
-    """Return each page of a PDF as a PDF of its own, with nothing in it that it does not draw."""
-    from pypdf import PdfReader, PdfWriter
-    from pypdf.generic import DictionaryObject, NameObject
-
-    found = []
-    for page in PdfReader(io.BytesIO(printed)).pages:
-        shared: Any = page["/Resources"].get_object()
-        used = {f"/{name.decode()}" for name in DRAWN.findall(page.get_contents().get_data())}  # type: ignore[union-attr]  # a figure has contents
-        own = DictionaryObject(shared)
-        forms: Any = shared.get("/XObject", DictionaryObject()).get_object()
-        own[NameObject("/XObject")] = DictionaryObject({name: form for name, form in forms.items() if name in used})
-        page[NameObject("/Resources")] = own
-        writer, data = PdfWriter(), io.BytesIO()
-        writer.add_page(page)
-        writer.write(data)
-        found.append(data.getvalue())
-    return found
-
-
-def _size_mm(page: PageObject) -> tuple[float, float]:
-    """Return width and height of a figure."""
-    return float(page.mediabox.width) / 72 * MM_OF_INCH, float(page.mediabox.height) / 72 * MM_OF_INCH
-
-
-def _with_figures(text: FPDF, pictures: Mapping[str, PageObject], placed: _Placed) -> bytes:
-    """Put figures where there is room for them: as forms, so that they stay drawings with text."""
-    from pypdf import PdfReader, PdfWriter
-    from pypdf.generic import DictionaryObject, NameObject
-
-    writer = PdfWriter(clone_from=PdfReader(io.BytesIO(bytes(text.output()))))
-    drawn: dict[int, list[tuple[str, float, float]]] = {}
-    for number, (name, page, left, bottom) in enumerate(placed.figures):
-        resources: Any = writer.pages[page]["/Resources"].get_object()
-        held = resources.setdefault(NameObject("/XObject"), DictionaryObject()).get_object()
-        held[NameObject(f"/Fig{number}")] = writer._add_object(_form(pictures[name], writer))
-        drawn.setdefault(page, []).append((f"Fig{number}", left, bottom))
-    for page, some in drawn.items():
-        _append(writer.pages[page], some)
-    data = io.BytesIO()
-    writer.write(data)
-    return data.getvalue()
-
-
-def _form(source: PageObject, writer: Any) -> Any:
-    """Return a page as a form: what can be drawn on another page."""
-    from pypdf.generic import NameObject, StreamObject
-
-    form = StreamObject()
-    form.set_data(source.get_contents().get_data())  # type: ignore[union-attr]  # a figure has contents
-    form.update(
-        {
-            NameObject("/Type"): NameObject("/XObject"),
-            NameObject("/Subtype"): NameObject("/Form"),
-            NameObject("/BBox"): source.mediabox,
-            NameObject("/Resources"): source["/Resources"].clone(writer),
-        }
-    )
-    if "/Group" in source:
-        form[NameObject("/Group")] = source["/Group"].clone(writer)
-    return form.flate_encode()
-
-
-def _append(page: Any, figures: list[tuple[str, float, float]]) -> None:
-    """Draw forms on a page, at left and bottom edges in mm, after what is there."""
-    from pypdf.generic import NameObject, StreamObject
-
-    point = 72 / MM_OF_INCH
-    words = "".join(f"q 1 0 0 1 {x * point:.3f} {y * point:.3f} cm /{name} Do Q\n" for name, x, y in figures)
-    stream = StreamObject()
-    # fpdf2 leaves a page with the scale and colours that it had; what it saved is restored first.
-    stream.set_data(b"q\n" + page.get_contents().get_data() + b"\nQ\n" + words.encode())
-    page[NameObject("/Contents")] = page.indirect_reference.pdf._add_object(stream.flate_encode())

@@ -9,7 +9,7 @@ from pathlib import Path
 from calib.calibration.model import Calibration, require_calibration
 from calib.evaluation.statistics import Evaluation, evaluate
 from calib.ranges import Ranges, concatenate
-from calib.report import sections
+from calib.report import error_sections, sections
 from calib.report.blocks import Document, Heading, Text
 from calib.report.origin import Origin, origin_of
 from calib.report.provenance import provenance, warnings
@@ -87,10 +87,10 @@ def _evaluated(
             Heading("Antenna delays"),
             *sections.delays(calibration, evaluation.planted, ranges.planted or {}, {}),
             Heading("Before and after"),
-            *sections.before_after(evaluation),
-            *sections.errors(ranges, applied, calibration),
-            *sections.curves(ranges, applied, calibration),
-            *sections.over_time(recordings, calibration),
+            *error_sections.before_after(evaluation),
+            *error_sections.errors(ranges, applied, calibration),
+            *error_sections.curves(ranges, applied, calibration),
+            *error_sections.over_time(recordings, calibration),
             *provenance(calibration, origin),
         ],
         origin.sentence(),

@@ -1,9 +1,9 @@
-"""The sections of a report, as blocks."""
+"""The sections of a report on what was recorded and fitted, as blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,31 +11,20 @@ import numpy as np
 
 from calib.calibration.display import pair_rows as offset_rows
 from calib.calibration.model import Calibration
-from calib.calibration.parts import CorrectedRanges
-from calib.error_mixture import fit_error_mixtures
-from calib.evaluation.error_statistics import ErrorStatistics
 from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, PlantedComparison, pair_rows
 from calib.ranges import Ranges
-from calib.report.blocks import Block, Heading, Picture, Table, Text
+from calib.report.blocks import Block, Picture, Table, Text
+from calib.tails import TWO_SIDED_95
 
 if TYPE_CHECKING:
     from calib.estimation.passive_listeners import OverheardDelay
     from calib.estimation.result import FitResult
 
-OUTLIER_SIGMAS: Final = 3.0
 NOT_SPLIT: Final = (
     "How a delay splits into transmission and reception is not determined: stamps of free-running clocks leave it "
     "open, overheard exchanges included, because shifting a tag's clock shifts both. Where both are needed, 0.44 of a "
     "delay goes to transmission and 0.56 to reception by convention."
 )
-
-
-FOLLOWS_CORE: Final = (
-    "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. Points are "
-    "the centre of that core (below: its spread), told from the tail bin by bin, without the curve. Medians are "
-    "drawn, too, and lie above: with a share s of reflected ranges about the quantile 0.5 / (1 − s) of the core."
-)
-FOLLOWS: Final = {"l2": "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."}
 
 
 def summary(evaluation: Evaluation, on_what: str = "") -> str:
@@ -122,7 +111,7 @@ def delays(
     header += ["heard by others (ns)", "± 1 std"] if heard else []
     rows = []
     for tag, delay in sorted(calibration.delays_ns.items()):
-        half = figures.TWO_SIDED_95 * calibration.delays_std_ns.get(tag, float("nan"))
+        half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, float("nan"))
         bounds = [f"{delay - half:+.4f}", f"{delay + half:+.4f}"] if np.isfinite(half) else ["undetermined", ""]
         row = [str(tag), f"{delay:+.4f}", *bounds]
         if known and planted:
@@ -176,161 +165,3 @@ def sensitivity(calibration: Calibration, refits: dict[float, Calibration]) -> l
             "scale-sensitivity", draw, "What another scale of the loss would have done to the delays, mean removed."
         )
     ]
-
-
-def curves(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
-    """Return the curves over power, with bands and data, which are found once for all widths."""
-    from calib import figures
-
-    known = (ranges, applied, calibration)
-    biases, sigmas = cache(partial(figures.biases, *known)), cache(partial(figures.sigmas, *known))
-    return [
-        Heading("Bias and standard deviation over power"),
-        Text(FOLLOWS.get(calibration.loss, FOLLOWS_CORE), "note"),
-        Text(
-            "Lifted power is the first-path power p on a scale that stretches where ranges are good and the bias "
-            f"changes: ψ = 10^((p − α) / 10 dB) with α = {calibration.alpha_dbm:g} dBm, so ψ = 1 at α and a tenth of "
-            "it 10 dB lower; of an exchange, "
-            + (
-                "the mean over both ends."
-                if calibration.lift == "mean-of-lifted"
-                else "that of the mean power of both ends."
-            )
-            + " Powers in dBm stand above the figures.",
-            "note",
-        ),
-        Picture(
-            "bias",
-            lambda width: figures.alone(partial(figures.bias_over_power, *known, found=biases()), width),
-            "Bias over power: what the delay-corrected errors centre on, and the curve with its 95 % band.",
-        ),
-        Picture(
-            "sigma",
-            lambda width: figures.alone(partial(figures.sigma_over_power, *known, found=sigmas()), width),
-            "Standard deviation over power: that of the calibrated errors' noise, and the curve with its 95 % band.",
-        ),
-    ]
-
-
-def before_after(evaluation: Evaluation) -> list[Block]:
-    """Return the table of errors by pair and stage, and how well sigma covers them."""
-    header = ["pair", "n", *["mean", "std", "robust"] * len(CORRECTION_STAGES), "95 % |e|", "noise", "in 95 %", "new p"]
-    rows = [[name, *_cells(group)] for name, group in evaluation.pairs.items()]
-    rows.append(["all", *_cells(evaluation.overall)])
-    above = [("", 2), *[(stage, 3) for stage in CORRECTION_STAGES], ("full", 3), ("", 1)]
-    overall = evaluation.overall
-    levels = list(overall.coverage)
-    covered = [
-        [name, *[f"{100 * group.coverage[level]:.0f} %" for level in levels]]
-        for name, group in [*evaluation.pairs.items(), ("all", overall)]
-    ]
-    low, high = 100 * overall.full.low_m, 100 * overall.full.high_m
-    return [
-        Table(header, rows, above, total=True),
-        Text(
-            "Errors in cm. Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
-            f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Noise: share of corrected "
-            "ranges that their own sigma explains at 95 %, 95 % without reflections; the rest are mostly reflected. In "
-            "95 %: share within the 95 % intervals that reckon with reflections. New p: share at powers the curves "
-            "were not fitted at.",
-            "note",
-        ),
-        Table(["pair", *[f"{level} %" for level in levels]], covered, [("", 1), ("nominal", len(levels))], total=True),
-        Text(
-            "Coverage: how many calibrated errors lie within the bounds that their sigma gives for a normal "
-            "distribution. Reflections take from the high levels.",
-            "note",
-        ),
-    ]
-
-
-def _cells(group: ErrorStatistics) -> list[str]:
-    cells = [str(group.raw.n)]
-    for stage in CORRECTION_STAGES:
-        stats = getattr(group, stage)
-        cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.std_m, stats.robust_std_m)]
-    shares = [_percent(share) for share in (1 - group.rejected, group.inside_95, group.clamped)]
-    return [*cells, f"{100 * group.full.abs95_m:.1f}", *shares]
-
-
-def _percent(share: float) -> str:
-    return "–" if share != share else f"{100 * share:.1f} %"
-
-
-def errors(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> list[Block]:
-    """Return histograms, z-scores, and residuals over distance and power."""
-    from calib.report import figures_errors
-
-    return [
-        Picture(
-            "errors",
-            partial(figures_errors.distribution, ranges=ranges, applied=applied),
-            "Range errors: how many of which size and sign (the outermost bins hold everything beyond them), and how "
-            "many are smaller than so much.",
-        ),
-        Picture(
-            "z-scores",
-            partial(figures_errors.z_scores, ranges=ranges, applied=applied),
-            "Calibrated errors over their sigma: density, and quantiles against those of the standard normal.",
-        ),
-        Picture(
-            "residuals",
-            partial(figures_errors.residuals, ranges=ranges, applied=applied, alpha_dbm=calibration.alpha_dbm),
-            "What is left over distance and over power, reflections included: they lift the medians off zero, the more "
-            "of them the higher; a slope or a wave would be a bias that is left. A hundredth of the points is beyond.",
-        ),
-    ]
-
-
-def outliers(ranges: Ranges, applied: CorrectedRanges) -> list[Block]:
-    """Say what the calibrated errors are made of, by pair."""
-    from calib import figures
-
-    rows = []
-    error, z = applied.corrected_m - ranges.truth_m, (applied.corrected_m - ranges.truth_m) / applied.sigma_m
-    groups = {**pair_rows(ranges), "all": np.ones(len(ranges), dtype=bool)}
-    told = {name: mine for name, mine in groups.items() if np.count_nonzero(mine) >= figures.FEWEST_IN_BIN}
-    mixtures = fit_error_mixtures([error[mine] for mine in told.values()])
-    for (name, mine), mixture in zip(told.items(), mixtures, strict=True):
-        rows.append(
-            [
-                name,
-                f"{100 * np.mean(z[mine] > OUTLIER_SIGMAS):.1f} %",
-                f"{100 * np.mean(z[mine] < -OUTLIER_SIGMAS):.1f} %",
-                f"{100 * mixture.sigma_m[0]:.1f}",
-                f"{100 * mixture.tail_share:.1f} %",
-                f"{100 * mixture.tail_mean_m:.0f}",
-                f"{100 * mixture.outlier_share:.2f} %",
-            ]
-        )
-    header = ["pair", "too long", "too short", "core (cm)", "tail", "its mean (cm)", "outliers"]
-    return [
-        Table(header, rows, total=True),
-        Text(
-            "Too long and too short: share of ranges beyond three sigmas. Core, tail and outliers: a Gaussian, an "
-            "exponential detour on the long side, and what fits neither, by maximum likelihood.",
-            "note",
-        ),
-    ]
-
-
-def over_time(recordings: list[Ranges], calibration: Calibration) -> list[Block]:
-    """Return a figure a recording of the calibrated errors over time."""
-    from calib.report import figures_errors
-
-    blocks: list[Block] = [Heading("Over time")]
-    for k, recording in enumerate(recordings):
-        applied, pairs = calibration.apply(recording), len(pair_rows(recording))
-        blocks.append(
-            Picture(
-                f"over-time-{k + 1}",
-                partial(figures_errors.over_time, ranges=recording, applied=applied),
-                f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
-                + (
-                    f" Of {pairs} pairs the {figures_errors.MOST_PAIRS} whose errors spread most; others are left out."
-                    if pairs > figures_errors.MOST_PAIRS
-                    else ""
-                ),
-            )
-        )
-    return blocks

@@ -11,11 +11,11 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.statistics import Evaluation
-from calib.figures import TWO_SIDED_95
 from calib.ranges import Ranges
 from calib.report.blocks import Block
 from calib.report.grades import BAD, DOUBT, GOOD, Criterion, graded, judgement
 from calib.report.without_truth import criteria
+from calib.tails import TWO_SIDED_95
 
 if TYPE_CHECKING:
     from calib.evaluation.tracking import Localization

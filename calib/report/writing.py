@@ -98,7 +98,7 @@ def _write_figures(
     force: bool,
 ) -> None:
     """Write each figure at each width as drawing and as PDF."""
-    from calib.report.pdf import single_pages
+    from calib.report.pdf_figures import single_pages
 
     pages = single_pages(printed)
     drawings = {f"{name}-{width}.svg": svg for name, widths in made.items() for width, svg in widths.items()}
