@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.carriers import Asked
-from calib.long_columns import ROWS_AT_ONCE, empty, let_go
+from calib.long_columns import ROWS_AT_ONCE, empty, let_go, put
 from calib.planted import check_planted
 from calib.range_columns import columns_of
 from calib.ranges import COLUMNS, Ranges, bodies_of, usable_rows
@@ -41,10 +41,9 @@ class _Columns:
     def add(self, some: Ranges) -> None:
         rows = slice(self.length, self.length + len(some))
         for name, column in self._room.items():
-            column[rows] = getattr(some, name)
+            put(column, rows, getattr(some, name))
         self._add_words(some.protocol, rows)
         self.length += len(some)
-        let_go(*self._room.values(), self._protocol)
 
     def _add_words(self, words: NDArray[np.str_], rows: slice) -> None:
         """Keep protocols; as long as all are one it is kept once."""
@@ -57,7 +56,7 @@ class _Columns:
             room = empty(self._most, wanted)
             room[: rows.start] = next(iter(before), "") if self._protocol is None else self._protocol[: rows.start]
             self._protocol = room
-        self._protocol[rows] = words
+        put(self._protocol, rows, words)
 
     def found(self) -> dict[str, Any]:
         """Return the columns."""
@@ -98,8 +97,7 @@ class _Reading:
         for part, poses in [(block, None)] if complete else self._windows.tracks_beside(block):
             self._keep(columns_of(part, part.truth_m, poses, self._tags))
         self._times.update(np.ascontiguousarray(block.time_ns).data)
-        self._range_m[self._count : self._count + len(block)] = block.range_m
-        let_go(self._range_m)
+        put(self._range_m, slice(self._count, self._count + len(block)), block.range_m)
         self._count += len(block)
         self._terms.append(skew_terms(block))
         self._asked.add(block)

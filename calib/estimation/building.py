@@ -22,7 +22,7 @@ from calib.estimation.problem import CELLS, Problem
 from calib.estimation.row_order import stable_order
 from calib.estimation.spacing import bins_of, splines
 from calib.estimation.unknowns import Unknowns
-from calib.long_columns import computed, empty, let_go, picked
+from calib.long_columns import EVERY, computed, empty, let_go, picked, put
 from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 from uwblink.bsplines import nonzero
@@ -70,7 +70,7 @@ def build_problem(
         # What has no power stands at the middle of the others, where it bends nothing.
         lifted[~powered] = np.median(lifted[powered]) if powered.any() else 1.0
     ordered = empty(len(lifted))
-    ordered[:] = lifted
+    put(ordered, EVERY, lifted)
     let_go(lifted, ranges.time_ns)
     ordered.sort()
     low, high = populated(ordered)
@@ -214,12 +214,13 @@ def _raw(
     if each:
         columns += [carriers + kind[pair] * each + first + k for k in range(DEGREE + 1)]
     for into, weight in zip(values, _weights(ranges, unknowns), strict=False):
-        into[:] = picked(weight, order)
-        let_go(values)
+        put(into, EVERY, picked(weight, order))
     ordered = picked(lifted, order)
     for begin in range(0, len(lifted) if each else 0, ROWS_AT_ONCE):
         rows = slice(begin, begin + ROWS_AT_ONCE)
-        values[-DEGREE - 1 :, rows] = nonzero(np.clip(ordered[rows], knots[0], knots[-1]), knots, DEGREE)[1]
+        some = nonzero(np.clip(ordered[rows], knots[0], knots[-1]), knots, DEGREE)[1]
+        for into, spline in zip(values[-DEGREE - 1 :], some, strict=True):
+            put(into, rows, spline)
         if begin % (PIECES_AT_ONCE * ROWS_AT_ONCE) == 0:
             let_go(values, ordered)
     let_go(values, lifted)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.estimation.row_order import Order, Runs, cut, stable_order
-from calib.long_columns import empty, let_go, picked
+from calib.long_columns import empty, let_go, picked, put, spans
 from uwblink.arrays import Bools, Floats, Ints
 
 ROWS_AT_ONCE: Final = 8192
@@ -106,7 +106,7 @@ class Design:
         """Return the matrix times parameters (m,), in the order of kept rows."""
         found = empty(len(self))
         for blocks, rows in self.passing():
-            found[rows] = self.piece_times(x, blocks, rows)
+            put(found, rows, self.piece_times(x, blocks, rows))
         return found
 
     def piece_times(self, x: Floats, blocks: slice, rows: slice) -> Floats:
@@ -222,8 +222,9 @@ class Design:
         there = np.diff(starts) > 0
         values = empty(len(keep), each=(len(self.values),))
         for into, column in zip(values, self.values, strict=True):
-            np.take(column, keep, out=into)
-            let_go(values, column)
+            for some in spans(len(keep)):
+                put(into, some, np.take(column, keep[some]))
+            let_go(column)
         return Design(values, order, np.append(starts[:-1][there], len(keep)), self.columns[there], self.turn)
 
     def blocked(self, place: Ints) -> Design:

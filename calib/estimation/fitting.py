@@ -34,7 +34,7 @@ from calib.estimation.solver import Ended, Solved, solve
 from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
-from calib.long_columns import computed, empty, let_go, spans, std_of
+from calib.long_columns import computed, empty, let_go, put, spans, std_of
 from calib.ranges import COLUMNS, Ranges
 from calib.sources import Data, load_ranges
 from uwblink.arrays import Bools, Floats
@@ -178,9 +178,10 @@ def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools]:
     for rows in spans(count):
         some = ranges[rows]
         applied = plain.apply(some)
-        residuals[rows] = applied.corrected_m - some.truth_m
-        inliers[rows] = np.abs(residuals[rows]) < INLIER_SIGMAS * applied.sigma_m
-        let_go(residuals, *(getattr(ranges, name) for name in COLUMNS))
+        left = applied.corrected_m - some.truth_m
+        put(residuals, rows, left)
+        put(inliers, rows, np.abs(left) < INLIER_SIGMAS * applied.sigma_m)
+        let_go(*(getattr(ranges, name) for name in COLUMNS))
     return residuals, inliers
 
 

@@ -12,7 +12,7 @@ from calib.estimation.design import Design, as_design
 from calib.estimation.problem import CELLS
 from calib.estimation.reflections import Shape, expected
 from calib.estimation.scores import Scores, Sort, Summing, Sums
-from calib.long_columns import ROWS_AT_ONCE, empty, let_go, picked
+from calib.long_columns import ROWS_AT_ONCE, empty, let_go, picked, put
 from uwblink.arrays import Floats, Ints
 
 SLOPES: Final = ("noise", "share", "mean", "least", "outliers")
@@ -149,7 +149,7 @@ def slopes_at(errors: Errors, layout: Layout, theta: Floats, name: str) -> Float
     """Return the slope of each range (n,) by its own parameter of a kind of `SLOPES`, at parameters."""
     found, which = empty(len(errors.error)), SLOPES.index(name)
     for _, rows, piece in _pieces(errors, layout, theta):
-        found[rows] = piece.slopes[which]
+        put(found, rows, piece.slopes[which])
     let_go(found, errors.error)
     return found
 
@@ -159,7 +159,8 @@ def scores_at(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, Su
     found = empty(len(errors.error), each=(1 + len(SLOPES),))
     summing = Summing(errors.design, len(SLOPES), squares=True)
     for blocks, rows, piece in _pieces(errors, layout, theta):
-        found[0, rows], found[1:, rows] = piece.score, piece.slopes
+        for column, values in zip(found, (piece.score, *piece.slopes), strict=True):
+            put(column, rows, values)
         summing.add(blocks, rows, piece.score, piece.slopes)
         if rows.start // ROWS_AT_ONCE != rows.stop // ROWS_AT_ONCE:
             let_go(found, errors.error)

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.estimation.design import Design, as_design
 from calib.estimation.losses import LOSSES, Weights
-from calib.long_columns import computed, empty, let_go, spans
+from calib.long_columns import computed, empty, let_go, put, spans
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -117,8 +117,9 @@ def terms(loss: str, residual: Floats, width: float) -> tuple[Floats, Floats]:
     function, count = LOSSES[loss], len(residual)
     weight, slope = empty(count), empty(count)
     for rows in spans(count):
-        weight[rows], slope[rows] = function(residual[rows] / width)
-        let_go(weight, slope, residual)
+        for column, values in zip((weight, slope), function(residual[rows] / width), strict=True):
+            put(column, rows, values)
+        let_go(residual)
     return weight, slope
 
 

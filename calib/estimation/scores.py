@@ -17,10 +17,9 @@ import numpy as np
 
 from calib.estimation.design import PIECES_AT_ONCE, Design
 from calib.estimation.row_order import Runs
-from calib.long_columns import ROWS_AT_ONCE, let_go, spans
+from calib.long_columns import EVERY, ROWS_AT_ONCE, let_go, spans
 from uwblink.arrays import Floats, Ints
 
-EVERY: Final = slice(None)
 _NOTHING: Final = np.zeros((0, 0))
 
 
