@@ -15,8 +15,9 @@ import numpy as np
 from calib.calibration.model import Calibration, require_calibration
 from calib.errors import UnanswerableError
 from calib.evaluation.tracking import FixedStd, Localization, Settings
-from calib.evaluation.tracking_filters import FilterRanges, filter_ranges, run_filters
+from calib.evaluation.tracking_filters import filter_ranges, run_filters
 from calib.evaluation.tracking_problem import Noise, problems
+from calib.evaluation.tracking_runs import FilterRanges, Run
 from calib.sources import Data, Flight, load_flight, require_times
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
@@ -57,26 +58,26 @@ def localize(
     fixed = fixed_std(calibration, chosen, training)
     require_times(flight.ranges)
     applied = calibration.apply(flight.ranges)
-    found = []
+    runs = []
     for problem in problems(flight):
         noises = [Noise.drawn(problem, chosen, chosen.seed + k) for k in range(chosen.seeds)]
         ranges = filter_ranges(flight.ranges[problem.rows], applied, problem.rows, calibration, fixed.std_m)
-        tracks = run_filters(problem, list(ranges.values()), noises, chosen)
-        found.append(
-            Localization(
-                source=flight.ranges.source,
-                body=problem.body,
-                tracks={name: tracks[k][0] for k, name in enumerate(ranges)},
-                rmse_m={name: np.array([track.rmse_m for track in tracks[k]]) for k, name in enumerate(ranges)},
-                fixed=fixed,
-                simulated=flight.ranges.planted is not None,
-            )
-        )
-    if not found:
+        runs.append(Run(problem, ranges, noises))
+    if not runs:
         raise UnanswerableError(
             f"{flight.ranges.source}: no body moves among poses and ranges, so there is nothing to localize"
         )
-    return found
+    return [
+        Localization(
+            source=flight.ranges.source,
+            body=run.problem.body,
+            tracks={name: own[0] for name, own in tracks.items()},
+            rmse_m={name: np.array([track.rmse_m for track in own]) for name, own in tracks.items()},
+            fixed=fixed,
+            simulated=flight.ranges.planted is not None,
+        )
+        for run, tracks in zip(runs, run_filters(runs, chosen), strict=True)
+    ]
 
 
 def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
@@ -101,13 +102,20 @@ def fixed_std(calibration: Calibration, settings: Settings, training: Data | Fli
 def _tuned(flight: Flight, calibration: Calibration, settings: Settings) -> FixedStd:
     """Return the standard deviations with which the filters err least on a flight."""
     applied = calibration.apply(flight.ranges)
-    squares = np.zeros((2, len(TUNED_OVER)))
+    runs = []
     for whole in problems(flight):
         problem = whole.first(TUNED_RANGES)
         noises = [Noise.drawn(problem, settings, settings.seed + k) for k in range(settings.seeds)]
-        measured = (applied.raw_m[problem.rows], applied.corrected_m[problem.rows])
-        ranges = [FilterRanges(m, np.full(len(m), std)) for m in measured for std in TUNED_OVER]
-        errors = [[track.rmse_m for track in tracks] for tracks in run_filters(problem, ranges, noises, settings)]
+        measured = {"raw": applied.raw_m[problem.rows], "calibrated": applied.corrected_m[problem.rows]}
+        ranges = {
+            f"{name}, {std}": FilterRanges(own, np.full(len(own), std))
+            for name, own in measured.items()
+            for std in TUNED_OVER
+        }
+        runs.append(Run(problem, ranges, noises))
+    squares = np.zeros((2, len(TUNED_OVER)))
+    for tracks in run_filters(runs, settings):
+        errors = [[track.rmse_m for track in own] for own in tracks.values()]
         squares += np.sum(np.array(errors) ** 2, axis=1).reshape(squares.shape)
     best = [TUNED_OVER[k] for k in np.argmin(squares, axis=1)]
     return FixedStd({"raw": best[0], "calibrated": best[1]}, f"tuned on {flight.ranges.source}")

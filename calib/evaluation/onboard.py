@@ -111,7 +111,7 @@ def _run(one: Readings, settings: OnboardSettings, running: InertialFilter, firs
             running.slow(settings.speed_m_s)
         elif kind == "range":
             heard = running.hear(
-                float(one.range_m[number]), float(one.noise_m[number]), one.errors[number], one.arm_m[number],
+                float(one.range_m[number]), float(one.noise_m[number]), one.errors.at(number), one.arm_m[number],
                 one.anchor_m[number],
             )  # fmt: skip
             log.heard_s.append(now)

@@ -38,7 +38,7 @@ class Readings:
     time_s: Floats
     range_m: Floats
     noise_m: Floats
-    errors: list[RangeErrors]
+    errors: RangeErrors
     arm_m: Floats
     anchor_m: Floats
     imu_s: Floats
@@ -130,15 +130,15 @@ def _of_body(
     )
 
 
-def _corrected(ranges: Ranges, calibration: Calibration) -> tuple[Floats, Floats, list[RangeErrors]]:
+def _corrected(ranges: Ranges, calibration: Calibration) -> tuple[Floats, Floats, RangeErrors]:
     """Return corrected ranges (n,), the noise of direct ones (n,), and what their errors are made of besides."""
     from calib.evaluation.tracking_filters import range_errors
 
     if not len(ranges):
-        return np.zeros(0), np.zeros(0), []
+        return np.zeros(0), np.zeros(0), UNKNOWN_ERRORS.times(0)
     applied = calibration.apply(ranges)
     if calibration.errors is None:
-        return applied.corrected_m, applied.sigma_m, [UNKNOWN_ERRORS] * len(ranges)
+        return applied.corrected_m, applied.sigma_m, UNKNOWN_ERRORS.times(len(ranges))
     return (applied.corrected_m - calibration.errors.location_m, *range_errors(calibration, ranges))
 
 

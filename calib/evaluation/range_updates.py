@@ -7,7 +7,8 @@ follow exactly (Gaussian noise and state, moments of the posterior).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,16 +18,25 @@ from uwblink.arrays import Bools, Floats
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeErrors:
-    """What the errors of one range are made of: reflected with `share`, by a least detour and an exponential one.
+    """What the errors of a range are made of: reflected with `share`, by a least detour and an exponential one.
 
-    Metres and shares of 1. `outlier` are of any size, about `outlier_m`.
+    Metres and shares of 1. `outlier` are of any size, about `outlier_m`. Of several ranges, `share` and `detour_m` are
+    columns (n,).
     """
 
-    share: float
+    share: Floats | float
     least_m: float
-    detour_m: float
+    detour_m: Floats | float
     outlier: float
     outlier_m: float
+
+    def times(self, count: int) -> RangeErrors:
+        """Return those of so many ranges, all alike."""
+        return replace(self, share=np.full(count, self.share), detour_m=np.full(count, self.detour_m))
+
+    def at(self, rows: Any) -> RangeErrors:
+        """Return those of some of several ranges, or of one by its number."""
+        return replace(self, share=np.asarray(self.share)[rows], detour_m=np.asarray(self.detour_m)[rows])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,9 @@ from calib.evaluation.consistency import summarize
 from calib.evaluation.localization import fixed_std, localize
 from calib.evaluation.localization_display import as_tum, localization_json, localization_text, write_tum
 from calib.evaluation.tracking import Settings
+from calib.evaluation.tracking_filters import AT_ONCE, filter_ranges, run_filters
+from calib.evaluation.tracking_problem import Noise, problems
+from calib.evaluation.tracking_runs import Run
 from calib.samples import sample_flight
 from calib.sources import Flight, load_flight
 from uwbsim.scenario.loading import load
@@ -129,6 +132,31 @@ def test_each_body_and_flight_has_noise_of_its_own(flights):
     assert one.rmse_m["raw"][0] != one.rmse_m["raw"][1]
     again = localize(flight, calibration, Settings(seeds=1, seed=1, gate=1e9))[0]
     assert again.rmse_m["raw"][0] == one.rmse_m["raw"][1]
+
+
+def test_bodies_side_by_side_are_tracked_as_each_alone(flights):
+    # They begin anew, each in its own time, for none is where it thinks to be. The first is judged in two parts.
+    calibration = fit(flights["train"].ranges).calibration
+    flight, settings = flights["test1"], Settings(seeds=2, initial_offset_m=(3.0, 0.0, 0.0))
+    applied, runs = calibration.apply(flight.ranges), []
+    for whole, count in zip(problems(flight), (AT_ONCE + 200, 700, 40), strict=True):
+        problem = whole.first(count)
+        known = flight.ranges[problem.rows]
+        ranges = filter_ranges(known, applied, problem.rows, calibration, {"raw": 0.2, "calibrated": 0.1})
+        runs.append(Run(problem, ranges, [Noise.drawn(problem, settings, seed) for seed in (3, 4)]))
+    together = run_filters(runs, settings)
+    for run, found in zip(runs, together, strict=True):
+        (alone,) = run_filters([run], settings)
+        assert list(found) == list(alone) == ["raw", "calibrated", "variance", "robust"]
+        for name, tracks in alone.items():
+            for track, other in zip(tracks, found[name], strict=True):
+                for column in ("estimate_m", "std_m", "nis", "nees", "accepted"):
+                    np.testing.assert_array_equal(getattr(track, column), getattr(other, column))
+    for found in together[:2]:
+        track = found["variance"][1]
+        wrong = np.linalg.norm(track.estimate_m - track.truth_m, axis=1)
+        assert wrong[0] > 2
+        assert wrong[-100:].max() < 1, "it began anew"
 
 
 @pytest.mark.parametrize("offset", [(5.0, 0.0, 0.0), (0.0, -10.0, 0.0), (-7.0, 7.0, 0.0), (0.0, 0.0, 5.0)])
