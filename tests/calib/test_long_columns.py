@@ -34,7 +34,7 @@ def test_rows_of_one_of_several_columns(few):
     columns = empty(4, each=(3,))
     columns[:] = 0
     put(columns[1], slice(1, 3), np.array([5.0, 6.0]))
-    put(columns[2], slice(0, 4), np.float64(7))
+    put(columns[2], slice(0, 4), np.array(7.0))
     put(columns[:, 0], slice(1, 3), np.array([8.0, 9.0]))  # not one after the other
     np.testing.assert_array_equal(columns, [[0, 0, 0, 0], [8, 5, 6, 0], [9, 7, 7, 7]])
 
