@@ -31,7 +31,7 @@ class Run:
     noises: Sequence[Noise]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Beside:
     """What several runs are given, side by side: times (n,) first, then filters, then a column a body and noise.
 
