@@ -26,6 +26,14 @@ seeds = {seeds}
 "ranging.response_delay_uus" = [300, 1500]
 """
 
+CALIBRATIONS = """[sweep]
+scenario = "{scenario}"
+kind = "calibrate"
+seeds = {seeds}
+[vary]
+"run.duration_s" = [10.0]
+"""
+
 
 def main() -> None:
     """Print one row a figure."""
@@ -39,6 +47,12 @@ def main() -> None:
     row("their variances apart", "2 %", alone("variances"))
     one, two = float(alone("sweep", "1")), float(alone("sweep", "2"))
     row("a sweep with two workers, over one", "1.8", f"{one / two:.2f} ({one:.1f} s, {two:.1f} s)", at_least=True)
+    beyond = " and ".join(f"{alone('calibrations', workers)} s" for workers in ("1", "2"))
+    row(
+        "a calibration of a flight of ten seconds beyond its flight, in a sweep with one and two workers",
+        "0.2 s",
+        beyond,
+    )
     row("Dask's overhead at the default chunk, over processes", "5 %", alone("dask"))
     few, many = float(alone("memory", "4")), float(alone("memory", "400"))
     row("peak memory of a sweep of 400 runs, over one of 4", "", f"{many:.0f} MB, {few:.0f} MB")
@@ -122,6 +136,33 @@ def sweep(workers: str, seeds: str = "60") -> str:
         return f"{time.perf_counter() - start:.2f}"
 
 
+def calibrations(workers: str, seeds: int = 40) -> str:
+    """Processor time of a run that calibrates, start of processes included, less that of its flight."""
+    from uwbsim.scenario.loading import load
+    from uwbsim.simulation.run import simulate
+    from uwbsim.sweep.design import load_design
+    from uwbsim.sweep.runner import run_sweep
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan.toml"
+        path.write_text(CALIBRATIONS.format(scenario=TEST1, seeds=seeds))
+        plan, before = load_design(path), _processor_time()
+        run_sweep(plan, Path(folder) / "out", workers=int(workers))
+        each = (_processor_time() - before) / seeds
+    flight = load(TEST1, ["run.duration_s=10"])
+    start = time.process_time()
+    for _ in range(seeds):
+        simulate(flight)
+    return f"{each - (time.process_time() - start) / seeds:.2f}"
+
+
+def _processor_time() -> float:
+    """Return the processor time of this process and of those that it started and that ended."""
+    return sum(
+        u.ru_utime + u.ru_stime for u in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
 def dask() -> str:
     """How much longer a chunk of a second takes when Dask hands it out, measured on chunks alone."""
     from distributed import Client, LocalCluster
@@ -163,8 +204,8 @@ def memory(seeds: str) -> str:
 
 
 MEASURES: dict[str, Callable[..., str]] = {
-    "plain": plain, "full": full, "means": means, "variances": variances, "sweep": sweep, "dask": dask,
-    "memory": memory,
+    "plain": plain, "full": full, "means": means, "variances": variances, "sweep": sweep,
+    "calibrations": calibrations, "dask": dask, "memory": memory,
 }  # fmt: skip
 
 
