@@ -54,7 +54,8 @@ def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
         axes.set_ylim(0, 2.5 * usual)
         axes.text(0.99, 0.97, f"highest bar: {highest[-1]:.2f} m", transform=axes.transAxes, ha="right", va="top")
     axes.set_xticks(np.arange(len(names)), names)
-    label(axes, "", "RMSE of the position (m)")
+    left = f"{len(shown)} of {len(found)} bodies, those with the largest errors"
+    label(axes, left if len(shown) < len(found) else "", "RMSE of the position (m)")
     axes.grid(False, axis="x")
     legend(figure)
     return figure

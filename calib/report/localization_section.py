@@ -48,7 +48,7 @@ def localization(found: list[Localization]) -> list[Block]:
             "note",
         ),
         Picture(
-            "rmse", partial(figures_tracks.rmse_bars, found=found), _told_bars(len(found), figures_tracks.MOST_BARS)
+            "rmse", partial(figures_tracks.rmse_bars, found=found), "RMSE of the position of each body, and the mean."
         ),
     ]
     for one in found[:MOST_TRACKS]:
@@ -68,11 +68,6 @@ def localization(found: list[Localization]) -> list[Block]:
 def file_name(source: str, body: str) -> str:
     """Return what figures of a body in a recording are called."""
     return "".join(c if c.isalnum() else "-" for c in f"{source.removesuffix('.uwb')}-{body}")
-
-
-def _told_bars(count: int, most: int) -> str:
-    left = f" Of {count} bodies those with the largest are drawn; the mean is over all." if count > most else ""
-    return f"RMSE of the position of each body, and the mean.{left}"
 
 
 def _verdict(total: Summary) -> str:

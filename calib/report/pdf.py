@@ -24,15 +24,22 @@ SIZE: Final = 9.5
 SMALL: Final = 8.0
 """The smallest text."""
 
+HEADING_MM: Final = 20.0
 LINE_MM: Final = 5.0
 NUMBER_MM: Final = 12.0
-"""Height of a line of the contents, and width of its page number."""
+"""Heights of a heading and of a line of the contents, and width of its page number."""
 
 NARROW_MM: Final = 20.0
 """Up to this width a column is not made narrower."""
 
 PADDING_MM: Final = 2.4
 """Beside the text of a cell."""
+
+ROW_MM: Final = SMALL * 0.55
+"""Height of a line of a table."""
+
+GAP_MM: Final = 0.4
+"""Above and below the lines of a row."""
 
 FILLS: Final = {
     "lead": (243, 245, 247),
@@ -77,7 +84,7 @@ def _set(document: Document, sizes: Mapping[str, tuple[float, float]]) -> tuple[
             _contents(page, document, placed)
             listed = True
         if isinstance(block, Heading):
-            _heading(page, block, 20 + sizes[following.name][1] if isinstance(following, Picture) else 45)
+            _heading(page, block, _beginning_mm(page, following, sizes))
             placed.sections.append(page.page_no())
         elif isinstance(block, Picture):
             _picture(page, block, captions[block.name], sizes[block.name], placed)
@@ -85,6 +92,20 @@ def _set(document: Document, sizes: Mapping[str, tuple[float, float]]) -> tuple[
             _block(page, block)
     _number_contents(page, placed)
     return page, placed
+
+
+def _beginning_mm(page: FPDF, block: Block | None, sizes: Mapping[str, tuple[float, float]]) -> float:
+    """Return the room that a heading needs for itself and what it must not be parted from."""
+    if isinstance(block, Picture):
+        return HEADING_MM + sizes[block.name][1]
+    whole = _whole_mm(page, block) if isinstance(block, Table) else 0.0
+    return HEADING_MM + (whole or 25.0)
+
+
+def _whole_mm(page: FPDF, table: Table) -> float:
+    """Return the height of a table that is not to be parted: up to half a page, no line broken; 0 of others."""
+    height = (ROW_MM + 2 * GAP_MM) * (len(table.rows) + (2 if table.above else 1))
+    return height if not table.words and height < page.eph / 2 else 0.0
 
 
 def _new(document: Document) -> FPDF:
@@ -237,16 +258,18 @@ def _table(page: FPDF, table: Table) -> None:
     width = min(page.epw, sum(widths))
     page.set_fill_color(255, 255, 255)
     page.set_font(FAMILY, "", SMALL)
+    if page.will_page_break(_whole_mm(page, table)):
+        page.add_page()
     with page.table(
         col_widths=tuple(widths),
         width=width,
         align="LEFT",
         text_align="LEFT" if table.words else ("LEFT", *["RIGHT"] * (len(widths) - 1)),
         borders_layout=TableBordersLayout.HORIZONTAL_LINES,
-        line_height=SMALL * 0.55,
+        line_height=ROW_MM,
         headings_style=FontFace(emphasis="BOLD"),
         num_heading_rows=2 if table.above else 1,
-        padding=0.4,
+        padding=GAP_MM,
     ) as drawn:
         if table.above:
             row = drawn.row()

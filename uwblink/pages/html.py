@@ -62,11 +62,18 @@ def table_html(
     spans = "".join(f"<th colspan='{span}'>{escape(name)}</th>" for name, span in above)
     over = f"<tr class='above'>{spans}</tr>" if spans else ""
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
+    # On a phone cells of words stand below each other, without the row of headings.
+    heads = ["", *header[1:]] if words else [""] * len(header)
     body = []
     for k, row in enumerate(rows):
         last = " class='all'" if total and k == len(rows) - 1 else ""
-        body.append(f"<tr{last}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+        body.append(f"<tr{last}>" + "".join(_cell(cell, heads[j]) for j, cell in enumerate(row)) + "</tr>")
     kind = " ".join(name for name, so in (("many", len(header) > MANY), ("words", words)) if so)
     of_kind = f" class='{kind}'" if kind else ""
     parts = f"<thead>{over}<tr>{head}</tr></thead><tbody>{''.join(body)}</tbody>"
     return f"<div class='wide' tabindex='0'><table{of_kind}>{parts}</table></div>"
+
+
+def _cell(text: str, head: str) -> str:
+    named = f" data-head='{escape(head, quote=True)}'" if head and text else ""
+    return f"<td{named}>{escape(text)}</td>"

@@ -18,8 +18,10 @@ from calib.evaluation.tracking import Settings
 from calib.evaluation.tracking_filters import AT_ONCE, filter_ranges, run_filters
 from calib.evaluation.tracking_problem import Noise, problems
 from calib.evaluation.tracking_runs import Run
+from calib.report.figures_tracks import rmse_bars
 from calib.samples import sample_flight
 from calib.sources import Flight, load_flight
+from uwblink.pages.figures import style
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate
 from uwbsim.simulation.simulated import write
@@ -254,3 +256,13 @@ def test_recordings_of_one_name_keep_their_own_trajectories(tmp_path):
     raw = sorted(path.name for path in tmp_path.glob("*-raw.tum"))
     assert raw == sorted(f"memory-robot{k}{end}-raw.tum" for k in (1, 2, 3) for end in ("", "_2"))
     assert (tmp_path / raw[0]).read_text() != (tmp_path / raw[1]).read_text()
+
+
+def test_bars_say_where_they_leave_bodies_out(flights):
+    found = localize(flights["test1"], fit(flights["train"].ranges).calibration, Settings(seeds=1))
+    with style():
+        (few,), (most,) = (rmse_bars(3.5, some).axes for some in (found, 2 * found))
+    assert few.get_xlabel() == ""
+    assert most.get_xlabel() == "5 of 6 bodies, those with the largest errors"
+    assert len(few.get_xticks()) == 4
+    assert len(most.get_xticks()) == 6

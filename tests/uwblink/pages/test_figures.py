@@ -96,3 +96,9 @@ def test_a_picture_is_on_white():
         return Figure(figsize=(width_in, 1))
 
     assert np.all(imread(io.BytesIO(picture(draw, "png"))) == 1)
+
+
+def test_cells_of_words_say_what_they_are_where_no_heading_is_above_them():
+    words = table_html(["criterion", "met", "asked for"], [["is it <so>?", "yes", ""]], words=True)
+    assert "<td>is it &lt;so&gt;?</td><td data-head='met'>yes</td><td></td>" in words
+    assert "data-head" not in table_html(["pair", "mean"], [["1-2", "3.0"]])
