@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 from calib.cli.arguments import CalibrationFile, Figures, Force, Recordings
 from calib.cli.loading import known_calibration
 from uwblink.cli.guide import add, choice
+from uwblink.cli.starting import keep_imported
 from uwblink.cli.waiting import waiting
 
 PANEL: Final = "Judge"
@@ -61,6 +62,7 @@ def evaluate(
         from calib.report import check_places
 
         check_places(report, None, figures, force=force)
+        keep_imported()
     known = known_calibration(calibration)
     with waiting("evaluating"):
         parts = load_each(recordings, need_power=known.needs_power)

@@ -32,6 +32,7 @@ from calib.cli.evaluating import PANEL, command_line, tell_seen
 from calib.cli.flags import with_flags
 from calib.cli.loading import STOPPED
 from uwblink.cli.guide import add
+from uwblink.cli.starting import keep_imported
 
 MANY: Final = "--tests"
 
@@ -106,6 +107,7 @@ def report(
         constants=constants,
     )
     check_places(output, pdf, figures, force=force)
+    keep_imported()
     with Console(file=sys.stderr).status("loading") as status:
         campaign = calib.run_campaign(
             recordings,
