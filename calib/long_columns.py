@@ -131,6 +131,14 @@ def picked(column: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
     return _kept(column, rows) if rows.dtype == bool else _gathered(column, rows)
 
 
+def few(rows: NDArray[Any], *columns: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield rows from all over each column (n,), which lie on most of its pages: one column at a time is in memory."""
+    for column in columns:
+        found = column[rows]
+        let_go(column)
+        yield found
+
+
 def _count(rows: NDArray[Any] | slice, length: int) -> int:
     """Return how many rows are chosen of a column of a length."""
     if isinstance(rows, slice):

@@ -227,6 +227,10 @@ class Design:
             let_go(column)
         return Design(values, order, np.append(starts[:-1][there], len(keep)), self.columns[there], self.turn)
 
+    def without_rows(self) -> Design:
+        """Return a matrix of the same columns, with nothing in it."""
+        return Design(np.empty((len(self.values), 0)), None, np.zeros(1, np.int64), self.columns[:0], self.turn)
+
     def blocked(self, place: Ints) -> Design:
         """Return the same matrix, with one place of given rows (n,) in each block."""
         kept = self.kept(place)

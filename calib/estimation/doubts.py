@@ -177,7 +177,12 @@ def _confounded(problem: Problem, found: Solved) -> list[str]:
         return []
     if problem.design.shape[1] != found.scores.design.shape[1] or not np.ptp(problem.ranges.truth_m) > 0:
         return []
-    far = found.scores.design.kept(problem.ranges.truth_m - np.median(problem.ranges.truth_m))
+    problem.let_go()
+    found.scores.let_go()
+    truth_m = problem.ranges.truth_m
+    middle = np.median(truth_m)
+    far = found.scores.design.kept(computed(len(truth_m), lambda rows: truth_m[rows] - middle))
+    let_go(truth_m)
     link = found.scores.linked(far, *everywhere(found.scores))[0]
     taken = link @ found.inverse
     own = sum(float(found.scores.known(rows) @ far[rows] ** 2) for rows in spans(len(far)))

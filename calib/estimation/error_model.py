@@ -17,7 +17,7 @@ from calib.estimation.mixture_slopes import Errors
 from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
 from calib.estimation.persistence import lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
-from calib.long_columns import let_go, picked, spans
+from calib.long_columns import few, let_go, picked, spans
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 
@@ -210,8 +210,10 @@ def _put_right(model: ErrorModel, problem: Problem, residual_m: Floats) -> Error
     rows = np.linspace(0, len(residual_m) - 1, min(JUDGED, len(residual_m))).astype(np.int64)
     if len(rows) < FEWEST_JUDGED:
         return model
-    error, ranges = residual_m[rows], problem.ranges
-    shapes = model.shapes(problem.lifted[rows], ranges.initiator[rows], ranges.target[rows])
+    ranges = problem.ranges
+    problem.let_go()
+    error, lifted, first, second = few(rows, residual_m, problem.lifted, ranges.initiator, ranges.target)
+    shapes = model.shapes(lifted, first, second)
     level = np.quantile(model.below(error, shapes), LEVELS)
     away = error - model.mean_m(shapes)
     reach = BEYOND_MEANS * (model.least_m + shapes.detour_m)

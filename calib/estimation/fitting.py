@@ -145,6 +145,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         problem, ended = problem.without_design(), found.ended
         del found
         residuals, inliers = _left(calibration, ranges)
+        columns = residuals, inliers, *(getattr(ranges, name) for name in COLUMNS)
         warnings = [
             *limits(ranges, problem, residuals, fixed),
             *_stopped(ended),
@@ -154,11 +155,14 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             *_beyond(reference, alpha_dbm, problem),
             *warnings_of(ranges, float(np.mean(inliers)), problem.free),
         ]
+        problem.let_go()
+        let_go(*columns)
         provenance = _provenance(ranges, inliers, fixed, sequential, problem, ended, warnings, reference)
         provenance["error_std_m"] = {
             "raw": std_of(computed(len(ranges), lambda rows: ranges.raw_m[rows] - ranges.truth_m[rows])),
             "corrected": std_of(residuals),
         }
+        let_go(*columns)
         return FitResult(
             calibration=replace(calibration, provenance=provenance),
             ranges=ranges,

@@ -134,7 +134,10 @@ def one_way(ranges: Ranges) -> Iterator[str]:
 def _parts(error: Floats, key: Ints) -> dict[int, Floats]:
     """Return errors (n,) apart by their keys (n,)."""
     sizes = np.bincount(key)
-    several = picked(error, stable_order(key))
+    let_go(error)
+    order = stable_order(key)
+    let_go(key)
+    several = picked(error, order)
     return dict(enumerate(np.split(several, np.cumsum(sizes)[:-1])))
 
 
