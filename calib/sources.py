@@ -215,6 +215,11 @@ def _recording(data: str | os.PathLike[str] | Recording) -> AbstractContextManag
     return nullcontext(data) if isinstance(data, Recording) else Recording.open(data, memory_mb=READING_MB)
 
 
+def held_open(data: Data) -> AbstractContextManager[Data]:
+    """Return a context in which a file is open, for those who read it more than once; raises what opening it raises."""
+    return _recording(data) if isinstance(data, str | os.PathLike) else nullcontext(data)
+
+
 def fingerprint(exchanges: Exchanges) -> str:
     """Return what tells exchanges from all others, whatever their file is called: a hash of their times and ranges."""
     found = sha256()
@@ -274,5 +279,5 @@ def require_times(ranges: Ranges) -> None:
 
 def load_flight(data: Data, *, need_power: bool = True) -> Flight:
     """Return a recording's ranges with its poses; raises what `load_ranges` raises."""
-    with opened(data) as (_, source):
-        return Flight(load_ranges(data, need_power=need_power), source.poses, list(source.tags))
+    with held_open(data) as held, opened(held) as (_, source):
+        return Flight(load_ranges(held, need_power=need_power), source.poses, list(source.tags))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +27,7 @@ from calib.evaluation.statistics import Evaluation, evaluate
 from calib.evaluation.tracking import Localization
 from calib.ranges import Ranges, concatenate
 from calib.report.origin import Origin, origin_of
-from calib.sources import Data, each, load_each, opened
+from calib.sources import Data, each, held_open, load_each, opened
 
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
 """Scales of the loss, over the chosen one, for which a campaign is fitted again."""
@@ -153,28 +154,29 @@ def run_campaign(
     >>> campaign.evaluation.overall.full.n
     300
     """
-    recordings = each(training)
-    judged = each(tests) if tests else []
+    given = each(training), each(tests) if tests else []
     progress("loading")
-    need_power = not settings.get("delays_only", False)
-    fitted = load_each(recordings, trim_static=trim_static, need_power=need_power)
-    testing = load_each(judged, need_power=need_power) if judged else []
-    progress("fitting")
-    found = fit(concatenate(fitted), **settings)
-    refits = _refits(concatenate(fitted), found.calibration, settings)
-    progress("examining")
-    findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
-    progress("localizing")
-    return Campaign(
-        training=fitted,
-        tests=testing,
-        fit=found,
-        refits=refits,
-        heard=_heard(recordings, found.calibration),
-        findings=findings,
-        tracks=_tracks(judged or recordings, found.calibration),
-        origin=origin_of([*recordings, *judged], command),
-    )
+    with ExitStack() as stack:
+        recordings, judged = ([stack.enter_context(held_open(one)) for one in some] for some in given)
+        need_power = not settings.get("delays_only", False)
+        fitted = load_each(recordings, trim_static=trim_static, need_power=need_power)
+        testing = load_each(judged, need_power=need_power) if judged else []
+        progress("fitting")
+        found = fit(concatenate(fitted), **settings)
+        refits = _refits(concatenate(fitted), found.calibration, settings)
+        progress("examining")
+        findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
+        progress("localizing")
+        return Campaign(
+            training=fitted,
+            tests=testing,
+            fit=found,
+            refits=refits,
+            heard=_heard(recordings, found.calibration),
+            findings=findings,
+            tracks=_tracks(judged or recordings, found.calibration),
+            origin=origin_of([*given[0], *given[1]], command),
+        )
 
 
 def _refits(ranges: Ranges, calibration: Calibration, settings: FitSettings) -> dict[float, Calibration]:

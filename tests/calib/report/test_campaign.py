@@ -26,9 +26,23 @@ def recordings(tmp_path_factory):
     return folder
 
 
-def test_it_is_what_the_command_makes(recordings, tmp_path):
+@pytest.fixture
+def opened(monkeypatch):
+    """The names of recordings, as they are opened."""
+    names, whole = [], Recording.open
+
+    def noted(path, **kwargs):
+        names.append(path.name)
+        return whole(path, **kwargs)
+
+    monkeypatch.setattr(Recording, "open", noted)
+    return names
+
+
+def test_it_is_what_the_command_makes(recordings, tmp_path, opened):
     told: list[str] = []
     campaign = calib.run_campaign(recordings / "train.uwb", recordings / "test.uwb", loss="huber", progress=told.append)
+    assert opened == ["train.uwb", "test.uwb"], "each is opened once, and looked at whole whenever it is opened"
     campaign = replace(campaign, origin=replace(campaign.origin, files={}))
     campaign.write(tmp_path / "python.html")
     words = ["report", "train.uwb", "--tests", "test.uwb", "-o", "command.html", "--loss", "huber", "--json"]
