@@ -11,7 +11,8 @@ import pytest
 FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --hide-scrollbars"
 MEASURE = """<script>
 const wide = [...document.querySelectorAll('body *')].filter(e => e.getClientRects().length &&
-  e.getBoundingClientRect().right > innerWidth + 1 && !e.closest('.wide, pre, svg')).map(e => e.outerHTML.slice(0, 80));
+  e.getBoundingClientRect().right > innerWidth + 1 && (e.closest('table.words') || !e.closest('.wide, pre, svg')))
+  .map(e => e.outerHTML.slice(0, 80));
 const text = [...document.querySelectorAll('p, td, th, li, figcaption, h2')].filter(e => e.getClientRects().length)
   .map(e => parseFloat(getComputedStyle(e).fontSize));
 const drawn = [...document.querySelectorAll('figure svg')].filter(e => e.getClientRects().length).flatMap(svg =>

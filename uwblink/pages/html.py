@@ -62,8 +62,8 @@ def table_html(
     spans = "".join(f"<th colspan='{span}'>{escape(name)}</th>" for name, span in above)
     over = f"<tr class='above'>{spans}</tr>" if spans else ""
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
-    # On a phone cells of words stand below each other, without the row of headings.
-    heads = ["", *header[1:]] if words else [""] * len(header)
+    # On a phone cells of words stand below each other, without the row of headings; one alone needs no name.
+    heads = ["", *header[1:]] if words and len(header) > 2 else [""] * len(header)
     body = []
     for k, row in enumerate(rows):
         last = " class='all'" if total and k == len(rows) - 1 else ""

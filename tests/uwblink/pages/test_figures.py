@@ -81,7 +81,7 @@ def test_a_page_lies_well(width, tmp_path):
     parts = [
         both_widths(two_panels, "A caption. " * 12, "two"),
         table_html(header, [["1-2", *("12345.6" for _ in range(20))]] * 3),
-        table_html(["what", "is"], [["a question " * 9, "an answer " * 9]], words=True),
+        table_html(["what", "is"], [["a question " * 9, "an answer " * 9], ["file", "0a" * 32]], words=True),
         f"<p class='bad'>{'word ' * 60}{'x' * 90}</p><pre>{'y' * 300}</pre>",
     ]
     lies_well(page_html("A page", parts), width, tmp_path)
@@ -101,4 +101,5 @@ def test_a_picture_is_on_white():
 def test_cells_of_words_say_what_they_are_where_no_heading_is_above_them():
     words = table_html(["criterion", "met", "asked for"], [["is it <so>?", "yes", ""]], words=True)
     assert "<td>is it &lt;so&gt;?</td><td data-head='met'>yes</td><td></td>" in words
-    assert "data-head" not in table_html(["pair", "mean"], [["1-2", "3.0"]])
+    assert "data-head" not in table_html(["file", "what"], [["a.uwb", "SHA-256"]], words=True)
+    assert "data-head" not in table_html(["pair", "mean", "std"], [["1-2", "3.0", "1.0"]])
