@@ -216,7 +216,9 @@ def require_some(source: str, count: int, excluded: Mapping[str, int], why_no_tr
         return
     most = max(excluded, key=lambda reason: excluded[reason])
     hints = {
-        "no true distance": why_no_truth or "it needs poses and lever arms, or measured distances",
+        "no true distance": why_no_truth
+        or "it needs poses and lever arms (`uwblink poses`), or measured "
+        "distances (gt_range_m of a table); without any see `calib survey`, or `calib fit --truth ranges`",
         "no power": "a calibration without a curve needs none: `calib fit --delays-only` makes one",
         "a tag with itself": "look at from_id and to_id of what was imported",
     }

@@ -120,6 +120,12 @@ def test_links_that_cannot_be(tmp_path):
     assert (tmp_path / "p.csv").read_text() == "mine"
 
 
+def test_a_server_says_how_to_record_what_it_serves(tmp_path):
+    said = run("uwbsim", "serve", BENCH, "--link-dir", tmp_path / "ports", "--duration", 0.1)
+    assert said.stdout.startswith("tag  10  ")
+    assert f"uwblink record {tmp_path / 'ports'}/* --pairs all -o flight.uwb" in said.stderr
+
+
 def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
     from uwblink.boards.pseudo_terminals import Terminal
     from uwblink.errors import PortError

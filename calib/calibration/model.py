@@ -175,11 +175,13 @@ class Calibration(CalibrationContent):
 
 def require_calibration(value: object, parameter: str = "calibration") -> None:
     """Raise `BadInputError` where an argument is no `Calibration`."""
-    if not isinstance(value, Calibration):
-        raise BadInputError(
-            f"found {value!r:.60}, expected a Calibration; `load_calibration` reads one from a file",
-            parameter=parameter,
-        )
+    if isinstance(value, Calibration):
+        return
+    # What a fit or a survey returns is easily taken for its calibration, and its repr is a page long.
+    has_one = isinstance(getattr(value, "calibration", None), Calibration)
+    remedy = "give its `.calibration`" if has_one else "`load_calibration` reads one from a file"
+    seen = repr(value) if isinstance(value, str | os.PathLike) else type(value).__name__
+    raise BadInputError(f"found {seen:.60}, expected a Calibration; {remedy}", parameter=parameter)
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:

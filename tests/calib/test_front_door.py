@@ -3,6 +3,7 @@
 import doctest
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
@@ -72,6 +73,14 @@ def test_what_is_no_calibration_is_refused_by_its_parameter(wrong, tmp_path):
             call()
         assert caught.value.parameter in ("calibration", "second"), name
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fit_given_for_its_calibration_is_told_so():
+    flight = calib.sample_flight()
+    result: Any = calib.fit(flight)
+    with pytest.raises(calib.BadInputError) as caught:
+        calib.evaluate(flight, result)
+    assert str(caught.value) == "`calibration`: found FitResult, expected a Calibration; give its `.calibration`"
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,7 @@ def test_exchanges_with_their_distances_need_no_poses():
     assert_same(Ranges.from_exchanges(flight.exchanges, truth), load_ranges(flight))
     with pytest.raises(BadInputError, match=r"`truth_m`: has shape \(3,\)"):
         Ranges.from_exchanges(flight.exchanges, np.zeros(3))
-    with pytest.raises(UnanswerableError, match="it needs poses and lever arms, or measured distances"):
+    with pytest.raises(UnanswerableError, match=r"it needs poses and lever arms \(`uwblink poses`\), or measured"):
         load_ranges(flight.exchanges)
 
 

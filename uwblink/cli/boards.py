@@ -74,7 +74,10 @@ def ports(
         print_json(rows)
         return
     if not rows:
-        typer.echo("no serial device with the boards' USB identity (0483:5740) is plugged in")
+        typer.echo(
+            "no serial device with the boards' USB identity (0483:5740) is plugged in; "
+            "boards at other devices are named as they are, and `uwbsim serve` makes simulated ones"
+        )
     for row in rows:
         said = f"board {row['board']}" if "board" in row else row.get("error", row["description"])
         typer.echo(f"{row['device']}  {said}")

@@ -13,6 +13,10 @@ HEADER_BYTES: Final = 3 * 4096
 BLOCK_BYTES: Final = 16_384
 """Smallest block of a DuckDB file; every larger one is a multiple of it."""
 
+_TABLES: Final = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".jsonl", ".ndjson")
+IMPORTED_AS: Final = {**dict.fromkeys(_TABLES, "csv"), **dict.fromkeys((".bag", ".mcap", ".db3"), "bag")}
+"""Endings of other people's files, and the importer that reads them."""
+
 
 def is_locked(path: Path, *, update: bool) -> bool:
     """Whether another process holds the lock that DuckDB takes on a file it writes, or reads."""
@@ -32,7 +36,14 @@ def is_locked(path: Path, *, update: bool) -> bool:
 
 def damaged(path: Path, error: Exception) -> RecordingError:
     """Return what to raise for a file that DuckDB cannot open."""
-    return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({first_line(error)})")
+    return _no_recording(path, first_line(error))
+
+
+def _no_recording(path: Path, seen: str) -> RecordingError:
+    form = IMPORTED_AS.get(path.suffix.lower())
+    if form:
+        return RecordingError(f"{path}: is no recording yet; `uwblink import {form}` makes one of it")
+    return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({seen})")
 
 
 def log_of(path: Path) -> Path:
@@ -56,4 +67,4 @@ def check_length(path: Path) -> None:
     if log.exists() and log.stat().st_size:
         return
     if path.stat().st_size % BLOCK_BYTES != HEADER_BYTES % BLOCK_BYTES:
-        raise RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one (its length is odd)")
+        raise _no_recording(path, "its length is odd")

@@ -119,6 +119,9 @@ def serve(
     try:
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")
+        ports = f"{link_dir}/*" if link_dir else " ".join(server.names.values())
+        until = "Ctrl-C ends it" if duration is None else f"for {duration:g} s"
+        typer.echo(f"served, {until}; to record: uwblink record {ports} --pairs all -o flight.uwb", err=True)
         server.announce(typer.echo)
         if poses:
             server.write_poses(poses)

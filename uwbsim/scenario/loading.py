@@ -17,7 +17,7 @@ from uwblink.text_files import read_text
 from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
 from uwbsim.scenario.linked_files import fill_in
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.shipped import found
+from uwbsim.scenario.shipped import found, nearest
 
 NO_FILE: Final = Path("scenario")
 """What messages name where a scenario has no file."""
@@ -79,8 +79,14 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
         return deepcopy(dict(source)), NO_FILE
     if isinstance(source, str) and "\n" in source:
         return _toml(source, NO_FILE), NO_FILE
+    if not isinstance(source, str | os.PathLike):
+        seen = type(source).__name__
+        raise ParameterError(
+            f"found {seen}, expected a path, a name, TOML text, tables or a Scenario", parameter="source"
+        )
     path = found(Path(source))
-    return _toml(read_text(path, ScenarioError, "scenario file (.toml) or name (see uwbsim scenarios)"), path), path
+    what = f"scenario file (.toml) or name{nearest(path)} (see uwbsim scenarios)"
+    return _toml(read_text(path, ScenarioError, what), path), path
 
 
 def _toml(text: str, path: Path) -> dict[str, Any]:

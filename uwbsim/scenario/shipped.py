@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 import tomllib
@@ -49,6 +50,14 @@ def found(path: Path) -> Path:
     if os.path.exists(path) or path.is_absolute():  # False, where Path.exists raises: for want of permission
         return path
     return shipped_scenarios().get(path.as_posix().removesuffix(SUFFIX), path)
+
+
+def nearest(path: Path) -> str:
+    """Return `, did you mean ...?` with the shipped scenarios that a path could stand for; nothing where none is."""
+    plain, known = path.as_posix().removesuffix(SUFFIX), list(shipped_scenarios())
+    parts = [name for name in known if plain in name.split("/")]
+    near = [] if os.path.lexists(path) else parts or difflib.get_close_matches(plain, known, 2)
+    return f", did you mean {' or '.join(near)}?" if near else ""
 
 
 def title(path: Path) -> str:

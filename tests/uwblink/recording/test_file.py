@@ -156,6 +156,15 @@ def test_a_damaged_file_with_the_word_lock_in_its_path_is_damaged(recording, tmp
         Recording.open(path)
 
 
+@pytest.mark.parametrize(("name", "command"), [("t.csv", "csv"), ("t.csv.gz", "csv"), ("t.MCAP", "bag")])
+@pytest.mark.parametrize("size", [100, 3 * 4096 + 16384])  # odd, and that of a database
+def test_a_table_given_for_a_recording_is_told_how_to_become_one(tmp_path, name, command, size):
+    path = tmp_path / name
+    path.write_bytes(b"a" * size)
+    with pytest.raises(RecordingError, match=f"{name}: is no recording yet; `uwblink import {command}` makes one"):
+        Recording.open(path)
+
+
 def test_a_recording_that_this_program_is_writing_says_so(tmp_path):
     with (
         Recording.create(tmp_path / "live.uwb", live=True),

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[3]
 COMMANDS: Any = typer.main.get_command(app)
 OPTIONS = {"/".join(p.opts) for command in COMMANDS.commands.values() for p in command.params}
 # Of functions that no command calls with what a user typed.
-ONLY_FROM_PYTHON = {"effect", "name", "evaluate", "lost_share"}
+ONLY_FROM_PYTHON = {"effect", "source", "name", "evaluate", "lost_share"}
 
 
 def test_every_parameter_that_an_error_names_has_its_flag():

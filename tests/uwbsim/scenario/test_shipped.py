@@ -2,6 +2,7 @@
 
 import doctest
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,14 @@ def test_a_name_does_for_a_file_where_there_is_none(tmp_path, monkeypatch):
     assert uwbsim.load("noiseless.toml").run.seed != uwbsim.load("noiseless").run.seed
     with pytest.raises(uwbsim.ScenarioError, match=r"no such scenario file \(\.toml\) or name"):
         uwbsim.load("icra2024/train")
+    for wrong, near in (("icra2023/tset1", "icra2023/test1 or"), ("hall.toml", "hall_with_metal/hall or lasting")):
+        with pytest.raises(uwbsim.ScenarioError, match=f"or name, did you mean {near}"):
+            uwbsim.load(wrong)
+    with pytest.raises(uwbsim.ScenarioError, match=r"or name \(see uwbsim scenarios\)"):
+        uwbsim.load("flight.uwb")
+    number: Any = 3
+    with pytest.raises(uwbsim.UwbsimError, match="`source`: found int, expected a path, a name"):
+        uwbsim.simulate(number)
 
 
 def test_a_sweep_may_name_one(tmp_path):
