@@ -38,12 +38,17 @@ def _sines(seed: int, **more: Any) -> Any:
     return flight(seed=seed, **(ERRING | more))
 
 
-def scenario(name: str, seed: int, seconds: float) -> Any:
-    """Simulate a scenario with another seed for so long, each body with an inertial sensor."""
+def scenario(name: str, seed: int, seconds: float, *, alike: bool = False) -> Any:
+    """Simulate a scenario with another seed for so long, each body with an inertial sensor.
+
+    With `alike` all tags send as strongly as each other, and read powers right.
+    """
     table = tomllib.loads((ROOT / "scenarios" / name).read_text(encoding="utf-8"))
     table["run"] |= {"seed": seed, "duration_s": seconds}
     for body in table["bodies"]:
         body["imu"] = IMU
+    for tag in table["tags"] if alike else ():
+        tag |= {"tx_power_db": 0.0, "power_offset_db": 0.0}
     return uwbsim.simulate(table)
 
 

@@ -28,6 +28,7 @@ from calib.estimation.limits import limits
 from calib.estimation.losses import MIXTURE
 from calib.estimation.pairs import pairs_of
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible
+from calib.estimation.power_levels import unlike_powers
 from calib.estimation.problem import Problem
 from calib.estimation.result import FitResult
 from calib.estimation.solver import Ended, Solved, solve
@@ -152,6 +153,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             *doubted.sentences,
             *skewed,
             *implausible(calibration.delays_ns, residuals),
+            *unlike_powers(ranges, calibration),
             *_beyond(reference, alpha_dbm, problem),
             *warnings_of(ranges, float(np.mean(inliers)), problem.free),
         ]

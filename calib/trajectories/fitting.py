@@ -22,6 +22,7 @@ from calib.estimation.building import build_problem
 from calib.estimation.limits import limits
 from calib.estimation.losses import MIXTURE
 from calib.estimation.plausibility import implausible, one_way
+from calib.estimation.power_levels import unlike_powers
 from calib.estimation.problem import Problem
 from calib.estimation.result import FitResult
 from calib.estimation.stating import calibration_of
@@ -221,6 +222,7 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, riv
         *found.doubts,
         *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
+        *unlike_powers(ranges, calibration),
         *warnings_of(ranges, float(np.mean(inliers)), []),
     ]
     provenance = _provenance(climbed, problem, found, asked) | {

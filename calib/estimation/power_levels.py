@@ -1,0 +1,98 @@
+"""Tags that read or send powers unlike the others: what that puts into their delays, and ranges do not show.
+
+At the ends of a link a frame and its answer take the same way, so what differs is the tags' own: how strongly one sends
+and how high it reads. Only the sum is seen. A tag that reads powers too high has its ranges corrected as stronger ones
+are, and its delay takes what that is on average: right for its ranges, not for its antenna.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import lifted_power
+from calib.estimation.plausibility import MEDIAN
+from calib.ranges import Ranges
+from calib.spread import robust_spread
+from uwblink.arrays import Floats
+from uwblink.ticks import SPEED_OF_LIGHT
+
+ENOUGH: Final = 20_000
+"""Of more ranges, only every so many are looked at."""
+
+FEWEST: Final = 20
+"""Ranges a pair by which its levels are told."""
+
+ALIKE_DB: Final = 0.5
+"""Levels of tags that differ by less are taken for the same; medians of a pair's ranges are known to a tenth of it."""
+
+SURELY: Final = 4.0
+"""Standard errors beyond which levels differ; readings of one place come together, so that these are a little small."""
+
+SMALLEST_NS: Final = 0.02
+NORMAL95: Final = 1.96
+
+
+def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
+    """Name tags whose powers are unlike those of the others, so much that their delays may hold more than they say."""
+    each_ns = _ns_a_decibel(ranges, calibration)
+    unlike = {}
+    for tag, (level, std) in power_levels_db(ranges).items():
+        half_ns = NORMAL95 * calibration.delays_std_ns.get(tag, 0.0)
+        if (
+            half_ns > 0
+            and abs(level) > max(ALIKE_DB, SURELY * std)
+            and abs(level) * each_ns > max(half_ns, SMALLEST_NS)
+        ):
+            unlike[tag] = level
+    if unlike:
+        named = ", ".join(f"{tag} ({level:+.1f} dB)" for tag, level in unlike.items())
+        held_ps = 1e3 * each_ns * max(map(abs, unlike.values()))
+        yield (
+            f"powers of tag{'s' * (len(unlike) > 1)} {named} stand apart from the others': they are read so, or sent "
+            f"the other way; a delay holds what its tag reads wrongly, up to {held_ps:.0f} ps here, which is right for "
+            "ranges and not for the antenna"
+        )
+
+
+def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
+    """Return by how much each tag reads powers higher, less how much more strongly it sends, than most others.
+
+    In dB, each with its standard error; tags of which no pair has enough ranges with both powers are left out.
+    """
+    step = max(len(ranges) // ENOUGH, 1)
+    # The initiator reads what the target sent, and the target what the initiator sent.
+    apart = ranges.fpp2_dbm[::step] - ranges.fpp1_dbm[::step]
+    known = np.isfinite(apart)
+    both = np.column_stack([ranges.initiator[::step], ranges.target[::step]])[known]
+    ends, number, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
+    enough = np.flatnonzero(count >= FEWEST)
+    if not len(enough):
+        return {}
+    parts = [apart[known][number.ravel() == k] for k in enough]
+    tags = np.unique(ends[enough])
+    rows = np.subtract(*(np.equal.outer(ends[enough, end], tags).astype(float) for end in (0, 1)))
+    inverse = np.linalg.pinv(rows)
+    std = np.array([MEDIAN * robust_spread(part) / np.sqrt(len(part)) for part in parts])
+    levels: Floats = inverse @ np.array([np.median(part) for part in parts])
+    near = np.abs(np.subtract.outer(levels, levels)) < ALIKE_DB
+    levels -= levels[near[np.argmax(near.sum(axis=1))]].mean()
+    spreads = np.sqrt(inverse**2 @ std**2)
+    return dict(zip(tags.tolist(), zip(levels.tolist(), spreads.tolist(), strict=True), strict=True))
+
+
+def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:
+    """Return what a delay takes, in ns, where its tag reads powers a decibel too high: at one end of a range of two."""
+    step = max(len(ranges) // ENOUGH, 1)
+    powers = ranges.fpp1_dbm[::step], ranges.fpp2_dbm[::step]
+    lifted = [
+        lifted_power(*both, calibration.lift, calibration.alpha_dbm)
+        for both in (powers, (powers[0] + 1, powers[1]), (powers[0], powers[1] + 1))
+    ]
+    known = np.all(np.isfinite(lifted), axis=0)
+    at, first, second = (float(np.mean(calibration.bias_curve(power[known]))) for power in lifted)
+    # A range has half of either end's delay.
+    return abs(0.5 * (first + second) - at) / (0.5 * SPEED_OF_LIGHT) * 1e9
