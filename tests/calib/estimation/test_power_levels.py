@@ -66,7 +66,7 @@ def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
     assert said.startswith("powers of tag 3 (+2.0 dB) stand apart")
     held_ps = float(re.search(r"up to (\d+) ps", said)[1])
     away = np.array([result.calibration.delays_ns[tag] - delay for tag, delay in DELAYS_NS.items()])
-    # A shift common to all is the curve's constant, so the other three are the reference; a fifth for how the curve bends.
+    # A shift common to all is the curve's constant, so the others are the reference; a fifth for how the curve bends.
     of_three = abs(away[2] - np.mean(np.delete(away, 2)))
     assert 1e3 * of_three == pytest.approx(held_ps, rel=0.2)
     assert held_ps > 50
