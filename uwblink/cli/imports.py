@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -67,7 +68,8 @@ def guess(
         typer.echo(found.text, nl=False)
         return
     write_text(output, found.text, force=force)
-    typer.echo(f"{output}: {'import with --map' if found.complete else 'fill in what is missing, then import'}")
+    then = f"uwblink import csv {quote(str(table))} --map {quote(str(output))} -o {quote(table.name.split('.')[0])}.uwb"
+    typer.echo(f"{output}: {'look at it' if found.complete else 'fill in what is missing'}, then {then}")
 
 
 def _with_map(row: Importer) -> Any:

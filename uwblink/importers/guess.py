@@ -17,7 +17,7 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, EVENT, ISO, LAYOUTS, POSITIONS, STAMP_UNITS
+from uwblink.importers.column_map import DISTANCE_UNITS, DISTANCES, EVENT, ISO, LAYOUTS, STAMP_UNITS
 from uwblink.importers.guess_columns import OF_MESSAGES, named_columns, placed, stamp_and_event
 from uwblink.importers.stamps import how_counted, stamps_of
 from uwblink.importers.table import Table
@@ -72,8 +72,12 @@ def guess_map(path: Path) -> Guess:
     lines += ["", f"# not used: {', '.join(map(json.dumps, left))[:300]}"] if left else []
     lacking = [name for name in _NEEDED[layout] if name not in cells or not np.isfinite(cells[name]).any()]
     lines += [f"# a column of numbers is still needed: {', '.join(lacking)}"] if lacking else []
+    mixed = _distance_units(columns)
+    lines += [f"# distances have one unit for all, here they have {', '.join(sorted(mixed))}: convert some"] * (
+        len(mixed) > 1
+    )
     lines += ["# what was programmed into the devices is not in the table: [antenna_delays] says it"]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking)
+    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2)
 
 
 _NEEDED: Final = {
@@ -118,7 +122,8 @@ def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str)
         why = "whole numbers" if whole else "not whole numbers"
         return [f"bits = {bits}", f'counter = "{counter}"'], [f'stamps = "{unit}"  # {why}']
     units = [u for u in ended if u] or (["ticks", "ns", "us", "s", "ps"] if whole else ["ns", "us", "s", "ps", "ticks"])
-    trials = [trial for unit in units for trial in _trials(stamps, cells, unit)]
+    metres = DISTANCE_UNITS[min(_distance_units(columns), default="m")]
+    trials = [trial for unit in units for trial in _trials(stamps, cells, unit, metres)]
     unit, counter, best = max(trials, key=lambda found: round(found[2].plausible, 2))
     sure = best.plausible >= CLEARLY
     share = f"{100 * best.plausible:.0f} % of its ranges are plausible, {best.low_m:.3g} to {best.high_m:.3g} m"
@@ -131,13 +136,15 @@ def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str)
     return lines, [f'stamps = "{unit}"  # {why}']
 
 
-def _trials(stamps: dict[str, Floats], cells: dict[str, Floats], unit: str) -> list[tuple[str, str, Trial]]:
+def _trials(
+    stamps: dict[str, Floats], cells: dict[str, Floats], unit: str, metres: float
+) -> list[tuple[str, str, Trial]]:
     chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE]
     if not len(chosen):
         raise ImportTableError("its stamps are no numbers in any row")
     sampled = {name: column[chosen] for name, column in stamps.items()}
     bits, counter = how_counted({n: c * STAMP_UNITS[unit] for n, c in sampled.items()}, None, None)
-    truth = cells["gt_range_m"][chosen] if "gt_range_m" in cells else np.full(len(chosen), np.nan)
+    truth = cells["gt_range_m"][chosen] * metres if "gt_range_m" in cells else np.full(len(chosen), np.nan)
     sample = Sample(sampled, np.zeros(len(chosen), dtype=np.int64), truth, STAMP_UNITS[unit])
     names = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
     names = [name for name in names if name not in ("ss-cfo", "ds-sym")] or ["ss"]
@@ -149,11 +156,16 @@ def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:
     if "time_s" in columns:
         unit, why = _time_unit(columns["time_s"], cells["time_s"])
         lines.append(f'time = "{unit}"  # {why}')
-    distances = [n for n in ("range_m", "gt_range_m", *POSITIONS) if n in columns]
-    units = {_suffix(columns[name], DISTANCE_UNITS) for name in distances} - {None}
+    units = _distance_units(columns)
     if len(units) == 1 and units != {"m"}:
         lines.append(f'distance = "{units.pop()}"  # by the columns\' names')
     return lines
+
+
+def _distance_units(columns: dict[str, str]) -> set[str]:
+    """Return the units that columns of ranges, true distances and positions are called after."""
+    ended = (_suffix(columns[name], DISTANCE_UNITS) for name in DISTANCES if name in columns)
+    return {unit for unit in ended if unit}
 
 
 def _time_unit(header: str, values: Floats) -> tuple[str, str]:

@@ -10,58 +10,14 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.importers.column_map import EVENT, POSITIONS
+from uwblink.importers.guess_words import END, PATTERNS, numbered, plain
 from uwblink.importers.table import Table
 from uwblink.importers.trials import CLEARLY
 from uwblink.twr import STAMPS
 
-_END: Final = r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|dbm|db|ppm))*"
-_ID: Final = r"(_?(id|addr|address|mac|name))?"
-_RANGE: Final = r"(range|dist|distance)"
-_FROM: Final = r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)"
-_TO: Final = r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)"
-
-
-def _place(name: str) -> str:
-    """Return what columns of one of `POSITIONS` are called: `tag_x`, `anchor_pos_x_m`, `x_tag`, `x1`; `x` is whose?
-
-    A single `x` is that of the initiator, which moves where anchors are called so.
-    """
-    (end, axis), (number, words) = name.split("_")[:2], ("1", _FROM) if name.startswith("from") else ("2", _TO)
-    true, place = r"((gt|true|truth|ground_?truth|mocap|ref)_?)?", r"(pos(ition)?|loc(ation)?|place|p)?"
-    forms = [rf"{true}{words}_?{place}_?{axis}", rf"{true}{place}_?{axis}_?({words}|{number})", rf"p{number}_?{axis}"]
-    forms += [rf"{true}{place}_?{axis}"] if end == "from" else []
-    return "|".join(forms)
-
-
-_PATTERNS: Final = {
-    "time_s": r"(ros_?|host_?|unix_?|utc_?)?(time|timestamp|stamp|t|datetime|date|epoch)(_(utc|iso))?",
-    "from_id": rf"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|id_?from|id_?1){_ID}",
-    "to_id": rf"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|id_?to|id_?2){_ID}",
-    "tx1": r"(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
-    "rx1": r"(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
-    "tx2": r"(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
-    "rx2": r"(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
-    "tx3": r"(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
-    "rx3": r"(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
-    "fpp1": r"(fpp?|fp_?power|first_?path(_?power)?)_?1",
-    "fpp2": r"(fpp?|fp_?power|first_?path(_?power)?)_?2?",
-    "rxp1": r"(rxp|rx_?power|rssi|total_?power|pr)_?1",
-    "rxp2": r"(rxp|rx_?power|rssi|total_?power|pr)_?2?",
-    "skew1": r"(skew|cfo|carrier|clock_?offset)_?1",
-    "skew2": r"(skew|cfo|carrier|clock_?offset)_?2?",
-    "gt_range_m": rf"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|actual)_?{_RANGE}|ground_?truth",
-    "range_m": rf"(device_?|measured?_?|uwb_?|est(imated)?_?)?{_RANGE}",
-    "sequence": r"(seq|sequence)(_?(no|num|nr|number|id))?",
-    "message": r"(msg|message|frame)(_?(no|num|nr|number|type|id))?",
-    "tx": r"tx",
-    "rx": r"rx",
-    "fpp": r"(fpp?|fp_?power|first_?path(_?power)?)",
-    "rxp": r"(rxp|rx_?power|rssi|total_?power)",
-    "skew": r"(skew|cfo|carrier|clock_?offset)",
-} | {name: _place(name) for name in POSITIONS}
 OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sequence", "message")
 _EVENT: Final = re.compile(r"(event|direction|dir|kind|type|action|edge|what|tx_?or_?rx|tx_?rx)")
-_STAMP: Final = re.compile(rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){_END}")
+_STAMP: Final = re.compile(rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){END}")
 _OF_DEVICE: Final = re.compile(r"device|dw|tick|dtu|raw|chip|counter|^stamp")
 _OF_HOST: Final = re.compile(r"host|ros|unix|utc|iso|date|time_s$")
 _SENT: Final = ("tx", "t", "sent", "send", "transmit", "transmitted")
@@ -80,12 +36,12 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
     if all(name in columns for name in STAMPS[:4]) or ("tx" in columns and "rx" in columns):
         return None
     single = [name for name in table.names if table.names.count(name) == 1]
-    event = next((name for name in single if _EVENT.fullmatch(_plain(name)) and _is_event(table, name)), None)
-    times = [name for name in single if _STAMP.fullmatch(_plain(name))]
+    event = next((name for name in single if _EVENT.fullmatch(plain(name)) and _is_event(table, name)), None)
+    times = [name for name in single if _STAMP.fullmatch(plain(name))]
     if event is None or not times:
         return None
     # The first of those that are equal in that: False is before True.
-    stamp = min(times, key=lambda name: (not _OF_DEVICE.search(_plain(name)), bool(_OF_HOST.search(_plain(name)))))
+    stamp = min(times, key=lambda name: (not _OF_DEVICE.search(plain(name)), bool(_OF_HOST.search(plain(name)))))
     rest = {ours: header for ours, header in columns.items() if header not in (stamp, event)}
     if "time_s" not in rest and len(times) > 1:
         rest["time_s"] = next(name for name in times if name != stamp)
@@ -124,18 +80,15 @@ def placed(columns: dict[str, str], cells: dict[str, Floats]) -> tuple[dict[str,
     )
 
 
-def _plain(header: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "_", header.lower()).strip("_")
-
-
 def named_columns(names: Iterable[str]) -> dict[str, str]:
     """Return which column each of our names is, raw ones before others, first ones before later ones."""
     found: dict[str, str] = {}
     listed = sorted(names, key=lambda name: "raw" not in name.lower())
-    for ours, pattern in _PATTERNS.items():
-        whole = re.compile(f"({pattern}){_END}")
+    called = numbered({name: plain(name) for name in listed})
+    for ours, pattern in PATTERNS.items():
+        whole = re.compile(f"({pattern}){END}")
         for header in listed:
-            if whole.fullmatch(_plain(header)) and listed.count(header) == 1 and _free(ours, header, found):
+            if whole.fullmatch(called[header]) and listed.count(header) == 1 and _free(ours, header, found):
                 found[ours] = header
                 break
     return found

@@ -22,8 +22,8 @@ _OF_MESSAGE: Final = {"fpp": "fpp", "rxp": "rxp", "skew": "skew"}
 def from_messages(rows: Rows, unusable: Unusable) -> tuple[Rows, str]:
     """Return exchanges of rows that are messages, and their protocol; notes the rows that belong to no whole exchange.
 
-    Messages are 1, 2 and 3, by a column or by their order. The first one's sender is the initiator; who sends the third
-    tells "ds" from "ds-alt".
+    Messages are 1, 2 and 3, by a column (or 0, 1 and 2 there) or by their order. The first one's sender is the
+    initiator; who sends the third tells "ds" from "ds-alt".
     """
     order, group, place = _groups(rows)
     rows = take(rows, order)
@@ -37,7 +37,7 @@ def from_messages(rows: Rows, unusable: Unusable) -> tuple[Rows, str]:
     protocol = "ss" if not three else "ds-alt" if alternative else "ds"
     expected = np.where(place == 2, target[group], initiator[group])
     expected = np.where((place == 3) & (not alternative), target[group], expected)
-    good = (sender == expected) & (place <= (3 if three else 2))
+    good = (sender == expected) & (place >= 1) & (place <= (3 if three else 2))
     cells = {name: column[start] for name, column in rows.cells.items() if name in ("gt_range_m", "range_m")}
     for k in (1, 2, 3)[: 3 if three else 2]:
         mine = good & (place == k)
@@ -134,8 +134,14 @@ def _groups(rows: Rows, *, numbered: bool = True) -> tuple[Ints, Ints, Ints]:
     first = np.flatnonzero(begins)
     place = np.arange(len(rows)) - first[group] + 1
     if message is not None:
-        place = np.nan_to_num(message[order], nan=9).astype(np.int64)
+        place = np.nan_to_num(message[order], nan=9).astype(np.int64) + _counted_from(message)
     return order, group, place
+
+
+def _counted_from(message: Floats) -> int:
+    """Return what to add to the numbers of messages: 1 where they are 0, 1 and 2, and 0 is no rare damage."""
+    numbers = message[np.isfinite(message)]
+    return int(len(numbers) > 0 and numbers.max() <= 2 and 4 * np.count_nonzero(numbers == 0) > len(numbers))
 
 
 def _put(values: Floats, group: Ints, mine: Bools, count: int) -> Floats:

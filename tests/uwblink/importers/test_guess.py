@@ -162,3 +162,54 @@ def test_a_table_without_time_between_the_last_messages_is_guessed_in_peace(tmp_
     """Of which some ranges are infinite; as in commands, a warning of NumPy would be an error."""
     rows = [row | ({"tx3": row["tx2"]} if k % 2 else {}) for k, row in enumerate(wrapped(flights()))]
     assert "tx3" in guess_map(write(tmp_path / "t.csv", rows, ",")).text
+
+
+def guessed(tmp_path, path):
+    guess = guess_map(path)
+    assert guess.complete
+    (tmp_path / "map.toml").write_text(guess.text)
+    return read_table(path, tmp_path / "map.toml")
+
+
+GERMAN = ("Zeit [s]", "Quelle", "Empfänger", *(f"T_{n} [ns]" for n in HEADER[3:9]), "FP1 [dBm]", "FP2 [dBm]")
+AT_DEVICES = ("Datum", "Sender", "Ziel", *POLL, "fp_power_resp (dBm)", "fp_power_init (dBm)")
+OF_MESSAGES = ("t_s", "src", "dst", *(f"ts_{n}" for n in POLL), "poll_fp_level", "resp_fp_level")
+
+
+@pytest.mark.parametrize(
+    ("called", "true", "decimal"),
+    [(GERMAN, "Referenz [cm]", ","), (AT_DEVICES, "Tape", "."), (OF_MESSAGES, "distance_gt_cm", ".")],
+)
+def test_columns_as_labs_call_them(tmp_path, called, true, decimal):
+    rows = flights()
+    names = dict(zip(HEADER, called, strict=True)) | {"truth": true}
+    scale = dict.fromkeys(HEADER[3:9], 1e9 / TICKS_PER_SECOND) if "[ns]" in called[3] else {}
+    scale |= {"truth": 100.0} if "cm" in true else {}
+    whole = [short | {"truth": row["truth"]} for short, row in zip(wrapped(rows), rows, strict=True)]
+    table = [{names[n]: v * scale[n] if n in scale else v for n, v in row.items()} for row in whole]
+    path = write(tmp_path / "t.csv", table, ";", lambda value: str(value).replace(".", decimal))
+    found = guessed(tmp_path, path)
+    same(found, rows)
+    assert found.exchanges.fpp1_dbm.tolist() == [row["fpp1"] for row in rows]
+    assert found.exchanges.fpp2_dbm.tolist() == [row["fpp2"] for row in rows]
+    assert found.exchanges.truth_m == pytest.approx([row["truth"] for row in rows])
+
+
+@pytest.mark.parametrize("third", [True, False])
+def test_messages_that_are_counted_from_zero(tmp_path, third):
+    rows = flights()
+    table = [row | {"message": row["message"] - 1} for row in as_messages(wrapped(rows))]
+    found = guessed(tmp_path, write(tmp_path / "m.csv", [row for row in table if third or row["message"] < 2]))
+    e, expected = found.exchanges, {row["tx1"] % 2**32: row for row in rows}
+    assert len(e) == len(rows)
+    for k, row in enumerate(expected[int(tx1)] for tx1 in e.tx1):
+        assert [int(getattr(e, n)[k]) for n in HEADER[3 : 9 if third else 7]] == [
+            row[n] % 2**32 for n in HEADER[3 : 9 if third else 7]
+        ]
+
+
+def test_distances_in_two_units_are_not_read_as_one(tmp_path):
+    table = [{"t": k, "src": 1, "dst": 2, "range_cm": 300 + k, "gt_m": 3.0} for k in range(30)]
+    guess = guess_map(write(tmp_path / "t.csv", table))
+    assert not guess.complete
+    assert "# distances have one unit for all, here they have cm, m: convert some" in guess.text
