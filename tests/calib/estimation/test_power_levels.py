@@ -12,7 +12,7 @@ from calib.estimation.power_levels import power_levels_db, unlike_powers
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 SENT_DB, READ_DB = {2: -3.0}, {3: 2.0}
-NOBODY = {}
+NOBODY: dict[int, float] = {}
 
 
 def world(sent=NOBODY, read=NOBODY, noise_db=0.0, **more):
