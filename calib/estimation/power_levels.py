@@ -38,9 +38,11 @@ NORMAL95: Final = 1.96
 
 def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
     """Name tags whose powers are unlike those of the others, so much that their delays may hold more than they say."""
-    each_ns = _ns_a_decibel(ranges, calibration)
-    unlike = {}
-    for tag, (level, std) in power_levels_db(ranges).items():
+    levels = power_levels_db(ranges)
+    if not levels:
+        return
+    each_ns, unlike = _ns_a_decibel(ranges, calibration), {}
+    for tag, (level, std) in levels.items():
         half_ns = NORMAL95 * calibration.delays_std_ns.get(tag, 0.0)
         if (
             half_ns > 0

@@ -57,7 +57,9 @@ def test_levels_with_noise_are_as_near_as_they_say():
 
 def test_ranges_without_powers_have_no_levels():
     r = world()
-    assert power_levels_db(replace(r, fpp2_dbm=np.full(len(r), np.nan))) == {}
+    bare = replace(r, fpp2_dbm=np.full(len(r), np.nan))
+    assert power_levels_db(bare) == {}
+    assert not [*unlike_powers(bare, calib.fit(r).calibration)]
 
 
 def test_a_tag_that_reads_too_high_is_named_with_what_its_delay_holds():
