@@ -77,6 +77,9 @@ def residuals(width_in: float, ranges: Ranges, applied: CorrectedRanges, alpha_d
         panel.axhline(0, color=MUTED, lw=0.7)
         low_x, high_x = np.quantile(x, (0.001, 0.999))
         panel.set_xlim(low_x - 0.03 * (high_x - low_x) - 1e-6, high_x + 0.03 * (high_x - low_x) + 1e-6)
+        panel.locator_params(
+            axis="x", nbins=7, steps=[1, 2, 5, 10]
+        )  # of -97.5 dBm there is room for fewer than by default
         label(panel, name, "calibrated error (cm)" if panel is panels[0] or width_in < NARROW_IN else "")
     panels[0].set_ylim(*_reach_cm(error))
     legend(figure, panels[0])
