@@ -95,7 +95,7 @@ def label(axes: Axes, x: str, y: str) -> None:
     """Name the axes, and take away what carries nothing."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
-    axes.grid(True)
+    axes.grid(True, color=GRID, linewidth=STYLE["grid.linewidth"])  # also in axes of somebody who has another style
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 

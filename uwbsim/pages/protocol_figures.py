@@ -68,9 +68,11 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
         right.set_ylabel("standard deviation (cm), log axis")
     else:
         right.set_ylim(bottom=0)
-    if logarithmic:
-        for axes in (left, right):
+    for axes in (left, right):
+        if logarithmic:
             _microseconds(axes)
+        else:
+            axes.locator_params(axis="x", nbins=6)  # nine of powers cover each other
     legend(figure, left)
     return figure
 

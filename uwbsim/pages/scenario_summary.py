@@ -130,11 +130,12 @@ def sentences(found: Preview) -> list[str]:
             f"{pair.distance_m[0]:8.2f} to {pair.distance_m[1]:5.2f}{pair.power_dbm[0]:8.1f} to "
             f"{pair.power_dbm[1]:6.1f}{100 * pair.ss_bias_m:+20.1f}"
         )
-        if pair.audible < 0.9:
-            lines.append(
-                f"warning: {pair.initiator} and {pair.target} hear each other {100 * pair.audible:.0f} % of the time "
-                f"(sensitivity {scenario.radio.sensitivity_dbm:g} dBm)"
-            )
+    lines += [
+        f"warning: {pair.initiator} and {pair.target} hear each other {100 * pair.audible:.0f} % of the time "
+        f"(sensitivity {scenario.radio.sensitivity_dbm:g} dBm)"
+        for pair in found.pairs
+        if pair.audible < 0.9
+    ]
     # Pairs that would not determine delays are known beforehand: a two-coloured graph leaves one direction free.
     if _is_bipartite([(p.initiator, p.target) for p in found.pairs]):
         lines.append(

@@ -35,6 +35,18 @@ FIRST: Final = (
 )
 """What is drawn before anything else."""
 
+SAID: Final = {
+    "rmse_m": "root mean square of the errors of raw ranges",
+    "std_m": "standard deviation of the errors of raw ranges",
+    "bias_m": "mean error of raw ranges",
+    "median_m": "median error of raw ranges",
+    "low_m": "what 2.5 % of the errors of raw ranges lie below",
+    "high_m": "what 2.5 % of the errors of raw ranges lie above",
+    "predicted_bias_m": "mean error as it is predicted without simulating",
+    "predicted_std_m": "standard deviation as it is predicted without simulating",
+}
+"""What figures are, in words."""
+
 NOT_RESULTS: Final = ("scenario", "number", "seed", "uwbcal", "numpy", "python", "status", "error", "protocol")
 
 
@@ -72,7 +84,8 @@ def _page(plan: SweepDesign, rows: Sequence[Mapping[str, Any]]) -> str:
             _column(good, name),
         )
         shown, swept = _unit(name, swept)
-        parts.append(both_widths(partial(figure_over_keys, swept=swept, name=shown), f"{shown}.", name))
+        caption = f"{shown}: {SAID[name]}." if name in SAID else f"{shown}."
+        parts.append(both_widths(partial(figure_over_keys, swept=swept, name=shown), caption, name))
     if len(drawn) > MOST_FIGURES:
         parts.append(f"<p class='note'>Not drawn: {_listed(drawn[MOST_FIGURES:])}.</p>")
     return page_html(f"Sweep: {plan.name}", parts)

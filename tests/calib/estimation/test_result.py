@@ -51,6 +51,16 @@ def test_groups_have_a_row_each():
     assert "sigma (cm) flat" in text
 
 
+def test_lines_of_the_grid_are_pale_in_axes_of_somebody_else(result):
+    from matplotlib import pyplot
+    from matplotlib.colors import to_rgb
+
+    axes = result.plot_delays()
+    axes.figure.draw_without_rendering()
+    assert min(to_rgb(axes.get_ygridlines()[0].get_color())) > 0.8
+    pyplot.close(axes.figure)
+
+
 def test_html_is_escaped(result):
     page = result._repr_html_()
     assert "<b>beware" not in page

@@ -1,6 +1,7 @@
 """Scenes, comparisons and sweeps as pages: what stands on them, and how it lies in a window."""
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,12 @@ from tests.browser import lies_well
 from uwblink import PROTOCOLS
 from uwblink.pages.figures import picture, style
 from uwbsim.pages.comparison_page import page as comparison_page
+from uwbsim.pages.protocol_figures import error_over
 from uwbsim.pages.scenario_figures import room, timing
 from uwbsim.pages.scenario_page import page as scene_page
 from uwbsim.pages.sweep_figures import Swept, figure_over_keys
 from uwbsim.pages.sweep_page import write_sweep_page
+from uwbsim.protocols.error_curves import ErrorCurve
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 BENCH, OFFICE = SCENARIOS / "two_boards_on_a_bench/bench.toml", SCENARIOS / "office/office.toml"
@@ -113,6 +116,17 @@ def test_a_sweep_draws_what_came_out(tmp_path, more):
     assert f"{len(design.seeds)} seeds each" in page
 
 
+def test_a_sweep_says_what_its_figures_are(tmp_path):
+    plan = tmp_path / "plan.toml"
+    head = f"sweep = {{ scenario = '{BENCH.as_posix()}', protocols = ['ds'], ranges = 50, seeds = 1 }}"
+    plan.write_text(f"{head}\n[vary]\n'radio.rx_noise_ps' = [50.0, 200.0]\n")
+    design = uwbsim.load_design(plan)
+    uwbsim.run_sweep(design, tmp_path / "out", workers=1)
+    page = write_sweep_page(design, tmp_path / "out").read_text()
+    captions = re.findall("<figcaption>(.*?)</figcaption>", page)
+    assert "low (cm): what 2.5 % of the errors of raw ranges lie below." in captions
+
+
 def test_bands_over_seeds_reach_from_the_least_to_the_largest():
     values = [1.0] * 3 + [2.0] * 3
     swept = Swept({"key": values}, ["ds"] * 6, np.array([1.0, 2.0, 9.0, 4.0, 5.0, 6.0]))
@@ -135,3 +149,23 @@ def test_words_and_many_keys_are_drawn_key_by_key():
     figure = figure_over_keys(3.5, Swept({**keys}, ["ds", "ss"] * 4, np.arange(8.0)), "figure")
     assert len(figure.axes) == 3
     assert [t.get_text() for t in figure.axes[1].get_xticklabels()] == ["x", "y"]
+
+
+@pytest.mark.parametrize("x", [np.linspace(-90.1, -69.7, 12), np.linspace(-20.0, 20.0, 12)])
+def test_numbers_along_an_axis_do_not_cover_each_other(x):
+    flat = np.ones(12)
+    curve = ErrorCurve(x=x, bias_m=flat, std_m=flat, predicted_bias_m=flat, predicted_std_m=flat)
+    with style():
+        figure = error_over(7.16, {"ss": curve}, "first-path power (dBm)")
+        figure.draw_without_rendering()
+        boxes = [[t.get_window_extent() for t in axes.get_xticklabels()] for axes in figure.axes]
+    for one in boxes:
+        assert len(one) >= 4
+        assert all(left.x1 + 2 < right.x0 for left, right in pairwise(one))
+
+
+def test_warnings_stand_below_the_table_of_pairs():
+    lines = str(uwbsim.preview("nlos_office/office")).splitlines()
+    warned = [line.startswith("warning:") for line in lines]
+    assert any(warned)
+    assert warned == sorted(warned)

@@ -19,6 +19,7 @@ def test_every_one_is_told_of():
     told = listed()
     assert list(told) == list(shipped_scenarios()) == sorted(told)
     assert all(4 < len(text) < 200 for text in told.values())
+    assert len(set(told.values())) == len(told), "two are told of alike"
 
 
 def test_a_name_does_for_a_file_where_there_is_none(tmp_path, monkeypatch):
