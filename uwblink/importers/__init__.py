@@ -178,8 +178,8 @@ def import_file(
 ) -> Imported:
     """Do what `import_recording` does; returns what was imported.
 
-    `watch` is called with what is being done ("reading", "checking", "writing") and which share of it is done, by
-    importers that say so.
+    `watch` is called with what is being done ("reading", "checking", "writing", and between the first two "sorting" and
+    "grouping" where an exchange has several rows) and which share of it is done, by importers that say so.
     """
     check_output(Path(output), force=force)
     sources, row, explained = _chosen(source, importer, map_file)

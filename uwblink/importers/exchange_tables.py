@@ -17,14 +17,14 @@ import numpy as np
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, ColumnMap, load_map
-from uwblink.importers.messages import from_messages, from_parts, from_single_stamps
+from uwblink.importers.long_tables import exchanges_of_long
 from uwblink.importers.staged_tables import StagedTables, Watch
 from uwblink.importers.stamps import stamps_of
 from uwblink.importers.table_import import TableImport
-from uwblink.importers.table_rows import HeldRows, Rows, RowSource, has, joined, take
+from uwblink.importers.table_rows import Rows, RowSource, has
 from uwblink.importers.trials import SAMPLE, Reading, Sample, Trial, try_others
 from uwblink.importers.unusable import Unusable
-from uwblink.importers.usable import Usable, usable_exchanges, usable_ranges, with_ends
+from uwblink.importers.usable import Usable, usable_exchanges, usable_ranges
 from uwblink.recording.contents import Contents
 from uwblink.twr import LARGEST_ID, STAMPS
 
@@ -74,13 +74,13 @@ def plan(tables: StagedTables, watch: Watch | None = None) -> TableImport:
         if not tables.has(name):
             raise tables.missing(name)
     layout = tables.column_map.layout or _layout(tables)
-    if watch:
-        watch("checking", 0.0)
     source: RowSource = tables
     total, protocol = len(tables), tables.column_map.protocol
     if layout in ("messages", "stamps", "parts"):
-        source, found = _grouped(tables, layout, unusable)
+        source, found = exchanges_of_long(tables, layout, unusable, watch)
         total, protocol = len(source) + len(unusable), protocol or found
+    if watch:
+        watch("checking", 0.0)
     if layout == "ranges":
         usable, reading = _plain_ranges(tables, source, unusable, total), None
     else:
@@ -89,22 +89,6 @@ def plan(tables: StagedTables, watch: Watch | None = None) -> TableImport:
         tables=tables, source=source, usable=usable, unusable=unusable, reading=reading, notes=notes, total=total,
         watch=watch,
     )  # fmt: skip
-
-
-def _grouped(tables: StagedTables, layout: str, unusable: Unusable) -> tuple[RowSource, str | None]:
-    """Return rows of which several make an exchange as exchanges, and the protocol as far as they tell it."""
-    parts = [take(rows, np.flatnonzero(with_ends(rows, unusable))) for rows in tables.blocks()]
-    rows, protocol = joined(parts), None
-    if layout == "stamps":
-        for name in ("stamp", "event", "message"):
-            if not tables.has(name):
-                raise tables.missing(name)
-        rows = from_single_stamps(rows, unusable)
-    if layout == "parts":
-        rows = from_parts(rows, unusable)
-    else:
-        rows, protocol = from_messages(rows, unusable)
-    return HeldRows(rows), protocol
 
 
 def _layout(tables: StagedTables) -> str:

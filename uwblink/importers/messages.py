@@ -7,53 +7,129 @@ by pair and time.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.importers.belonging import MESSAGES, PARTS, STAMPS, Together, numbers
 from uwblink.importers.table_rows import RECEIVED, SENT, Rows, take
 from uwblink.importers.unusable import Unusable
-from uwblink.twr import STAMPS
+from uwblink.twr import STAMPS as STAMP_NAMES
 
 _OF_MESSAGE: Final = {"fpp": "fpp", "rxp": "rxp", "skew": "skew"}
+_AS_THEY_ARE: Final = ("gt_range_m", "range_m")
+
+USED: Final = ("sequence", "message", "tx", "rx", "stamp", "event", *_OF_MESSAGE, *_AS_THEY_ARE)
+"""Columns of messages and of single stamps that exchanges are made of."""
 
 
-def from_messages(rows: Rows, unusable: Unusable) -> tuple[Rows, str]:
-    """Return exchanges of rows that are messages, and their protocol; notes the rows that belong to no whole exchange.
+@dataclass(slots=True)
+class Numbered:
+    """Which numbers messages have in their column, as rows come."""
+
+    some: int = 0
+    zeros: int = 0
+    largest: float = -np.inf
+
+    def seen(self, parts: Iterable[Rows]) -> Iterator[Rows]:
+        """Yield rows and count them."""
+        for rows in parts:
+            found = rows.cells.get("message", np.empty(0))
+            found = found[np.isfinite(found)]
+            self.some += len(found)
+            self.zeros += int(np.count_nonzero(found == 0))
+            self.largest = float(found.max(initial=self.largest))
+            yield rows
+
+    @property
+    def less(self) -> int:
+        """What to add to the numbers: 1 where they are 0, 1 and 2, and 0 is no rare damage."""
+        return int(self.largest <= 2 and 4 * self.zeros > self.some)
+
+
+@dataclass(slots=True)
+class Votes:
+    """How many messages are second ones, third ones, and third ones by the initiator."""
+
+    second: int = 0
+    third: int = 0
+    third_by_initiator: int = 0
+
+    def add(self, messages: Messages) -> None:
+        """Count some messages."""
+        third = messages.place == 3
+        self.second += int(np.count_nonzero(messages.place == 2))
+        self.third += int(np.count_nonzero(third))
+        self.third_by_initiator += int(np.count_nonzero(third & (messages.sender == messages.initiator)))
+
+    def told(self) -> str:
+        """Return the protocol that most messages tell."""
+        if not 2 * self.third > self.second:
+            return "ss"
+        return "ds-alt" if 2 * self.third_by_initiator > self.third else "ds"
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """Messages by exchange; the number of each (n,), by a column or by their order."""
+
+    together: Together
+    place: Ints
+
+    @property
+    def sender(self) -> Ints:
+        """Who sent each message, (n,)."""
+        return self.together.rows.ids["from_id"]
+
+    @property
+    def initiator(self) -> Ints:
+        """Who sent the first message of each message's exchange, (n,)."""
+        return self._of_first("from_id")
+
+    def exchanges(self, protocol: str, unusable: Unusable) -> Rows:
+        """Return the exchanges by a protocol; notes the rows that belong to no whole one."""
+        rows, group, start = self.together.rows, self.together.group, self.together.start
+        expected = (1, 2) if protocol == "ss" else (1, 2, 3)
+        good = (self.sender == self._expected(protocol)) & (self.place >= 1) & (self.place <= len(expected))
+        exchanges = take(rows, start)
+        exchanges.cells = {name: column for name, column in exchanges.cells.items() if name in _AS_THEY_ARE}
+        for number in expected:
+            exchanges.cells |= self._cells(number, good & (self.place == number))
+        whole = np.bincount(group, weights=good, minlength=len(start)) == len(expected)
+        unusable.add("message", rows.origin[start[~whole]], "messages 1, 2 (and 3) of one exchange")
+        return take(exchanges, np.flatnonzero(whole))
+
+    def _expected(self, protocol: str) -> Ints:
+        """Return who should have sent each message, (n,)."""
+        of_target = (self.place == 2) | ((self.place == 3) & (protocol != "ds-alt"))
+        return np.where(of_target, self._of_first("to_id"), self.initiator)
+
+    def _cells(self, number: int, mine: Bools) -> dict[str, Floats]:
+        """Return what the messages of one number say, by exchange."""
+        names = {f"tx{number}": "tx", f"rx{number}": "rx"}
+        if number < 3:
+            names |= {f"{ours}{number}": theirs for theirs, ours in _OF_MESSAGE.items()}
+        cells = self.together.rows.cells
+        return {ours: self.together.put(cells[theirs], mine) for ours, theirs in names.items() if theirs in cells}
+
+    def _of_first(self, name: str) -> Ints:
+        return self.together.rows.ids[name][self.together.start][self.together.group]
+
+
+def messages_of(rows: Rows, numbered: Numbered) -> Messages:
+    """Return rows that are messages by their exchange.
 
     Messages are 1, 2 and 3, by a column (or 0, 1 and 2 there) or by their order. The first one's sender is the
     initiator; who sends the third tells "ds" from "ds-alt".
     """
-    order, group, place = _groups(rows)
-    rows = take(rows, order)
-    count = int(group[-1]) + 1 if len(group) else 0
-    start = np.searchsorted(group, np.arange(count))
-    initiator, target = rows.ids["from_id"][start], rows.ids["to_id"][start]
-    sender = rows.ids["from_id"]
-    third_by_initiator = (place == 3) & (sender == initiator[group])
-    three = bool(2 * np.count_nonzero(place == 3) > np.count_nonzero(place == 2))
-    alternative = bool(2 * np.count_nonzero(third_by_initiator) > np.count_nonzero(place == 3))
-    protocol = "ss" if not three else "ds-alt" if alternative else "ds"
-    expected = np.where(place == 2, target[group], initiator[group])
-    expected = np.where((place == 3) & (not alternative), target[group], expected)
-    good = (sender == expected) & (place >= 1) & (place <= (3 if three else 2))
-    cells = {name: column[start] for name, column in rows.cells.items() if name in ("gt_range_m", "range_m")}
-    for k in (1, 2, 3)[: 3 if three else 2]:
-        mine = good & (place == k)
-        cells |= {
-            f"tx{k}": _put(rows.cells["tx"], group, mine, count),
-            f"rx{k}": _put(rows.cells["rx"], group, mine, count),
-        }
-        if k < 3:
-            named = {f"{ours}{k}": theirs for theirs, ours in _OF_MESSAGE.items() if theirs in rows.cells}
-            cells |= {name: _put(rows.cells[theirs], group, mine, count) for name, theirs in named.items()}
-    counts = np.bincount(group, weights=good, minlength=count)
-    whole = counts == (3 if three else 2)
-    unusable.add("message", rows.origin[start[~whole]], "messages 1, 2 (and 3) of one exchange")
-    exchanges = take(rows, start)
-    exchanges.cells, exchanges.ids = cells, {"from_id": initiator, "to_id": target}
-    return take(exchanges, np.flatnonzero(whole)), protocol
+    together = MESSAGES.together(rows)
+    message = together.rows.cells.get("message")
+    if message is not None:
+        return Messages(together, numbers(message, 9) + numbered.less)
+    return Messages(together, np.arange(len(rows)) - together.start[together.group] + 1)
 
 
 def from_single_stamps(rows: Rows, unusable: Unusable) -> Rows:
@@ -61,90 +137,31 @@ def from_single_stamps(rows: Rows, unusable: Unusable) -> Rows:
 
     Rows belong together by sender, receiver, number of the message, and sequence number or time.
     """
-    order, group = _stamps_of_messages(rows)
-    rows = take(rows, order)
-    count = int(group[-1]) + 1 if len(group) else 0
-    start = np.searchsorted(group, np.arange(count))
-    found, whole = {}, np.ones(count, dtype=bool)
+    together = STAMPS.together(rows)
+    rows, group, start = together.rows, together.group, together.start
+    messages, whole = take(rows, start), np.ones(len(start), dtype=bool)
+    messages.cells = {name: c for name, c in together.largest().items() if name not in ("stamp", "event")}
     for name, kind in (("tx", SENT), ("rx", RECEIVED)):
         mine = rows.cells["event"] == kind
-        whole &= np.bincount(group, weights=mine, minlength=count) == 1
-        found[name] = _put(rows.cells["stamp"], group, mine, count)
-    others = {name: column for name, column in rows.cells.items() if name not in ("stamp", "event")}
-    messages = take(rows, start)
-    messages.cells = {name: np.fmax.reduceat(column, start) for name, column in others.items()} | found if count else {}
+        whole &= np.bincount(group, weights=mine, minlength=len(start)) == 1
+        messages.cells[name] = together.put(rows.cells["stamp"], mine)
     unusable.add("event", rows.origin[start[~whole]], "one tx and one rx of a message")
     return take(messages, np.flatnonzero(whole))
 
 
-def _stamps_of_messages(rows: Rows) -> tuple[Ints, Ints]:
-    """Return the order in which the stamps of a message stand together, and their message, (n,) each."""
-    time = rows.time_ns if rows.time_ns is not None else np.arange(len(rows), dtype=np.int64)
-    keys = [rows.ids["from_id"], rows.ids["to_id"]]
-    keys += [_key(rows.cells[name]) for name in ("sequence", "message") if name in rows.cells]
-    order = np.lexsort((time, *reversed(keys)))
-    begins: Bools = np.ones(len(rows), dtype=bool)
-    begins[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
-    if rows.time_ns is not None:
-        begins[1:] |= np.diff(time[order].astype(np.float64)) > rows.column_map.within_s * 1e9
-    return order, np.cumsum(begins) - 1
-
-
-def _key(column: Floats) -> Ints:
-    return np.nan_to_num(column, nan=-1).astype(np.int64)
-
-
 def from_parts(rows: Rows, unusable: Unusable) -> Rows:
     """Return exchanges of rows that each have some of the columns; notes those in which one has two values."""
-    order, group, _ = _groups(rows, numbered=False)
-    rows = take(rows, order)
-    count = int(group[-1]) + 1 if len(group) else 0
-    start = np.searchsorted(group, np.arange(count))
+    together = PARTS.together(rows)
+    rows, group, start = together.rows, together.group, together.start
     # The initiator is whoever the row with its first stamp names first.
     leads = np.isfinite(rows.cells["tx1"]) if "tx1" in rows.cells else np.zeros(len(rows), dtype=bool)
     lead = start.copy()
     lead[group[leads]] = np.flatnonzero(leads)
     exchanges = take(rows, lead)
-    exchanges.cells = {name: np.fmax.reduceat(column, start) for name, column in rows.cells.items()} if count else {}
-    twice = np.zeros(count, dtype=bool)
-    for name in STAMPS:
+    exchanges.cells = together.largest()
+    twice = np.zeros(len(start), dtype=bool)
+    for name in STAMP_NAMES:
         if name in rows.cells:
-            twice |= np.bincount(group, weights=np.isfinite(rows.cells[name]), minlength=count) > 1
+            twice |= np.bincount(group, weights=np.isfinite(rows.cells[name]), minlength=len(start)) > 1
     unusable.add("sequence", rows.origin[start[twice]], "one value of each column an exchange")
     return take(exchanges, np.flatnonzero(~twice))
-
-
-def _groups(rows: Rows, *, numbered: bool = True) -> tuple[Ints, Ints, Ints]:
-    """Return the order in which rows of one exchange stand together, their exchange, and their message, (n,) each."""
-    low, high = (f(rows.ids["from_id"], rows.ids["to_id"]) for f in (np.minimum, np.maximum))
-    time = rows.time_ns if rows.time_ns is not None else np.arange(len(rows), dtype=np.int64)
-    keys = [low, high]
-    if "sequence" in rows.cells:
-        keys.append(_key(rows.cells["sequence"]))
-    order = np.lexsort((np.arange(len(rows)), time, *reversed(keys)))
-    begins: Bools = np.ones(len(rows), dtype=bool)
-    begins[1:] = np.any([np.diff(key[order]) != 0 for key in keys], axis=0)
-    if rows.time_ns is not None:
-        apart = np.diff(time[order].astype(np.float64)) > rows.column_map.within_s * 1e9
-        begins[1:] |= apart
-    message: Floats | None = rows.cells.get("message") if numbered else None
-    if message is not None:
-        begins[1:] |= ~(np.diff(message[order]) > 0)
-    group = np.cumsum(begins) - 1
-    first = np.flatnonzero(begins)
-    place = np.arange(len(rows)) - first[group] + 1
-    if message is not None:
-        place = np.nan_to_num(message[order], nan=9).astype(np.int64) + _counted_from(message)
-    return order, group, place
-
-
-def _counted_from(message: Floats) -> int:
-    """Return what to add to the numbers of messages: 1 where they are 0, 1 and 2, and 0 is no rare damage."""
-    numbers = message[np.isfinite(message)]
-    return int(len(numbers) > 0 and numbers.max() <= 2 and 4 * np.count_nonzero(numbers == 0) > len(numbers))
-
-
-def _put(values: Floats, group: Ints, mine: Bools, count: int) -> Floats:
-    found = np.full(count, np.nan)
-    found[group[mine]] = values[mine]
-    return found

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
-from typing import TYPE_CHECKING, Any, Final, Self
+from tempfile import TemporaryDirectory, TemporaryFile, gettempdir
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,7 @@ class Stage:
         self._folder = TemporaryDirectory(prefix="uwblink-")
         self.db = confined(paths, self._folder.name)
         self._made = 0
+        self._files: list[BinaryIO] = []
 
     def __enter__(self) -> Self:
         """Return the stage itself."""
@@ -68,6 +69,8 @@ class Stage:
     def close(self) -> None:
         """Forget everything."""
         self.db.close()
+        for file in self._files:
+            file.close()
         self._folder.cleanup()
 
     def keep(self, query: str, bound: Sequence[Any], columns: Iterable[str]) -> Kept:
@@ -86,6 +89,12 @@ class Stage:
         self.db.register("more", dict(columns))
         self.db.execute(f"INSERT INTO {kept.table} SELECT {', '.join(kept.columns)} FROM more")  # noqa: S608 - names of ours
         self.db.unregister("more")
+
+    def file(self) -> BinaryIO:
+        """Return a file for what is put aside beside the database; it vanishes when it is closed."""
+        file = TemporaryFile(dir=self._folder.name)  # noqa: SIM115 - `close` closes it
+        self._files.append(file)
+        return file
 
     def unwritable(self, error: Exception) -> ImportTableError:
         """Return the error for a disk that does not take what is put aside."""
