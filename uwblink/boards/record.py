@@ -80,7 +80,13 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     turns = plan.turns(sorted(found))
     if order and sorted(order) != sorted(found):
         there = ", ".join(map(str, sorted(found)))
-        raise PlanError(f"order: found {', '.join(map(str, order))}, expected each of the boards at the ports, {there}")
+        text = f"found {', '.join(map(str, order))}, expected each of the boards at the ports, {there}"
+        raise PlanError(text, parameter="order")
+    if plan.tags and not any(tag.tag in found for tag in plan.tags):
+        seated, there = (", ".join(map(str, sorted(ids))) for ids in ({tag.tag for tag in plan.tags}, found))
+        raise PlanError(
+            f"the plan says where {seated} sit, but the boards at the ports are {there}: is it that of others?"
+        )
     meta = _meta(found, plan, turns, passive)
     with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
         seats = {tag.tag: tag for tag in plan.tags}

@@ -17,7 +17,7 @@ from uwblink.boards.record import record
 from uwblink.boards.replay import decode_again
 from uwblink.errors import PlanError, PortMissingError, RecordingError, RecordingExistsError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Arrangement
+from uwblink.recording.schema import Arrangement, Tag
 from uwbsim.boards.virtual_port import VirtualPorts
 
 BIN = Path(sys.executable).parent
@@ -49,6 +49,16 @@ def test_an_order_is_that_of_all_boards_on_a_line(tmp_path, known, order, messag
     names, out = ports.names.values(), tmp_path / "a.uwb"
     with pytest.raises(PlanError, match=message):
         record(names, out, RangingPlan(), using=ports, arrangement="A", known=known, order=order)
+
+
+def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(tmp_path):
+    ports, out = VirtualPorts(bench_scenario()), tmp_path / "a.uwb"
+    seats = [Tag(number, "drone", (0.1, 0.0, 0.0)) for number in (20, 10)]
+    with pytest.raises(PlanError, match="the plan says where 10, 20 sit, but the boards at the ports are 1, 2, 3"):
+        record(ports.names.values(), out, RangingPlan(tags=tuple(seats)), duration_s=0.5, using=ports)
+    assert not out.exists()
+    some = RangingPlan(rate_hz=50.0, tags=(Tag(1, "drone", (0.1, 0.0, 0.0)),))
+    assert record(ports.names.values(), out, some, duration_s=0.2, using=ports).exchanges
 
 
 @pytest.mark.parametrize("known", ["line 1 1", "plane 1 2", "line 1 b", "line  1"])

@@ -66,6 +66,12 @@ def same(found, rows, bits=32):
     np.testing.assert_allclose(found.exchanges.range_m, [row["truth"] for row in rows], atol=1e-9)
 
 
+def test_poses_are_told_from_exchanges(tmp_path):
+    path = write(tmp_path / "t.csv", [dict.fromkeys(("time_s", "body", "x", "y", "z", "qx", "qy", "qz", "qw"), 1)] * 3)
+    with pytest.raises(ImportTableError, match="these are poses; `uwblink poses RECORDING --from FILE`"):
+        read_table(path)
+
+
 @pytest.mark.parametrize("delimiter", [",", ";", "\t", "|"])
 def test_any_delimiter(tmp_path, delimiter):
     rows = flights()
