@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.exchange_bags import SUFFIXES as BAGS
-from uwblink.importers.exchange_bags import read_exchange_bag
+from uwblink.importers.exchange_bags import open_exchange_bag, read_exchange_bag
 from uwblink.importers.exchange_tables import SUFFIXES, open_tables, read_table, read_tables
 from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
@@ -99,6 +99,7 @@ _OWN: Final = (
         read_exchange_bag,
         "Import exchanges from messages in a bag of ROS 1, ROS 2 or MCAP.",
         map_help="Topics, names of fields, units and constants (.toml).",
+        open_all=open_exchange_bag,
     ),
     Importer("exported", (), read_exported, "Import a folder that 'uwblink export' wrote as CSV or Parquet."),
     Importer(

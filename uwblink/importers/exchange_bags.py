@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +24,8 @@ from uwblink.errors import ImportTableError
 from uwblink.importers.bags import Bag, opened
 from uwblink.importers.column_map import ColumnMap, load_map
 from uwblink.importers.exchange_tables import plan
-from uwblink.importers.staged_tables import StagedTables
+from uwblink.importers.staged_tables import StagedTables, Watch
+from uwblink.importers.table_import import TableImport
 from uwblink.recording.contents import Contents
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
@@ -43,21 +45,38 @@ LOGGED: Final = "log_time"
 
 def read_exchange_bag(source: Path, map_file: Path | None = None) -> Contents:
     """Return the exchanges of a bag; `map_file` says which topics and fields they are in. Raises `ImportTableError`."""
+    with open_exchange_bag([source], map_file) as found:
+        return found.contents()
+
+
+@contextmanager
+def open_exchange_bag(
+    sources: Sequence[Path], map_file: Path | None = None, watch: Watch | None = None
+) -> Iterator[TableImport]:
+    """Yield what `read_exchange_bag` returns of one bag, as something that can be written a part at a time."""
+    (source,) = sources
+    if watch:
+        watch("reading", 0.0)
+    with TemporaryDirectory() as place:
+        table = Path(place) / f"{source.name}.jsonl"
+        column_map = _as_table(source, load_map(map_file) if map_file else ColumnMap(), table)
+        with StagedTables([table], column_map, watch) as tables:
+            yield replace(plan(tables, watch), kind="import bag", imported_from=source.name)
+
+
+def _as_table(source: Path, column_map: ColumnMap, table: Path) -> ColumnMap:
+    """Write the messages of a bag as JSON lines; returns the map of these."""
     if not source.exists():
         raise ImportTableError(f"{source}: no such bag")
-    column_map = load_map(map_file) if map_file else ColumnMap()
-    with TemporaryDirectory() as place, opened(source) as bag:
+    with opened(source) as bag:
         column_map = _own(bag, column_map)
-        table = Path(place) / f"{source.name}.jsonl"
         try:
             first = _write(table, _rows(bag, column_map, _topics(bag, column_map)))
         except RecursionError as error:
             raise ImportTableError(f"{source}: a message is nested too deeply") from error
-        if first is None:
-            raise ImportTableError(f"{source}: no message on the topics of the map")
-        with StagedTables([table], _timed(column_map, first)) as tables:
-            found = plan(tables).contents()
-    return replace(found, meta={**found.meta, "source": "import bag", "imported_from": source.name})
+    if first is None:
+        raise ImportTableError(f"{source}: no message on the topics of the map")
+    return _timed(column_map, first)
 
 
 def _own(bag: Bag, column_map: ColumnMap) -> ColumnMap:

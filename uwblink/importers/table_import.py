@@ -31,7 +31,10 @@ Columns = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True, kw_only=True)
 class TableImport:
-    """Rows of tables that can be used, and how they are to be read (None: as plain ranges)."""
+    """Rows of tables that can be used, and how they are to be read (None: as plain ranges).
+
+    `kind` and `imported_from` (by default the names of the files) are what the recording says it comes from.
+    """
 
     tables: StagedTables
     source: RowSource
@@ -41,6 +44,8 @@ class TableImport:
     notes: list[str]
     total: int
     watch: Watch | None = None
+    kind: str = "import csv"
+    imported_from: str | None = None
 
     def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
         """Write a recording; returns how many rows its tables have, those without any left out, and the notes.
@@ -109,8 +114,8 @@ class TableImport:
     def _meta(self, notes: list[str]) -> dict[str, Any]:
         delays, names = self.tables.column_map.antenna_delays, self.tables.names
         meta: dict[str, Any] = {
-            "source": "import csv",
-            "imported_from": ", ".join(path.name for path in self.tables.paths),
+            "source": self.kind,
+            "imported_from": self.imported_from or ", ".join(path.name for path in self.tables.paths),
             "timestamp_bits": self.reading.bits if self.reading else 32,
             "notes": notes,
         }

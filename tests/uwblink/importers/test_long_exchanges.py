@@ -3,7 +3,8 @@
 import errno
 import io
 import tracemalloc
-from typing import Any
+from contextlib import nullcontext
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from tests.uwblink.importers.test_long_tables import told
 from tests.uwblink.importers.test_planted_delays import messages_of
 from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, stamps, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import import_file, row_files, split_rows, staged_tables, table_rows
+from uwblink.importers import exchange_bags, import_file, row_files, split_rows, staged_tables, table_rows
 from uwblink.importers.column_map import ColumnMap
 from uwblink.importers.exchange_tables import read_table
 from uwblink.importers.long_tables import exchanges_of_long
@@ -221,6 +222,36 @@ def test_memory_does_not_grow_with_the_table(tmp_path, monkeypatch):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     # A column of 8 bytes a row that stayed would be 144 kB more.
+    assert peaks[2] - peaks[1] < 100_000
+
+
+class Bag:
+    """Messages as if they were read from a bag, one at a time."""
+
+    kinds: ClassVar = {"/uwb": "uwb"}
+
+    def __init__(self, path, count):
+        self.path, self.count = path, count
+
+    def messages(self, _):
+        rows = wrapped(flights())
+        for k in range(self.count):
+            yield "/uwb", "uwb", 1_000_000 * k, {n: v for n, v in rows[k % 60].items() if n != "time_s"}
+
+
+def test_memory_does_not_grow_with_a_bag(tmp_path, monkeypatch):
+    at_once(monkeypatch, 500)
+    (tmp_path / "b.mcap").touch()
+    peaks = []
+    for count in (200, 1_000, 4_000):  # the first is for what is only made once
+        bag = Bag(tmp_path / "b.mcap", count)
+        monkeypatch.setattr(exchange_bags, "opened", lambda path, bag=bag: nullcontext(bag))
+        tracemalloc.start()
+        done = import_file(bag.path, tmp_path / f"{count}.uwb")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert done.counts["exchanges"] == count
+    # Exchanges that stayed would be 450 kB more.
     assert peaks[2] - peaks[1] < 100_000
 
 
