@@ -36,7 +36,8 @@ def said_of(found: Adjusted, second: SecondBest | None, verdict: Verdict) -> lis
     if found.network.power is not None:
         said.append(
             "a constant of the curve and one of all delays are the same to ranges: what the delays share is known only "
-            "as well as the curve at its reference power; differences of delays are known better (`uncertainty`)"
+            "as well as the curve at its reference power; differences of delays are known better, and a "
+            "taped distance (`known`) tells what they share"
         )
     if second is not None and second.ambiguous:
         who = ", ".join(map(str, second.tags))

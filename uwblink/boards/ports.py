@@ -256,6 +256,8 @@ def _explained(name: str, error: Exception) -> PortError:
         )
     if code in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "exclusively lock" in text:
         return PortBusyError(f"{name}: another process has this port open; close it first")
+    if os.path.isdir(name):
+        return PortError(f"{name.rstrip('/')}: is a folder; name the ports in it, as with {name.rstrip('/')}/*")
     if code == errno.ENOTTY or "Inappropriate ioctl" in text or "configure port" in text:
         return PortError(f"{name}: not a serial port")
     return PortError(f"{name}: cannot be opened ({text})")

@@ -50,6 +50,14 @@ def test_every_parameter_that_an_error_names_has_its_flag():
     assert {with_flags(f"`{name}`") for name in named - ONLY_FROM_PYTHON} <= OPTIONS
 
 
+def test_every_parameter_that_a_warning_names_has_its_flag():
+    said = ["surveys/saying", "estimation/warnings", "estimation/limits", "estimation/confounding"]
+    texts = [(ROOT / "calib" / f"{name}.py").read_text() for name in said]
+    named = {name for text in texts for name in re.findall(r'^ +f?"[^"\n]*`([a-z_0-9]+)`', text, re.MULTILINE)}
+    assert {"known", "delays_only"} <= named
+    assert {with_flags(f"`{name}`") for name in named} <= OPTIONS
+
+
 def test_the_library_does_not_speak_of_flags():
     for path in (ROOT / "calib").rglob("*.py"):
         if "cli" in path.parts:

@@ -23,6 +23,8 @@ def test_what_cannot_be_opened(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(PortError, match="not a serial port"):
         SerialPort(str(tmp_path / "file"))
+    with pytest.raises(PortError, match=f"{tmp_path}: is a folder; name the ports in it, as with {tmp_path}/[*]"):
+        SerialPort(f"{tmp_path}/")
     with pytest.raises(PortError, match="not a port"):
         SerialPort("nonsense://x")
 
