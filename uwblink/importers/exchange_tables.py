@@ -28,6 +28,9 @@ from uwblink.importers.usable import Usable, usable_exchanges, usable_ranges
 from uwblink.recording.contents import Contents
 from uwblink.twr import LARGEST_ID, STAMPS
 
+MOST_NAMES: Final = 12
+"""Ids that are words and are printed with their numbers; a recording has all, as its tags' bodies."""
+
 SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 
 
@@ -172,8 +175,9 @@ def _span(trial: Trial) -> str:
 def _notes(tables: StagedTables) -> list[str]:
     notes = []
     if tables.names:
-        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(tables.names.items())[:5])
-        notes.append(f"{len(tables.names)} ids are words or too large, and get numbers: {some}")
+        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(tables.names.items())[:MOST_NAMES])
+        more = f" and {len(tables.names) - MOST_NAMES} more" if len(tables.names) > MOST_NAMES else ""
+        notes.append(f"{len(tables.names)} ids are words or too large, and get numbers: {some}{more}")
     if not tables.has("time_s"):
         notes.append("there is no time; rows are put a millisecond apart, in their order")
     return notes

@@ -30,10 +30,14 @@ RECORDING: Final = ".uwb"
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """A map as TOML text with its reasons as comments, and whether it is enough to import the table."""
+    """A map as TOML text with its reasons as comments, and whether it is enough to import the table.
+
+    `assumed` are ids that no column names: the map says 1 and 2, which somebody who knows must change.
+    """
 
     text: str
     complete: bool
+    assumed: tuple[str, ...] = ()
 
 
 def guess_map(path: Path) -> Guess:
@@ -77,7 +81,7 @@ def guess_map(path: Path) -> Guess:
         len(mixed) > 1
     )
     lines += ["# what was programmed into the devices is not in the table: [antenna_delays] says it"]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2)
+    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2, tuple(missing))
 
 
 _NEEDED: Final = {

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests import processes
 from tests.shared_data import shared
 from tests.uwblink.importers.test_table_forms import HEADER, as_messages, flights, same, wrapped, write
 from uwblink.importers.column_map import load_map
@@ -213,3 +214,21 @@ def test_distances_in_two_units_are_not_read_as_one(tmp_path):
     guess = guess_map(write(tmp_path / "t.csv", table))
     assert not guess.complete
     assert "# distances have one unit for all, here they have cm, m: convert some" in guess.text
+
+
+@pytest.mark.parametrize(
+    ("ids", "todo"),
+    [({"src": 1, "dst": 2}, "look at it"), ({"src": 1}, "say to_id in it"), ({}, "say from_id and to_id")],
+)
+def test_the_command_says_what_to_do_and_how_to_go_on(tmp_path, ids, todo):
+    write(tmp_path / "my log.csv", [{"t": k, **ids, "range_m": 3.0} for k in range(30)])
+    said = processes.run("uwblink", "import", "guess", "my log.csv", "-o", "map.toml", cwd=tmp_path).stdout
+    assert said.startswith(f"map.toml: {todo}")
+    assert said.endswith(", then uwblink import csv 'my log.csv' --map map.toml -o 'my log'.uwb\n")
+
+
+def test_words_for_ids_are_told_with_their_numbers(tmp_path):
+    rows = [{"t": k, "src": chr(65 + k % 13), "dst": chr(66 + k % 13), "range_m": 3.0} for k in range(60)]
+    (note,) = guessed(tmp_path, write(tmp_path / "t.csv", rows)).meta["notes"]
+    assert note.startswith("14 ids are words or too large, and get numbers: A = 1, B = 2,")
+    assert note.endswith(", L = 12 and 2 more")
