@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import gzip
 import zlib
+from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
+from typing import BinaryIO, Final
 
 import numpy as np
 
 from uwblink.arrays import Ints
 from uwblink.errors import ImportTableError
+
+AT_ONCE: Final = 1 << 20
+"""Bytes of a file that are looked at together."""
 
 
 def lines_of(path: Path, skip: int, rejected: Ints, rows: Ints) -> Ints:
@@ -19,23 +25,46 @@ def lines_of(path: Path, skip: int, rejected: Ints, rows: Ints) -> Ints:
     """
     wanted = np.unique(rows)
     lines = wanted + 1 + skip
-    left_out = iter(rejected.tolist())
-    row, found, quoted, out = 0, -1, False, next(left_out, 0)
-    with (gzip.open if path.suffix == ".gz" else open)(path, "rt", encoding="utf-8-sig", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
+    row, found = 0, 0
+    with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as file:
+        for begins in _beginnings(file, skip):
             if row == len(wanted):
                 break
-            begins = not quoted
-            quoted ^= bool(line.count('"') % 2)
-            while out and out < number:
-                out = next(left_out, 0)
-            if number <= skip or not begins or not line.strip() or number == out:
-                continue
-            found += 1
-            if found == wanted[row]:
-                lines[row] = number
-                row += 1
+            out = np.searchsorted(rejected, [begins[0], begins[-1] + 1]) if len(begins) else (0, 0)
+            kept = np.setdiff1d(begins, rejected[out[0] : out[1]], assume_unique=True)
+            until = int(np.searchsorted(wanted, found + len(kept)))
+            lines[row:until] = kept[wanted[row:until] - found]
+            row, found = until, found + len(kept)
     return np.asarray(lines[np.searchsorted(wanted, rows)], dtype=np.int64)
+
+
+def _beginnings(file: BinaryIO | gzip.GzipFile, skip: int) -> Iterator[Ints]:
+    """Yield the lines at which rows begin, in ascending order, those of some bytes at a time."""
+    before, quoted = 0, False
+    while piece := file.read(AT_ONCE):
+        piece += file.readline()
+        if before >= skip and not quoted and _is_plain(piece):
+            count = piece.count(b"\n") + (not piece.endswith(b"\n"))
+            yield np.arange(before + 1, before + count + 1)
+        else:
+            count, found = 0, []
+            # Only the first piece can begin with a mark of the order of bytes, which is no text.
+            text = piece.decode("utf-8" if before else "utf-8-sig", errors="replace")
+            for count, line in enumerate(StringIO(text, newline=None), start=1):
+                if not quoted and line.strip() and before + count > skip:
+                    found.append(before + count)
+                quoted ^= bool(line.count('"') % 2)
+            yield np.array(found, dtype=np.int64)
+        before += count
+
+
+def _is_plain(piece: bytes) -> bool:
+    """Whether each line of a piece of a file is a row: it begins with a letter, a digit or a sign of ASCII."""
+    if b'"' in piece or piece.count(b"\r") != piece.count(b"\r\n"):
+        return False
+    letters = np.frombuffer(piece, dtype=np.uint8)
+    first = letters[np.concatenate([[0], np.flatnonzero(letters[:-1] == ord("\n")) + 1])]
+    return bool(np.all((first > ord(" ")) & (first < 127)))
 
 
 def check_file(path: Path) -> None:
