@@ -52,6 +52,8 @@ def guess_map(path: Path) -> Guess:
     if not len(next(iter(cells.values()), np.empty(0))):
         raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(table.names)}")
     layout = "stamps" if EVENT in columns else _layout(cells)
+    if layout == "messages" and _only_words(cells, "message") and columns["message"] != "message":
+        del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     columns, cells, unplaced = placed(columns, cells)
     top = [f'layout = "{layout}"  # {_WHY[layout]}' if layout in LAYOUTS else f"# {_WHY[layout]}"]
     units = _unit_lines(columns, cells)
@@ -74,7 +76,8 @@ def guess_map(path: Path) -> Guess:
     lines += ["", "[constants]", *constants] if constants else []
     lines += ["", f"# {unplaced}"] if unplaced else []
     lines += ["", f"# not used: {', '.join(map(json.dumps, left))[:300]}"] if left else []
-    lacking = [name for name in _NEEDED[layout] if name not in cells or not np.isfinite(cells[name]).any()]
+    lacking = [name for name in _NEEDED[layout] if name not in cells or _only_words(cells, name)]
+    lacking += ["message"] if layout == "messages" and _only_words(cells, "message") else []
     lines += [f"# a column of numbers is still needed: {', '.join(lacking)}"] if lacking else []
     mixed = _distance_units(columns)
     lines += [f"# distances have one unit for all, here they have {', '.join(sorted(mixed))}: convert some"] * (
@@ -98,6 +101,10 @@ _WHY: Final = {
     "ranges": "there are ranges and no stamps",
     "nothing": "neither stamps nor ranges were recognised: rename columns below",
 }
+
+
+def _only_words(cells: dict[str, Floats], name: str) -> bool:
+    return name in cells and not np.isfinite(cells[name]).any()
 
 
 def _layout(cells: dict[str, Floats]) -> str:

@@ -216,6 +216,20 @@ def test_distances_in_two_units_are_not_read_as_one(tmp_path):
     assert "# distances have one unit for all, here they have cm, m: convert some" in guess.text
 
 
+def test_messages_that_are_words_are_told_by_their_order(tmp_path):
+    rows = flights()
+    lines = as_messages(wrapped(rows))
+    words = [row | {"message": ("poll", "resp", "final")[row["message"] - 1]} for row in lines]
+    found = guessed(tmp_path, write(tmp_path / "m.csv", renamed(words, {"message": "msg"}))).exchanges
+    expected = {row["tx1"] % 2**32: row for row in rows}
+    assert len(found) == len(rows)
+    for k, row in enumerate(expected[int(tx1)] for tx1 in found.tx1):
+        assert [int(getattr(found, n)[k]) for n in HEADER[3:9]] == [row[n] % 2**32 for n in HEADER[3:9]]
+    guess = guess_map(write(tmp_path / "m.csv", words))
+    assert not guess.complete
+    assert "# a column of numbers is still needed: message" in guess.text
+
+
 @pytest.mark.parametrize(
     ("ids", "todo"),
     [({"src": 1, "dst": 2}, "look at it"), ({"src": 1}, "say to_id in it"), ({}, "say from_id and to_id")],
