@@ -29,8 +29,17 @@ duckdb.connect().execute(f'''COPY (SELECT 10 + (i // 6) * 0.01 AS time_s, 'tag' 
     random() AS y, random() AS z, 0.0 AS qx, 0.6 AS qy, 0.0 AS qz, 0.8 AS qw FROM range({sys.argv[1]}) t(i))
     TO 'poses.csv' (HEADER)''')
 """
+MESSAGE_TABLE = """
+import duckdb
+cells = ', '.join(f'[{n}, tx{n}, rx{n}]' for n in (1, 2, 3))
+duckdb.connect().execute(f'''COPY (SELECT time_s, CASE m[1] WHEN 1 THEN from_id ELSE to_id END AS from_id,
+    CASE m[1] WHEN 1 THEN to_id ELSE from_id END AS to_id, sequence, m[1] AS message, m[2] AS tx, m[3] AS rx
+    FROM (SELECT *, row_number() OVER () AS sequence, unnest([{cells}]) AS m FROM read_csv('table.csv')))
+    TO 'messages.csv' (HEADER)''')
+"""
 PARSE = "import duckdb\nduckdb.connect().execute('SELECT * FROM read_csv(?)', ['table.csv']).fetchnumpy()"
 IMPORT = "import uwblink\nuwblink.import_recording('table.csv', 'table.uwb', force=True)"
+PARSE_MESSAGES, IMPORT_MESSAGES = (code.replace("table.csv", "messages.csv") for code in (PARSE, IMPORT))
 ADD = (
     "from pathlib import Path\nfrom uwblink.importers import add_poses\nadd_poses(Path('table.uwb'), Path('poses.csv'))"
 )
@@ -49,6 +58,9 @@ def main(rows: int = ROWS) -> int:
             ("", POSE_TABLE, POSES),
             (f"DuckDB's parse of {rows} rows", PARSE + MEASURE, 0),
             (f"import of {rows} rows", IMPORT + MEASURE, 0),
+            ("", MESSAGE_TABLE, 0),
+            (f"DuckDB's parse of {3 * rows} messages", PARSE_MESSAGES + MEASURE, 0),
+            (f"import of {3 * rows} messages", IMPORT_MESSAGES + MEASURE, 0),
             ("", TABLE, FEW),
             ("", IMPORT, 0),
             (f"{POSES} poses into {FEW} exchanges", ADD + MEASURE, 0),
