@@ -80,6 +80,12 @@ def _euroc(path: Path, body: str | None, file: TextIO) -> Iterable[Row]:
         yield _time_ns(path, number, "time_ns", cells[0]), body, [found[name] for name in NUMBERS]
 
 
+_EXPECTED: Final = (
+    "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, in metres and "
+    "between commas"
+)
+
+
 def _csv(path: Path, body: str | None) -> Iterable[Row]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -94,7 +100,8 @@ def _csv(path: Path, body: str | None) -> Iterable[Row]:
             time = next((name for name in ("time_ns", "time_s") if name in names), None)
             missing = [name for name in (*NUMBERS, *(() if body else ("body",))) if name not in names]
             if time is None or missing:
-                raise ImportTableError(f"{path}: column {(missing or ['time_s'])[0]!r} is missing; found {names}")
+                first, there = (missing or ["time_s"])[0], ", ".join(names)[:400]
+                raise ImportTableError(f"{path}: column {first!r} is missing; there are {there}; {_EXPECTED}")
             for row in reader:
                 line = reader.line_num
                 name = body or str(row["body"]).strip()
