@@ -17,11 +17,14 @@ from calib.calibration.power_curves import lifted_power
 from calib.estimation.plausibility import MEDIAN
 from calib.ranges import Ranges
 from calib.spread import robust_spread
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
-ENOUGH: Final = 20_000
-"""Of more ranges, only every so many are looked at."""
+ENOUGH: Final = 6_000
+"""Of more ranges so many are looked at, spread over all."""
+
+GOLDEN: Final = 0.618034
+"""What numbers are multiplied by whose fractions keep in step with no schedule of pairs."""
 
 FEWEST: Final = 20
 """Ranges a pair by which its levels are told."""
@@ -65,31 +68,41 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
 
     In dB, each with its standard error; tags of which no pair has enough ranges with both powers are left out.
     """
-    step = max(len(ranges) // ENOUGH, 1)
+    rows = _spread(len(ranges))
     # The initiator reads what the target sent, and the target what the initiator sent.
-    apart = ranges.fpp2_dbm[::step] - ranges.fpp1_dbm[::step]
+    apart = ranges.fpp2_dbm[rows] - ranges.fpp1_dbm[rows]
     known = np.isfinite(apart)
-    both = np.column_stack([ranges.initiator[::step], ranges.target[::step]])[known]
-    ends, number, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
+    rows, apart = rows[known], apart[known]
+    tags, code = np.unique(np.concatenate([ranges.initiator[rows], ranges.target[rows]]), return_inverse=True)
+    first, second = np.split(code, 2)
+    pair, number, count = np.unique(first * len(tags) + second, return_inverse=True, return_counts=True)
     enough = np.flatnonzero(count >= FEWEST)
     if not len(enough):
         return {}
-    parts = [apart[known][number.ravel() == k] for k in enough]
-    tags = np.unique(ends[enough])
-    rows = np.subtract(*(np.equal.outer(ends[enough, end], tags).astype(float) for end in (0, 1)))
-    inverse = np.linalg.pinv(rows)
+    parts = [apart[number == k] for k in enough]
+    ends = np.divmod(pair[enough], len(tags))
+    told = np.unique(ends)
+    inverse = np.linalg.pinv(np.subtract(*(np.equal.outer(end, told).astype(float) for end in ends)))
     std = np.array([MEDIAN * robust_spread(part) / np.sqrt(len(part)) for part in parts])
     levels: Floats = inverse @ np.array([np.median(part) for part in parts])
     near = np.abs(np.subtract.outer(levels, levels)) < ALIKE_DB
     levels -= levels[near[np.argmax(near.sum(axis=1))]].mean()
     spreads = np.sqrt(inverse**2 @ std**2)
-    return dict(zip(tags.tolist(), zip(levels.tolist(), spreads.tolist(), strict=True), strict=True))
+    return dict(zip(tags[told].tolist(), zip(levels.tolist(), spreads.tolist(), strict=True), strict=True))
+
+
+def _spread(count: int) -> Ints:
+    """Return which of so many ranges are looked at, in their order."""
+    if count <= ENOUGH:
+        return np.arange(count)
+    number = np.arange(ENOUGH)
+    return np.asarray((number + number * GOLDEN % 1) * count / ENOUGH, dtype=np.int64)
 
 
 def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:
     """Return what a delay takes, in ns, where its tag reads powers a decibel too high: at one end of a range of two."""
-    step = max(len(ranges) // ENOUGH, 1)
-    powers = ranges.fpp1_dbm[::step], ranges.fpp2_dbm[::step]
+    rows = _spread(len(ranges))
+    powers = ranges.fpp1_dbm[rows], ranges.fpp2_dbm[rows]
     lifted = [
         lifted_power(*both, calibration.lift, calibration.alpha_dbm)
         for both in (powers, (powers[0] + 1, powers[1]), (powers[0], powers[1] + 1))

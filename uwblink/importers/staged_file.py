@@ -171,6 +171,6 @@ def missing_column(table: Table, column_map: ColumnMap, name: str) -> ImportTabl
     """Return the error that says which column a table lacks."""
     remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
     if {"qx", "qy", "qz", "qw"} <= {header.lower() for header in table.names}:
-        remedy = "these are poses; `uwblink poses RECORDING --from FILE` puts them into a recording"
+        remedy = "these are poses, which `uwblink poses` puts into a recording"
     there = ", ".join(table.names)[:400]
     return ImportTableError(f"{table.path}: column {column_map.header(name)!r} is missing; there are {there}; {remedy}")

@@ -68,7 +68,7 @@ def same(found, rows, bits=32):
 
 def test_poses_are_told_from_exchanges(tmp_path):
     path = write(tmp_path / "t.csv", [dict.fromkeys(("time_s", "body", "x", "y", "z", "qx", "qy", "qz", "qw"), 1)] * 3)
-    with pytest.raises(ImportTableError, match="these are poses; `uwblink poses RECORDING --from FILE`"):
+    with pytest.raises(ImportTableError, match="these are poses, which `uwblink poses` puts into"):
         read_table(path)
 
 
