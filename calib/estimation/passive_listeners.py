@@ -52,7 +52,7 @@ def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDel
             return {}
         poses, tags = source.poses, list(source.tags)
         protocols = set(np.unique(source.exchanges.protocol).tolist())
-    if not len(poses) or not protocols <= set(third_from_target()):
+    if not len(poses) or set(third_from_target(protocols)) != protocols:
         return {}
     sides = [("initiator", "target"), ("target", "listener"), ("initiator", "listener")]
     near, away, across = (distances_m(poses, tags, heard[a], heard[b], heard["time_ns"]) for a, b in sides)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 from uwblink.errors import ArgumentError
@@ -111,6 +112,9 @@ def is_single_sided(name: str) -> bool:
     return name in PROTOCOLS and PROTOCOLS[name].third_sender is None
 
 
-def third_from_target() -> tuple[str, ...]:
-    """Return the names of the protocols whose third message the target sends."""
-    return tuple(row.name for row in PROTOCOLS.values() if row.third_sender == "target")
+def third_from_target(names: Iterable[str]) -> list[str]:
+    """Return those of some protocols whose third message the target sends.
+
+    Others of other distributions are looked for only where one of the names is not known so far.
+    """
+    return [name for name in names if name in PROTOCOLS and PROTOCOLS[name].third_sender == "target"]

@@ -64,7 +64,7 @@ def target_faster_ppm(exchanges: Exchanges) -> Floats:
     both, else the first and the third. Antenna delays cancel.
     """
     spans = intervals(exchanges)
-    from_target = np.isin(exchanges.protocol, third_from_target())
+    from_target = np.isin(exchanges.protocol, third_from_target(names_in(exchanges.protocol)))
     with np.errstate(all="ignore"):
         target = np.where(from_target, spans.dt53, spans.dt32 + spans.dt64)
         initiator = np.where(from_target, spans.dt64, spans.dt41 + spans.dt53)
