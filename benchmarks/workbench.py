@@ -122,7 +122,7 @@ def variances() -> str:
     return f"{100 * abs(exact.var() / fast.var() - 1):.2f} %"
 
 
-def sweep(workers: str, seeds: str = "60") -> str:
+def sweep(workers: str, seeds: str = "120") -> str:
     """Seconds of a sweep."""
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
