@@ -166,9 +166,13 @@ def test_boards_are_streamed_and_recorded_by_the_command_until_the_time_is_over(
     assert len(rows) > 10
     assert {(row["initiator"], row["target"]) for row in rows} == {(1, 2), (1, 3), (2, 3)}
     assert f"{len(rows)} ranges" in done.stderr
-    recorded = uwblink.load(out).exchanges
-    assert [row["time_ns"] for row in rows] == recorded.time_ns.tolist()
-    assert [row["range_m"] for row in rows] == recorded.range_m.tolist()
+    loaded = uwblink.load(out)
+    recorded = dict(zip(loaded.exchanges.time_ns.tolist(), loaded.exchanges.range_m.tolist(), strict=True))
+    streamed = {row["time_ns"]: row["range_m"] for row in rows}
+    # On a machine that is held up, a report that comes after its turn has timed out is in the file alone, with a fault.
+    too_late = recorded.keys() - streamed.keys()
+    assert len(too_late) <= sum(fault.kind == "time-out" for fault in loaded.faults)
+    assert streamed == {time_ns: range_m for time_ns, range_m in recorded.items() if time_ns not in too_late}
 
 
 def test_ranges_are_called_back_while_boards_are_recorded(tmp_path):
