@@ -253,12 +253,12 @@ def _commits(recording: Recording, batch: writer.Batch) -> str:
 
 
 def commands(path: Path) -> None:
-    """Measure commits into a recording, and each command on it."""
-    growth(path)
+    """Measure each command on a recording, and then commits into it, which leave rows of another time there."""
     print("| command | processor time | largest memory |")
     print("|---|---|---|")
     for words, seconds, memory_mb in measured(path):
         print(f"| `{words}` | {seconds:.1f} s | {memory_mb:.0f} MB |", flush=True)
+    growth(path)
 
 
 def measured(path: Path) -> Iterator[tuple[str, float, float]]:

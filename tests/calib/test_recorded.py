@@ -112,10 +112,14 @@ def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
     assert parts == [3000]
 
 
-def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeypatch):
+@pytest.mark.parametrize("moved", [0, 20])
+def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeypatch, moved):
+    """Also where the clock was set back, so that the last rows are of the beginning."""
     flight = sample_flight(3000)
-    path = written(tmp_path / "it.uwb", flight.exchanges, flight.poses, flight.tags)
-    held: list[int] = []
+    rows = np.roll(np.arange(3000), -moved)
+    path = written(tmp_path / "it.uwb", flight.exchanges[rows], flight.poses, flight.tags)
+    whole, held = of_all(path), list[int]()
+    monkeypatch.setattr(blocks, "LEAP_NS", int(np.ptp(flight.exchanges.time_ns)) // 2)
     monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**8)
     monkeypatch.setattr(blocks, "POSES_AT_ONCE", len(flight.poses) // 20)
     window = blocks.PoseWindows.window
@@ -130,6 +134,7 @@ def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeyp
         found = read_ranges(recording, "it", need_power=True)
     assert found is not None
     assert len(found) == 3000
+    assert_same(found, whole)
     assert len(held) > 10
     assert max(held) < len(flight.poses) / 10
 

@@ -27,6 +27,10 @@ POSES_AT_ONCE: Final = 500_000
 MARGIN_NS: Final = 1_000_000_000
 """Poses are looked for so far before and after a stretch of time, and farther where a body has none there."""
 
+LEAP_NS: Final = 60_000_000_000
+MOST_LEAPS: Final = 50
+"""Times that are farther apart stand in stretches of their own; more of them in a block are how it was recorded."""
+
 
 def read_exchanges(store: Store, bits: int, where: str = "") -> Exchanges:
     """Return exchanges in the order in which they were written; raises `RecordingError`."""
@@ -130,11 +134,17 @@ class PoseWindows:
             return
         # A range belongs to the middle of its first two messages, which is after its time, by half a wrap at most.
         later = int(2**exchanges.bits * TICK_S * 0.5e9) + 1
+        for begin, end in pairwise([0, *_leaps(exchanges.time_ns), len(exchanges)]):
+            some = exchanges if end - begin == len(exchanges) else exchanges[begin:end]
+            for part in self._parts(some):
+                yield part, self.window(int(part.time_ns.min()), int(part.time_ns.max()) + later)
+
+    def _parts(self, exchanges: Exchanges) -> Iterator[Exchanges]:
+        """Yield exchanges in as many parts as it takes that none has many poses around it."""
         expected = self._expected(int(exchanges.time_ns.min()), int(exchanges.time_ns.max()))
         parts = min(int(expected / POSES_AT_ONCE) + 1, len(exchanges))
         for begin, end in pairwise((np.arange(parts + 1) * len(exchanges) // parts).tolist()):
-            part = exchanges[begin:end]
-            yield part, self.window(int(part.time_ns.min()), int(part.time_ns.max()) + later)
+            yield exchanges[begin:end]
 
     def _expected(self, start_ns: int, end_ns: int) -> float:
         """Return about how many poses there are in a stretch of time, if those of a body lie evenly."""
@@ -182,6 +192,15 @@ class PoseWindows:
             mine = np.isin(code, np.array([*codes.values()], dtype=np.uint64))
             r, code = {name: column[mine] for name, column in r.items()}, code[mine]
         return Window(time_ns=r["time_ns"], columns={name: r[name] for name in POSE}, code=code, codes=codes)
+
+
+def _leaps(time_ns: Ints) -> list[int]:
+    """Return where times (n,) leap, as where a clock was set: one that stands elsewhere would have all poses between.
+
+    Nowhere where they leap often, as in a recording of few exchanges.
+    """
+    found = np.flatnonzero(np.abs(np.diff(time_ns)) > LEAP_NS) + 1
+    return found.tolist() if len(found) <= MOST_LEAPS else []
 
 
 def _meet(span: tuple[int, int, int], start_ns: int, end_ns: int) -> bool:
