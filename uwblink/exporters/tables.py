@@ -17,6 +17,11 @@ from uwblink.recording.schema import TABLES
 MEMORY: Final = "400MB"
 """What DuckDB may keep of the file that it reads; what it writes comes on top of that."""
 
+THREADS: Final = (None, 1)
+"""Threads to write with, as many as DuckDB likes first: what one of them is behind with, the others keep in memory, so
+that it may not suffice; one alone needs hardly any.
+"""
+
 CSV_CELLS: Final = {"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"}
 
 
@@ -37,24 +42,39 @@ def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapp
         # What every reader checks is checked here too, before the file is read past it.
         counts = {table: opened.count(table) for table in TABLES}
     paths = {table: folder / f"{table}.{suffix}" for table in TABLES}
-    with duckdb.connect(":memory:") as db:
+    wanted = {table: paths[table] for table in TABLES if counts[table] or table == "exchanges"}
+    for threads in THREADS:
         try:
-            # What a link leads to has its log beside it, not beside the link.
-            place = recording.resolve()
-            allowed = [str(place), f"{place}.wal", *map(str, paths.values())]
-            db.execute("SET allowed_paths = ?", [allowed])
-            db.execute("SET enable_progress_bar = false")
-            db.execute("SET preserve_insertion_order = true")
-            db.execute(f"SET memory_limit = '{MEMORY}'")
-            db.execute("SET enable_external_access = false")
-            db.execute("SET lock_configuration = true")
-            db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
-            for table, path in paths.items():
-                if counts[table] or table == "exchanges":
-                    db.execute(f"COPY ({_query(db, table, cells)}) TO {_literal(path)} ({_options(options, table)})")
+            _copy(recording, wanted, options, cells, threads)
+            break
         except duckdb.Error as error:
+            if threads is None and isinstance(error, duckdb.OutOfMemoryException):
+                continue
             raise RecordingError(f"{recording}: cannot be exported ({first_line(error)})") from error
     return {path.name: counts[table] for table, path in paths.items() if path.exists()}
+
+
+def _copy(
+    recording: Path, wanted: Mapping[str, Path], options: str, cells: Mapping[str, str], threads: int | None
+) -> None:
+    """Write tables to their paths by so many threads; raises what DuckDB raises."""
+    import duckdb
+
+    with duckdb.connect(":memory:") as db:
+        # What a link leads to has its log beside it, not beside the link.
+        place = recording.resolve()
+        allowed = [str(place), f"{place}.wal", *map(str, wanted.values())]
+        db.execute("SET allowed_paths = ?", [allowed])
+        db.execute("SET enable_progress_bar = false")
+        db.execute("SET preserve_insertion_order = true")
+        db.execute(f"SET memory_limit = '{MEMORY}'")
+        if threads is not None:
+            db.execute(f"SET threads = {threads}")
+        db.execute("SET enable_external_access = false")
+        db.execute("SET lock_configuration = true")
+        db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
+        for table, path in wanted.items():
+            db.execute(f"COPY ({_query(db, table, cells)}) TO {_literal(path)} ({_options(options, table)})")
 
 
 def _query(db: object, table: str, cells: Mapping[str, str]) -> str:

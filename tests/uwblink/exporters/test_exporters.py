@@ -8,7 +8,7 @@ import pytest
 
 from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is a fixture
 from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
-from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
+from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter, tables
 from uwblink.importers import import_recording
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
@@ -131,3 +131,26 @@ def test_a_link_to_a_recording_is_exported_like_the_recording(tmp_path, to):
     (tmp_path / "link.uwb").symlink_to(tmp_path / "there" / "r.uwb")
     written = export_recording(tmp_path / "link.uwb", tmp_path / "out", to=to)
     assert written[f"exchanges.{to}"] == 1
+
+
+@pytest.mark.parametrize("to", ["csv", "parquet"])
+def test_what_several_threads_have_no_memory_for_is_written_by_one(whole, tmp_path, monkeypatch, to):
+    """And what one has none for either is one line."""
+    copy, asked = tables._copy, []
+
+    def no_room_for_many(*given):
+        asked.append(given[-1])
+        if given[-1] != alone:
+            raise duckdb.OutOfMemoryException("Out of Memory Error: failed to pin block")
+        return copy(*given)
+
+    plain = export_recording(whole, tmp_path / "plain", to=to)
+    monkeypatch.setattr(tables, "_copy", no_room_for_many)
+    alone = 1
+    assert export_recording(whole, tmp_path / "alone", to=to) == plain
+    assert asked == [None, 1]
+    for file in (tmp_path / "plain").iterdir():
+        assert (tmp_path / "alone" / file.name).read_bytes() == file.read_bytes()
+    alone = 0
+    with pytest.raises(RecordingError, match=r"cannot be exported \(Out of Memory Error: failed to pin block\)"):
+        export_recording(whole, tmp_path / "none", to=to)
