@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.columns import few_words
 from uwblink.errors import RecordingError, RecordingInUseError, first_line
+from uwblink.recording.batches import batch_of
 from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 from uwblink.recording.soundness import check_length, check_name, damaged, is_locked, log_of
@@ -182,28 +182,11 @@ class Store:
             raise RecordingError(f"{self.path}: table {table}: columns of different lengths, {lengths}")
         if not lengths or not lengths[names[0]]:
             return
-        batch: dict[str, NDArray[Any]] = {}
-        values, bound = [], list[Any]()
-        for name in names:
-            column = columns[name]
-            batch[name] = np.ascontiguousarray(np.ma.getdata(column))
-            values.append(f'"{name}"')
-            if (coded := few_words(column)) is not None:
-                # Words of an array are sorted, which would be the longest part of an insertion.
-                bound.append(coded[0].tolist())
-                batch[name] = coded[1] + 1
-                values[-1] = f'CAST(? AS VARCHAR[])["{name}"]'
-            if TABLES[table][name] == "BLOB":
-                # Not every version takes bytes from an array; all take digits.
-                batch[name] = np.array([data.hex() for data in batch[name].tolist()], dtype=object)
-                values[-1] = f'unhex("{name}")'
-            if np.ma.is_masked(column):
-                batch[f"no_{name}"] = np.ma.getmaskarray(column)
-                values[-1] = f'CASE WHEN "no_{name}" THEN NULL ELSE {values[-1]} END'
+        batch = batch_of(table, {name: columns[name] for name in names})
         listed = ", ".join(f'"{name}"' for name in names)
-        self._db.register("batch", batch)
+        self._db.register("batch", batch.columns)
         with self._fitting(table):
-            self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch", bound)  # noqa: S608 - keys of TABLES
+            self.execute(f"INSERT INTO {table} ({listed}) SELECT {batch.values} FROM batch", batch.bound)  # noqa: S608 - keys of TABLES
         self._db.unregister("batch")
 
     def insert_row(self, table: str, values: list[Any]) -> None:
