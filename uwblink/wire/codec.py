@@ -62,13 +62,10 @@ class Decoder:
         self._terminator = _terminator(next(iter(table)))
         self._texts = TEXTS if self._terminator == b"\r\n" else ()
         self._starts = (*self._texts, *table)
-        plausible = [re.escape(text) for text in self._texts] + [re.escape(key + BAR) for key in table]
-        ended = [re.escape(self._terminator + key) for key in table]
-        self._resume = re.compile(b"|".join([*ended, *plausible]), re.DOTALL)
-        self._longest_start = max(map(len, self._starts)) + 3
+        self._first_byte = re.compile(b"[%s]" % b"".join({re.escape(start[:1]) for start in self._starts}))
+        self._longest_start = max(map(len, self._starts))
         self._buffer = b""
-        self._tail = b""
-        self._clean = True
+        self._before = self._terminator  # the last bytes before the buffer; after something understood, a line end
         self.messages = 0
         self.skipped_bytes = 0
 
@@ -79,7 +76,7 @@ class Decoder:
 
     def take_back(self) -> bytes:
         """Return the bytes of a message that has only begun, and forget them; none while in the middle of damage."""
-        if not self._clean:
+        if not self._clean(b""):
             return b""
         data, self._buffer = self._buffer, b""
         return data
@@ -87,52 +84,58 @@ class Decoder:
     @property
     def between_messages(self) -> bool:
         """Whether everything so far was understood or skipped, and the next byte begins a message."""
-        return self._clean and not self._buffer
+        return self._clean(b"") and not self._buffer
 
     @property
     def begun(self) -> bytes:
         """The key of a message that has begun and is not complete, empty without one."""
-        return self._buffer[:3] if self._clean else b""
+        return self._buffer[:3] if self._clean(b"") else b""
 
     def finish(self) -> list[Event]:
         """Return what is left when no more bytes will come."""
         return self._drain(final=True)
 
     def _drain(self, *, final: bool) -> list[Event]:
+        """Return the events of the buffer, and keep what only more bytes can decide.
+
+        Places are tried one after the other, and what a place holds depends on the bytes before it and on as many
+        after it as it takes to decide. So events do not depend on the pieces in which the bytes came.
+        """
         events: list[Event] = []
-        buffer, at = self._buffer, 0
+        buffer, start, at = self._buffer, 0, 0  # buffer[start:at] is no message
         while at < len(buffer):
             try:
-                event, end = self._understand(buffer, at)
-            except NeedMore:
-                if not final:
+                event, end = self._understand(buffer, at, clean=self._clean(buffer[max(start, at - 2) : at]))
+            except (NeedMore, Malformed) as undecided:
+                if isinstance(undecided, NeedMore) and not final:
                     break
-                end = self._next_start(buffer, at, final=True)
-                event = None
-            except Malformed:
-                end = self._next_start(buffer, at, final=final)
-                event = None
-            if end == at:
-                break
-            if event is None:
-                event = Skipped(buffer[at:end], "not a message")
-                self.skipped_bytes += end - at
-                # A line end may have come in two pieces, each of them skipped.
-                self._tail = (self._tail + buffer[at:end])[-len(self._terminator) :]
-                self._clean = self._tail == self._terminator
-            else:
-                self.messages += 1
-                self._tail, self._clean = b"", True
-            events.append(event)
-            at = end
+                found = self._first_byte.search(buffer, at + 1)
+                at = found.start() if found else len(buffer)
+                continue
+            events += [*self._skip(buffer[start:at]), event]
+            self.messages += 1
+            self._before = self._terminator
+            start = at = end
+        events += self._skip(buffer[start:at])
         self._buffer = buffer[at:]
         return events
 
-    def _understand(self, buffer: bytes, at: int) -> tuple[Event, int]:
+    def _skip(self, data: bytes) -> list[Event]:
+        if not data:
+            return []
+        self.skipped_bytes += len(data)
+        self._before = (self._before + data)[-len(self._terminator) :]
+        return [Skipped(data, "not a message")]
+
+    def _clean(self, skipped: bytes) -> bool:
+        """Whether a line ends with the last of these skipped bytes, which may hold its end in part."""
+        return (self._before + skipped).endswith(self._terminator)
+
+    def _understand(self, buffer: bytes, at: int, *, clean: bool) -> tuple[Event, int]:
         """Return the message or text at a place and where it ends, or say why there is none."""
         key = buffer[at : at + 3]
         kind = self._table.get(key)
-        if kind is not None and (self._clean or buffer[at + 3 : at + 4] == BAR):
+        if kind is not None and (clean or buffer[at + 3 : at + 4] == BAR):
             return self._message(kind, buffer, at)
         for text in self._texts:
             if buffer.startswith(text, at):
@@ -170,31 +173,6 @@ class Decoder:
         if end < 0:
             raise Malformed if len(buffer) - at > LONGEST_TEXT + len(until) else NeedMore
         return end
-
-    def _next_start(self, buffer: bytes, at: int, *, final: bool) -> int:
-        """Return the first place after `at` at which a message could start."""
-        # The byte before the first candidate may be the end of a line.
-        found = self._resume.search(buffer, at)
-        while found:
-            place = found.start()
-            if buffer.startswith(self._terminator, place):
-                place += len(self._terminator)
-            if place > at:
-                return place
-            found = self._resume.search(buffer, found.start() + 1)
-        if final:
-            return len(buffer)
-        return self._partial_start(buffer, at)
-
-    def _partial_start(self, buffer: bytes, at: int) -> int:
-        """Return where the last bytes could be the first of a start that is not complete yet."""
-        for place in range(max(at + 1, len(buffer) - self._longest_start), len(buffer)):
-            rest = buffer[place:]
-            after_line = (self._terminator + start for start in self._starts)
-            with_bar = (key + BAR for key in self._table)
-            if any(s.startswith(rest) for s in (*after_line, *with_bar, *self._texts)):
-                return place
-        return len(buffer)
 
 
 def _expect(buffer: bytes, at: int, what: bytes) -> int:

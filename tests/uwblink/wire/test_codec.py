@@ -1,5 +1,6 @@
 """The codec against captured bytes, and against arbitrary ones."""
 
+import itertools
 from collections import Counter
 
 import numpy as np
@@ -163,12 +164,34 @@ def test_endless_garbage_does_not_pile_up():
     assert decoder.skipped_bytes > 300_000
 
 
+GARBAGE = [b"\x00", b"\r", b"\n"]
+FRAGMENTS = [
+    (m.REPORTS, [*GARBAGE, b"R00", b"R01|7"], 4),
+    (m.REPORTS, [*GARBAGE, b"R00\r", b"R", b"S06|\x01\x00", b"No next key character found."], 3),
+    (m.COMMANDS, [*GARBAGE, b"C00", b"C06|\x01\x00"], 4),
+]
+
+
+@pytest.mark.parametrize(("table", "fragments", "most"), FRAGMENTS, ids=["ids", "payloads", "commands"])
+def test_short_streams_decode_alike_wherever_they_are_cut(table, fragments, most):
+    for count in range(1, most + 1):
+        for data in map(b"".join, itertools.product(fragments, repeat=count)):
+            whole = understood(decode(data, table))
+            for cut in range(1, len(data)):
+                assert understood(decode(data, table, [cut])) == whole, (data, cut)
+            assert understood(decode(data, table, [1] * len(data))) == whole, data
+
+
+@pytest.mark.parametrize("line_end", [b"\r\n", b"\r\r\n", b"\n\r\n"])
+def test_a_line_end_of_garbage_may_come_in_two_chunks(line_end):
+    data = b"\x00" * 20 + line_end + b"R00\r\n"
+    for cut in range(len(data)):
+        assert understood(decode(data, m.REPORTS, [cut])) == [m.IdleSet()]
+
+
+SPLICES = [b"\r\n", b"\r", b"\n", b"R00\r\n", b"R05|", b"S06|\x03\x00", b"S10|", b"R0", b"S01|1"]
 ANYTHING = st.lists(
-    st.one_of(
-        st.binary(max_size=40),
-        st.sampled_from(REPORTED + COMMANDED + [b"\r\n", b"\r", b"R05|", b"S06|\x03\x00", b"S10|", b"R0", b"S01|1"]),
-    ),
-    max_size=12,
+    st.one_of(st.binary(max_size=40), st.sampled_from(REPORTED + COMMANDED), st.sampled_from(SPLICES)), max_size=12
 ).map(b"".join)
 
 
