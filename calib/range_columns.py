@@ -11,8 +11,7 @@ from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.tracks import Tracks
-from uwblink.ticks import TICK_S
-from uwblink.twr import Exchanges, delay_weights, intervals, raw_range, without_stamps
+from uwblink.twr import Exchanges, delay_weights, middle_ns, raw_range, without_stamps
 
 NO_STAMPS: Final = "range"
 """What stands for the protocol of a range that came without stamps."""
@@ -60,7 +59,7 @@ def _of_stamps(exchanges: Exchanges) -> tuple[Floats, Floats, Floats, Ints]:
         rows = slice(begin, begin + ROWS_AT_ONCE)
         some = exchanges[rows]
         raw[rows], (initiator[rows], target[rows]) = raw_range(some), delay_weights(some)
-        middle[rows] = some.time_ns + np.rint(intervals(some).dt41 * (TICK_S * 5e8)).astype(np.int64)
+        middle[rows] = middle_ns(some)
     return raw, initiator, target, middle
 
 

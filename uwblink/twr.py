@@ -213,6 +213,11 @@ def intervals(exchanges: Exchanges) -> Intervals:
     )
 
 
+def middle_ns(exchanges: Exchanges) -> Ints:
+    """Return the middle of the first two messages (n,) in ns: the time that a range belongs to."""
+    return exchanges.time_ns + np.rint(intervals(exchanges).dt41 * (TICK_S * 5e8)).astype(np.int64)
+
+
 def time_of_flight(exchanges: Exchanges) -> Floats:
     """Raw time of flight in seconds, shape (n,): each row by the formula of its protocol.
 

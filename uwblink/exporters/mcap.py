@@ -9,18 +9,20 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from heapq import merge
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import numpy as np
 
+from uwblink.arrays import Floats
 from uwblink.errors import RecordingError
 from uwblink.exporters.corrections import corrections
 from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
-from uwblink.recording.pieces import READING_MB, pieces
+from uwblink.recording.pieces import READING_MB, distances_by_poses_m, pieces
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x0F
@@ -43,7 +45,8 @@ def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
 
 def _messages(recording: Recording) -> Iterator[Message]:
     for held in pieces(recording):
-        parts = (_poses(held), _ranges(held), _imu(held), _heights(held), _temperatures(held), _faults(held))
+        (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
+        parts = (_poses(held), _ranges(held, by_poses), _imu(held), _heights(held), _temperatures(held), _faults(held))
         yield from merge(*parts, key=lambda message: message[0])
 
 
@@ -101,8 +104,8 @@ def _poses(held: Contents) -> Iterator[Message]:
         yield time_ns, "/tf", "foxglove.FrameTransform", frames | {"translation": position, "rotation": attitude}
 
 
-def _ranges(held: Contents) -> Iterator[Message]:
-    e = held.exchanges
+def _ranges(held: Contents, by_poses: Floats) -> Iterator[Message]:
+    e = replace(held.exchanges, truth_m=np.where(np.isfinite(held.exchanges.truth_m), held.exchanges.truth_m, by_poses))
     names = ("initiator", "target", "protocol", *NUMBERS)
     columns = {name: getattr(e, name).tolist() for name in names} | corrections(held)
     for k in np.argsort(e.time_ns, kind="stable").tolist():

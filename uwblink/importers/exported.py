@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.staging import confined
 from uwblink.recording.contents import Contents, load
-from uwblink.recording.schema import TABLES
+from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
 from uwblink.recording.store import Store
+
+if TYPE_CHECKING:
+    import duckdb
 
 SUFFIXES: Final = (".csv", ".parquet")
 _FROM_TEXT: Final = {"BLOB": "unhex({0})"}
@@ -42,25 +46,34 @@ def _path(folder: Path, table: str) -> Path | None:
 def _take(store: Store, table: str, source: Path) -> None:
     import duckdb
 
-    columns = TABLES[table]
-    names = ", ".join(f'"{name}"' for name in columns)
-    if source.suffix == ".csv":
-        kinds = ", ".join(f"'{name}': 'VARCHAR'" for name in columns)
-        reader = (
-            f"read_csv(?, auto_detect=false, header=true, delim=',', quote='\"', escape='\"', nullstr='', "
-            f"allow_quoted_nulls=false, columns={{{kinds}}}, max_line_size=64000000, parallel=false)"
-        )
-        cells = (_cell(name, kind) for name, kind in columns.items())
-        query = f"SELECT {', '.join(cells)} FROM {reader}"  # noqa: S608 - names are keys of TABLES
-    else:
-        query = f"SELECT {names} FROM read_parquet(?)"  # noqa: S608 - names are keys of TABLES
     with confined([source]) as db:
         try:
-            store.insert(table, dict(db.execute(query, [str(source)]).fetchnumpy()))
-        except duckdb.Error as error:
+            store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
+        except (duckdb.Error, UnicodeDecodeError, csv.Error) as error:
             raise ImportTableError(f"{source}: not as 'uwblink export' wrote it ({first_line(error)})") from error
 
 
-def _cell(name: str, kind: str) -> str:
-    text = _FROM_TEXT.get(kind, "{0}").format(f'"{name}"')
-    return f'CAST({text} AS {kind}) AS "{name}"'
+def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
+    """Return what reads a table, in which nothing but our names is SQL."""
+    columns, read = TABLES[table] | {TRUTH_FROM: "VARCHAR"}, "read_parquet(?)"
+    if source.suffix == ".csv":
+        with source.open(encoding="utf-8-sig", newline="") as file:
+            header = next(csv.reader(file), [])
+        there = [name if name in columns else f"other{k}" for k, name in enumerate(header)]
+        kinds = ", ".join(f"'{name}': 'VARCHAR'" for name in there)
+        read = (
+            f"read_csv(?, auto_detect=false, header=true, delim=',', quote='\"', escape='\"', nullstr='', "
+            f"allow_quoted_nulls=false, columns={{{kinds}}}, max_line_size=64000000, parallel=false)"
+        )
+    else:
+        found = db.execute(f"DESCRIBE SELECT * FROM {read}", [str(source)]).fetchall()  # noqa: S608 - nothing of a file
+        there = [str(row[0]) for row in found]
+    cells = {name: f'"{name}"' for name in TABLES[table]}
+    if source.suffix == ".csv":
+        texts = {name: _FROM_TEXT.get(kind, "{0}").format(cells[name]) for name, kind in TABLES[table].items()}
+        cells = {name: f"CAST({text} AS {TABLES[table][name]})" for name, text in texts.items()}
+    if TRUTH_FROM in there and table == "exchanges":
+        # Where the distance is that of the poses, which come in, too.
+        cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
+    listed = ", ".join(f'{cell} AS "{name}"' for name, cell in cells.items())
+    return f"SELECT {listed} FROM {read}"  # noqa: S608 - keys of TABLES

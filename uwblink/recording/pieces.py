@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.arrays import Floats
 from uwblink.recording.contents import Contents
+from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses
-from uwblink.twr import Exchanges
+from uwblink.twr import Exchanges, middle_ns
 
 ROWS_AT_ONCE: Final = 50_000
 """Rows of a table that a piece has, about."""
@@ -64,6 +66,20 @@ def _fits(recording: Recording) -> bool:
 
 def _equal(one: dict[str, NDArray[Any]], other: dict[str, NDArray[Any]]) -> bool:
     return all(np.array_equal(one[name], other[name]) for name in ENDS)
+
+
+def distances_by_poses_m(recording: Recording, blocks: Iterable[Exchanges]) -> Iterator[Floats]:
+    """Yield the distances (n,) at which the antennas of each block of exchanges were by the poses; NaN without poses.
+
+    A distance is that in the middle of the first two messages, to which a range belongs.
+    """
+    windows, tags = recording.pose_windows(), recording.tags()
+    for exchanges in blocks:
+        parts = (
+            distances_m(tracks, tags, some.initiator, some.target, middle_ns(some))
+            for some, tracks in windows.tracks_beside(exchanges)
+        )
+        yield np.concatenate([np.empty(0), *parts])
 
 
 def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Poses]]:

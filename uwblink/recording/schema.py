@@ -93,6 +93,10 @@ TABLES: Final[dict[str, dict[str, str]]] = {
     },
 }
 
+TRUTH_FROM: Final = "truth_from"
+BY_POSES: Final = "poses"
+"""The column of exported exchanges that says where `truth_m` is from, and what it says of distances by poses."""
+
 ADDED_LATER: Final = {
     "faults": frozenset({"initiator", "target"}),
     "imu": frozenset(TABLES["imu"]),

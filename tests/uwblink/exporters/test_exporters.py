@@ -8,11 +8,11 @@ import pytest
 
 from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is a fixture
 from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
-from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter, tables
+from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 from uwblink.importers import import_recording
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import TABLES, Fault, Poses
+from uwblink.recording.schema import TABLES, Fault, Poses, Tag
 from uwblink.twr import Exchanges
 
 
@@ -133,24 +133,41 @@ def test_a_link_to_a_recording_is_exported_like_the_recording(tmp_path, to):
     assert written[f"exchanges.{to}"] == 1
 
 
+@pytest.fixture
+def flown(tmp_path):
+    """One tag on a body that flies along x, half a metre ahead of it; the second of three distances was measured."""
+    exchanges = Exchanges.from_arrays(
+        [1] * 3, [2] * 3, time_ns=[0, 10**9, 10**10], tx1=[0] * 3, rx1=[0] * 3, tx2=[10**8] * 3, rx2=[127_795_200] * 3,
+        truth_m=[np.nan, 7.25, np.nan],
+    )  # fmt: skip
+    poses = Poses.from_arrays([0, 2 * 10**9], ["drone"] * 2, [[0.0, 3.0, 0.0], [4.0, 3.0, 0.0]])
+    mast = Poses.from_arrays([0], ["mast"], [[0.0, 0.0, 0.0]])
+    both = Poses(*(np.concatenate([getattr(p, n) for p in (mast, poses)]) for n in Poses.__slots__))
+    tags = [Tag(1, "mast", (0.0, 0.0, 0.0)), Tag(2, "drone", (0.5, 0.0, 0.0))]
+    Contents(exchanges=exchanges, tags=tags, poses=both).save(tmp_path / "flown.uwb")
+    return tmp_path / "flown.uwb"
+
+
+BY_HAND = [np.hypot(0.5 + 2 * 0.001, 3.0), 7.25]
+"""By a range's middle, 1 ms after its time, the body is at 2 mm; the third exchange is after the last pose."""
+
+
 @pytest.mark.parametrize("to", ["csv", "parquet"])
-def test_what_several_threads_have_no_memory_for_is_written_by_one(whole, tmp_path, monkeypatch, to):
-    """And what one has none for either is one line."""
-    copy, asked = tables._copy, []
+def test_true_distances_are_those_of_the_poses_where_none_was_measured(flown, tmp_path, to):
+    export_recording(flown, tmp_path / "out", to=to)
+    with duckdb.connect() as db:
+        rows = db.execute(
+            f"SELECT truth_m, truth_from FROM read_{to}(?)", [str(tmp_path / "out" / f"exchanges.{to}")]
+        ).fetchall()
+    assert [row[0] for row in rows[:2]] == pytest.approx(BY_HAND, abs=1e-9)
+    assert rows[2] == (None, None)
+    assert [row[1] for row in rows] == ["poses", "measured", None]
+    import_recording(tmp_path / "out", tmp_path / "back.uwb", importer="exported")
+    assert in_order(tmp_path / "back.uwb") == in_order(flown), "what the poses say is not taken for measured"
 
-    def no_room_for_many(*given):
-        asked.append(given[-1])
-        if given[-1] != alone:
-            raise duckdb.OutOfMemoryException("Out of Memory Error: failed to pin block")
-        return copy(*given)
 
-    plain = export_recording(whole, tmp_path / "plain", to=to)
-    monkeypatch.setattr(tables, "_copy", no_room_for_many)
-    alone = 1
-    assert export_recording(whole, tmp_path / "alone", to=to) == plain
-    assert asked == [None, 1]
-    for file in (tmp_path / "plain").iterdir():
-        assert (tmp_path / "alone" / file.name).read_bytes() == file.read_bytes()
-    alone = 0
-    with pytest.raises(RecordingError, match=r"cannot be exported \(Out of Memory Error: failed to pin block\)"):
-        export_recording(whole, tmp_path / "none", to=to)
+def test_messages_have_true_distances_by_the_poses(flown, tmp_path):
+    export_recording(flown, tmp_path / "out", to="mcap")
+    import_recording(tmp_path / "out" / "recording.mcap", tmp_path / "back.uwb")
+    with Recording.open(tmp_path / "back.uwb") as recording:
+        assert recording.exchanges().truth_m == pytest.approx([*BY_HAND, np.nan], abs=1e-9, nan_ok=True)
