@@ -1,4 +1,4 @@
-"""Correct the reports of boards as they come: what a recorder's live page and a stream of ranges ask for."""
+"""Correct exchanges as they come: what a recorder's live page and a stream of ranges ask for."""
 
 from __future__ import annotations
 
@@ -6,23 +6,25 @@ from collections.abc import Callable
 from pathlib import Path
 
 from calib.calibration.model import load_calibration
-from calib.errors import CalibError
-from uwblink.wire.messages import RangeReport
+from calib.calibration.runtime import CorrectedColumns
+from calib.range_columns import columns_of
+from calib.ranges import Ranges
+from uwblink.arrays import Floats
+from uwblink.twr import Exchanges
 
 
-def live_correction(path: Path) -> Callable[[int, RangeReport], dict[str, float]]:
-    """Return a function that corrects a report of an initiator: `corrected_m`, and what else `CorrectedRange` has.
+def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
+    """Return a function that corrects exchanges (n,) to `corrected_m`, and what else `CorrectedColumns` has.
 
-    It returns nothing for a tag that is not calibrated. Raises what `load_calibration` raises.
+    The numbers are those of `calib.apply`. The function raises what `Calibration.apply` raises, as for a tag that is
+    not calibrated. Raises what `load_calibration` raises.
     """
     calibration = load_calibration(path)
 
-    def correct(initiator: int, report: RangeReport) -> dict[str, float]:
-        try:
-            found = calibration.correct(report.range_m, report.fpp1_dbm, report.fpp2_dbm, initiator, report.neighbour)
-        except CalibError:
-            return {}
-        known = found._asdict()
+    def correct(exchanges: Exchanges) -> dict[str, Floats]:
+        columns = columns_of(exchanges, exchanges.truth_m, None, ())
+        ranges = Ranges(source=str(path), excluded={}, planted=None, **columns)
+        known = CorrectedColumns.of(calibration.apply(ranges))._asdict()
         return {"corrected_m": known.pop("range_m"), **known}
 
     return correct

@@ -135,16 +135,7 @@ class Calibration(CalibrationContent):
         ranges = Ranges.from_arrays(
             range_m, initiator=initiator, target=target, fpp1_dbm=fpp1_dbm, fpp2_dbm=fpp2_dbm, weights=weights
         )
-        applied = self.apply(ranges)
-        powered = np.isfinite(applied.lifted)
-        corrected = np.where(powered, applied.corrected_m, applied.delay_corrected_m)
-        return CorrectedColumns(
-            corrected,
-            np.where(powered, applied.sigma_m, np.nan),
-            applied.clamped,
-            applied.sigma_total_m,
-            applied.tail_share,
-        )
+        return CorrectedColumns.of(self.apply(ranges))
 
     def _one(self) -> RangeCorrector:
         """Return the corrector of single ranges, made when it is first asked for."""

@@ -16,6 +16,7 @@ import numpy as np
 from calib.calibration.content import CalibrationContent
 from calib.calibration.error_model import ErrorsAtOnce
 from calib.calibration.pair_offsets import offset_of
+from calib.calibration.parts import CorrectedRanges
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from calib.range_columns import FAINTEST_DBM, LOUDEST_DBM
@@ -48,6 +49,18 @@ class CorrectedColumns(NamedTuple):
     clamped: Bools
     sigma_total_m: Floats
     tail_share: Floats
+
+    @classmethod
+    def of(cls, applied: CorrectedRanges) -> CorrectedColumns:
+        """Return corrected ranges as columns; those without a power have the delays' part only."""
+        powered = np.isfinite(applied.lifted)
+        return cls(
+            np.where(powered, applied.corrected_m, applied.delay_corrected_m),
+            np.where(powered, applied.sigma_m, np.nan),
+            applied.clamped,
+            applied.sigma_total_m,
+            applied.tail_share,
+        )
 
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""

@@ -17,7 +17,7 @@ that came before in the file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from uwblink.recording.schema import Fault
@@ -101,6 +101,9 @@ class Listener:
     >>> abs(farthest.range_m - 3.0) < 0.5
     True
     """
+
+    def on_start(self, pairs: Sequence[Pair]) -> None:
+        """Note which pairs will range; what this raises refuses the recording before anything is written."""
 
     def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
         """Note bytes that came "in" from a port or went "out" to it."""

@@ -12,18 +12,20 @@ import math
 import shutil
 import threading
 from collections import deque
+from collections.abc import Sequence
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from uwblink.boards.corrections import Correction
+from uwblink.boards.corrections import Correction, check_pairs
 from uwblink.boards.listeners import Listener, Pair, Turn
 from uwblink.boards.live_view import SCRIPT, Point, counts, disk, faults_list, table, whole
 from uwblink.boards.progress import Progress
 from uwblink.errors import PortError
 from uwblink.recording.schema import Fault
+from uwblink.wire.bulk import exchanges_of
 
 LOOPBACK: Final = "127.0.0.1"
 MOST_POINTS: Final = 600
@@ -66,12 +68,19 @@ class LivePage(Listener):
         """Where the page is."""
         return f"http://{LOOPBACK}:{self._server.server_address[1]}/"
 
+    def on_start(self, pairs: Sequence[Pair]) -> None:
+        """Raise what the correction raises where it cannot correct ranges of a pair."""
+        check_pairs(self._correct, pairs)
+
     def on_turn(self, turn: Turn) -> None:
         """Keep the range of a turn."""
         if turn.report is None:
             return
-        known = self._correct(turn.pair[0], turn.report) if self._correct else {}
-        point = Point(turn.time_ns, turn.report.range_m, known.get("corrected_m", math.nan))
+        corrected_m = math.nan
+        if self._correct:
+            known = self._correct(exchanges_of([(turn.time_ns, turn.pair[0], turn.report)]))
+            corrected_m = float(known["corrected_m"][0])
+        point = Point(turn.time_ns, turn.report.range_m, corrected_m)
         with self._lock:
             self._series.setdefault(turn.pair, deque(maxlen=MOST_POINTS)).append(point)
 

@@ -87,6 +87,8 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         raise PlanError(
             f"the plan says where {seated} sit, but the boards at the ports are {there}: is it that of others?"
         )
+    for listener in others:
+        listener.on_start(turns)
     meta = _meta(found, plan, turns, passive)
     with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
         seats = {tag.tag: tag for tag in plan.tags}

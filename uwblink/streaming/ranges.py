@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from uwblink.boards.corrections import Correction
-from uwblink.wire.messages import RangeReport
+from uwblink.twr import Exchanges
 
+ENDS: Final = ("time_ns", "initiator", "target")
 LEVELS: Final = ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
 
 
@@ -42,7 +43,7 @@ class StreamedRange:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what is known, by name; numbers that are none are left out, because JSON has no word for them."""
-        ends = {"time_ns": self.time_ns, "initiator": self.initiator, "target": self.target}
+        ends = {name: getattr(self, name) for name in ENDS}
         levels = {name: getattr(self, name) for name in ("range_m", "corrected_m", "sigma_m", *LEVELS)}
         return ends | {name: value for name, value in (levels | dict(self.more)).items() if math.isfinite(value)}
 
@@ -51,16 +52,12 @@ class StreamedRange:
         return json.dumps(self.to_dict(), allow_nan=False)
 
 
-def streamed(time_ns: int, initiator: int, report: RangeReport, correct: Correction | None) -> StreamedRange:
-    """Return a report of an initiator as a range of a stream, corrected where that is possible."""
-    known = dict(correct(initiator, report)) if correct else {}
-    return StreamedRange(
-        time_ns=time_ns,
-        initiator=initiator,
-        target=report.neighbour,
-        range_m=report.range_m,
-        corrected_m=known.pop("corrected_m", math.nan),
-        sigma_m=known.pop("sigma_m", math.nan),
-        more=known,
-        **{name: getattr(report, name) for name in LEVELS},
-    )
+def streamed(exchanges: Exchanges, correct: Correction | None) -> Iterator[StreamedRange]:
+    """Yield exchanges as ranges of a stream, corrected where there is a correction."""
+    names = (*ENDS, "range_m", *LEVELS)
+    known = {name: column.tolist() for name, column in (correct(exchanges) if correct else {}).items()}
+    own = {name: known.pop(name) for name in ("corrected_m", "sigma_m") if name in known}
+    columns = {name: getattr(exchanges, name).tolist() for name in names} | own
+    for row in range(len(exchanges)):
+        more = {name: column[row] for name, column in known.items()}
+        yield StreamedRange(more=more, **{name: column[row] for name, column in columns.items()})

@@ -6,29 +6,29 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from uwblink.boards.corrections import Correction, load_correction
-from uwblink.boards.listeners import Heard, Listener, Turn, as_listeners
+from uwblink.boards.corrections import Correction, check_pairs, load_correction
+from uwblink.boards.listeners import Heard, Listener, Pair, Turn, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import identify
 from uwblink.boards.recorder import Recorder
 from uwblink.errors import ArgumentError
 from uwblink.recording.file import Recording
-from uwblink.streaming.ranges import LEVELS, StreamedRange, streamed
-from uwblink.twr import STAMPS, Exchanges
+from uwblink.streaming.ranges import StreamedRange, streamed
+from uwblink.twr import Exchanges
 from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import RangeReport
 
 Stream = Generator[StreamedRange, None, None]
 LONGEST_SLEEP_S: Final = 0.1
 AT_A_TIME: Final = 10_000
-"""Rows of a recording that are made into Python's numbers at once."""
+"""Rows of a recording that are corrected and made into Python's numbers at once."""
 
 
 def stream(
@@ -78,10 +78,11 @@ def stream(
     found = identify(source, ports)
     turns = chosen.turns(sorted(found))
 
-    def begin(ranges: Listener) -> Recorder:
-        return Recorder(found, chosen, turns, [ranges, *told], ports=ports)
-
-    return _live(begin, correct, duration_s, stop)
+    ranges: deque[StreamedRange] = deque()
+    told = [RangeListener(ranges.append, correct), *told]
+    for listener in told:
+        listener.on_start(turns)
+    return _live(lambda: Recorder(found, chosen, turns, told, ports=ports), ranges, duration_s, stop)
 
 
 def _correction(calibration: str | os.PathLike[str] | Correction | None) -> Correction | None:
@@ -127,6 +128,10 @@ class RangeListener(Listener):
         self._callback, self._correct = callback, _correction(calibration)
         self._came_ns: dict[int, int] = {}
 
+    def on_start(self, pairs: Sequence[Pair]) -> None:
+        """Raise what the correction raises where it cannot correct ranges of a pair."""
+        check_pairs(self._correct, pairs)
+
     def on_message(self, heard: Heard) -> None:
         """Note when a report came."""
         if isinstance(heard.message, RangeReport):
@@ -137,15 +142,14 @@ class RangeListener(Listener):
         if turn.report is not None:
             initiator = turn.pair[0]
             came_ns = self._came_ns.get(initiator, turn.time_ns)
-            (time_ns,) = exchanges_of([(came_ns, initiator, turn.report)]).time_ns.tolist()
-            self._callback(streamed(time_ns, initiator, turn.report, self._correct))
+            for found in streamed(exchanges_of([(came_ns, initiator, turn.report)]), self._correct):
+                self._callback(found)
 
 
 def _live(
-    begin: Callable[[Listener], Recorder], correct: Correction | None, duration_s: float, stop: Callable[[], bool]
+    begin: Callable[[], Recorder], found: deque[StreamedRange], duration_s: float, stop: Callable[[], bool]
 ) -> Stream:
-    found: deque[StreamedRange] = deque()
-    recorder = begin(RangeListener(found.append, correct))
+    recorder = begin()
     try:
         for _ in recorder.steps(duration_s, stop):
             while found:
@@ -161,6 +165,8 @@ def _exchanges(path: Path, correct: Correction | None) -> Exchanges:
         if correct and "calibration" in recording.meta():
             raise ArgumentError(f"{path}: its ranges are corrected already; stream it without `calibration`")
         found = recording.exchanges()
+    if correct and len(found):  # one of each pair, so that what cannot be corrected is told before the first range
+        correct(found[np.unique(np.column_stack([found.initiator, found.target]), axis=0, return_index=True)[1]])
     return found[np.argsort(found.time_ns, kind="stable")]
 
 
@@ -170,20 +176,11 @@ def _play(
     start_s = time.monotonic()
     first_ns = int(exchanges.time_ns[0]) if len(exchanges) else 0
     for start in range(0, len(exchanges), AT_A_TIME):
-        part = exchanges[start : start + AT_A_TIME]
-        rows = zip(part.time_ns.tolist(), part.initiator.tolist(), _reports(part), strict=True)
-        for time_ns, initiator, report in rows:
-            since_s = (time_ns - first_ns) * 1e-9
+        for found in streamed(exchanges[start : start + AT_A_TIME], correct):
+            since_s = (found.time_ns - first_ns) * 1e-9
             if since_s > duration_s or not _wait_until(start_s + since_s / speed, stop):
                 return
-            yield streamed(time_ns, initiator, report, correct)
-
-
-def _reports(exchanges: Exchanges) -> Iterable[RangeReport]:
-    """Return exchanges as the reports that boards would have sent."""
-    names = ("target", "range_m", *STAMPS, *LEVELS)
-    columns = (getattr(exchanges, name).tolist() for name in names)
-    return (RangeReport(*row) for row in zip(*columns, strict=True))
+            yield found
 
 
 def _wait_until(due_s: float, stop: Callable[[], bool]) -> bool:

@@ -74,7 +74,7 @@ def recorded(tmp_path, page, look, lost_share=0.1):
 
 
 def test_the_page_shows_rates_success_ranges_power_faults_disk_and_queue(tmp_path):
-    with LivePage(tmp_path / "f.uwb", correct=lambda _, report: {"corrected_m": report.range_m - 0.125}) as page:
+    with LivePage(tmp_path / "f.uwb", correct=lambda x: {"corrected_m": x.range_m - 0.125}) as page:
         done, (headers, text) = recorded(tmp_path, page, lambda: fetch(page))
     assert headers["Content-Type"] == "text/html; charset=utf-8"
     rows = re.findall(r"<tr><td>(\d)&nbsp;&rarr;&nbsp;(\d)</td>(.*?)</tr>", text)
@@ -179,13 +179,8 @@ def test_a_calibration_s_correction_is_found_by_its_entry_point(tmp_path):
         load_correction(tmp_path / "c.json")
     calibration.save(tmp_path / "d.json")
     correct = load_correction(tmp_path / "d.json")
-    report = RangeReport(2, 3.0, 1, 2, 3, 4, 5, 6, -85.0, -86.0, 0.0, 0.0)
-    expected = calibration.correct(3.0, -85.0, -86.0, 1, 2)
-    found = dict(correct(1, report))
-    assert found.pop("corrected_m") == expected.range_m
-    assert {"range_m": expected.range_m, **found} == expected._asdict()
-    stranger = RangeReport(77, 3.0, 1, 2, 3, 4, 5, 6, -85.0, -86.0, 0.0, 0.0)
-    assert correct(1, stranger) == {}
+    expected = calibration.apply(calib.Ranges.from_exchanges(flight.exchanges)).corrected_m
+    assert correct(flight.exchanges)["corrected_m"].tolist() == expected.tolist()
 
 
 def test_the_command_says_where_the_page_is_and_serves_it_while_it_records(tmp_path):

@@ -5,6 +5,7 @@ import types
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import uwblink
@@ -100,8 +101,9 @@ def test_the_node_publishes_corrected_ranges_until_ros_ends(node, monkeypatch):
     def stream(given, *, calibration, stop):
         assert (given, calibration) == (names, "mine.json")
 
-        def correct(initiator, report):
-            return {} if report.neighbour == 3 else {"corrected_m": report.range_m - 0.5, "sigma_m": 0.25}
+        def correct(exchanges):
+            known = np.where(exchanges.target == 3, np.nan, 1.0)
+            return {"corrected_m": (exchanges.range_m - 0.5) * known, "sigma_m": 0.25 * known}
 
         return real(given, calibration=correct, stop=stop, using=ports)
 

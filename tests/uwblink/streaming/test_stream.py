@@ -8,13 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import duckdb
 import pytest
 
 import calib
 import uwblink
 from tests import processes
 from tests.boards import bench_scenario, served
-from uwblink.boards import Progress
+from uwblink.boards import LivePage, Progress, load_correction
 from uwblink.errors import ArgumentError, PlanError, PortError
 from uwblink.streaming import RangeListener
 from uwbsim.boards.virtual_port import VirtualPorts
@@ -22,24 +23,32 @@ from uwbsim.boards.virtual_port import VirtualPorts
 BIN = Path(sys.executable).parent
 
 
-def flight(path, **more):
+def flight(path, protocol="ds", **more):
     ports = VirtualPorts(bench_scenario())
-    plan = uwblink.RangingPlan(rate_hz=50.0)
+    plan = uwblink.RangingPlan(rate_hz=50.0, protocol=protocol)
     uwblink.record(ports.names.values(), path, plan, duration_s=4.0, using=ports, **more)
     return uwblink.load(path).exchanges
 
 
-@pytest.fixture(scope="module")
-def calibration(tmp_path_factory):
-    """A calibration of boards 1, 2 and 3, with tag 3 left out of its delays."""
-    path = tmp_path_factory.mktemp("stream") / "c.json"
-    known = calib.fit(calib.sample_flight()).calibration
-    document = json.loads(known.to_json())
+def calibrated(path, tags):
+    """Write a calibration with a curve, for some of the boards."""
+    document = json.loads(calib.fit(calib.sample_flight()).calibration.to_json())
     document.pop("uncertainty", None)
-    for name in ("delays_ns", "delays_std_ns"):
-        document[name] = {"1": 0.5, "2": -0.25}
+    document["delays_ns"] = {str(tag): 0.5 - 0.25 * tag for tag in tags}
+    document["delays_std_ns"] = {str(tag): 0.01 for tag in tags}
     path.write_text(json.dumps(document))
     return path
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    return calibrated(tmp_path_factory.mktemp("stream") / "c.json", (1, 2, 3))
+
+
+@pytest.fixture(scope="module")
+def of_two(tmp_path_factory):
+    """A calibration that does not know board 3."""
+    return calibrated(tmp_path_factory.mktemp("stream") / "two.json", (1, 2))
 
 
 def test_boards_are_streamed_as_they_would_be_recorded(tmp_path):
@@ -65,22 +74,64 @@ def test_ranges_come_one_at_a_time_and_closing_closes_the_ports():
     assert again.time_ns > first.time_ns
 
 
-def test_a_recording_is_corrected_row_by_row_as_apply_does(tmp_path, calibration):
-    expected = flight(tmp_path / "f.uwb")
-    known = calib.load_calibration(calibration)
-    found = list(uwblink.stream(tmp_path / "f.uwb", calibration=calibration, speed=math.inf))
-    assert [one.range_m for one in found] == expected.range_m.tolist()
-    for one, e in zip(found, range(len(expected)), strict=True):
-        if 3 in (one.initiator, one.target):
-            assert math.isnan(one.corrected_m)
-            assert one.more == {}
-            continue
-        ranges = calib.Ranges.from_exchanges(expected[e : e + 1])
-        applied = known.apply(ranges)
-        # The board printed its range with four decimals; delays of 0.25 ns times a skew of ppm are far below.
-        assert one.corrected_m == pytest.approx(float(applied.corrected_m[0]), abs=2e-4)
-        assert one.sigma_m == pytest.approx(float(applied.sigma_m[0]), rel=1e-9)
-        assert one.more["clamped"] == bool(applied.clamped[0])
+@pytest.mark.parametrize("protocol", ["ss", "ds"])
+def test_ranges_are_corrected_live_and_played_as_apply_corrects_them(tmp_path, calibration, protocol):
+    """The stamps say more than the range that a board prints, which in SS-TWR is a whole number of ticks."""
+    live: list[uwblink.StreamedRange] = []
+    printed = flight(tmp_path / "f.uwb", protocol, listeners=[RangeListener(live.append, calibration)]).range_m
+    calib.apply(tmp_path / "f.uwb", calib.load_calibration(calibration), tmp_path / "corrected.uwb")
+    expected = uwblink.load(tmp_path / "corrected.uwb").exchanges.range_m.tolist()
+    played = list(uwblink.stream(tmp_path / "f.uwb", calibration=calibration, speed=math.inf))
+    assert [one.corrected_m for one in live] == [one.corrected_m for one in played] == expected
+    assert [one.range_m for one in played] == printed.tolist()
+    names = ("sigma_m", "clamped", "sigma_total_m", "tail_share")
+    with duckdb.connect(tmp_path / "corrected.uwb", read_only=True) as opened:
+        rows = opened.execute(f"SELECT {', '.join(names)} FROM corrected ORDER BY time_ns").fetchall()
+    for found in (live, played):
+        assert [(one.sigma_m, *(one.more[name] for name in names[1:])) for one in found] == rows
+
+
+def test_a_recording_of_another_protocol_and_stamp_size_is_corrected_as_apply_does(tmp_path, calibration):
+    big = 2**35
+    exchanges = uwblink.Exchanges.from_arrays(
+        [1, 1], [2, 3], tx1=[big, 5], rx1=[7, big], tx2=[100_007, big + 100_000], rx2=[big + 100_900, 101_005],
+        skew2_ppm=[12.5, -4.0], fpp1_dbm=-85.0, fpp2_dbm=-86.0, protocol="ss-cfo", bits=40, time_ns=[0, 10**9],
+        range_m=[1.0, 2.0],
+    )  # fmt: skip
+    uwblink.Contents(exchanges=exchanges).save(tmp_path / "f.uwb")
+    expected = calib.load_calibration(calibration).apply(calib.Ranges.from_exchanges(exchanges)).corrected_m
+    played = uwblink.stream(tmp_path / "f.uwb", calibration=calibration, speed=math.inf)
+    assert [one.corrected_m for one in played] == expected.tolist()
+
+
+def test_a_tag_that_is_not_calibrated_is_told_before_the_first_range(tmp_path, of_two):
+    flight(tmp_path / "f.uwb")
+    with pytest.raises(ValueError, match=r"two\.json: no delay for tag 3"):
+        uwblink.stream(tmp_path / "f.uwb", calibration=of_two)
+    ports = VirtualPorts(bench_scenario())
+    names = list(ports.names.values())
+    with pytest.raises(PlanError, match="no delay for tag 3"):
+        uwblink.stream(names, calibration=of_two, using=ports)
+    for listener in (RangeListener(print, of_two), LivePage(tmp_path / "g.uwb", correct=load_correction(of_two))):
+        with pytest.raises(PlanError, match="no delay for tag 3"):
+            uwblink.record(names, tmp_path / "g.uwb", uwblink.RangingPlan(), using=ports, listeners=[listener])
+    assert [p.name for p in tmp_path.iterdir()] == ["f.uwb"], "nothing was written"
+    plan = uwblink.RangingPlan(((1, 2),), rate_hz=50.0)
+    found = list(uwblink.stream(names, calibration=of_two, plan=plan, duration_s=1.0, using=ports))
+    assert found
+    assert all(math.isfinite(one.corrected_m) for one in found)
+
+
+def test_what_a_correction_raises_while_boards_range_is_told_and_what_came_before_is_kept(tmp_path):
+    def correct(exchanges):
+        if exchanges.tx1.any() and next(seen) == 20:
+            raise ValueError("the calibration is broken")
+        return {"corrected_m": exchanges.range_m}
+
+    seen = iter(range(100))
+    with pytest.raises(ValueError, match="the calibration is broken"):
+        flight(tmp_path / "f.uwb", listeners=[RangeListener(lambda _: None, correct)])
+    assert len(uwblink.load(tmp_path / "f.uwb").exchanges) == 21
 
 
 def test_a_recording_plays_in_its_own_time(tmp_path):
@@ -132,6 +183,22 @@ def test_the_command_prints_a_line_a_range(tmp_path, calibration):
     assert done.stderr == f"{len(rows)} ranges\n"
 
 
+def test_the_commands_refuse_a_calibration_of_other_boards_and_write_nothing(tmp_path, of_two):
+    flight(tmp_path / "f.uwb")
+    with served() as server:
+        names, out = list(server.names.values()), tmp_path / "g.uwb"
+        for words in (
+            ("stream", tmp_path / "f.uwb", "-c", of_two),
+            ("stream", *names, "-c", of_two, "-o", out),
+            ("record", *names, "--pairs", "all", "--live", "--calibration", of_two, "-o", out),
+        ):
+            done = run(*words)
+            assert (done.returncode, done.stdout) == (2, "")
+            assert "tag 3" in done.stderr.splitlines()[-1]
+            assert "Traceback" not in done.stderr
+    assert not out.exists()
+
+
 def test_a_reader_that_goes_away_ends_the_stream(tmp_path):
     flight(tmp_path / "f.uwb")
     words = f"{BIN / 'uwblink'} stream {tmp_path / 'f.uwb'} --speed 20 | head -n 2"
@@ -177,7 +244,9 @@ def test_boards_are_streamed_and_recorded_by_the_command_until_the_time_is_over(
 
 def test_ranges_are_called_back_while_boards_are_recorded(tmp_path):
     found: list[uwblink.StreamedRange] = []
-    expected = flight(tmp_path / "f.uwb", listeners=[RangeListener(found.append, lambda *_: {"corrected_m": 7.0})])
+    expected = flight(
+        tmp_path / "f.uwb", listeners=[RangeListener(found.append, lambda x: {"corrected_m": 0 * x.range_m + 7.0})]
+    )
     assert [one.time_ns for one in found] == expected.time_ns.tolist()
     assert {one.corrected_m for one in found} == {7.0}
     with pytest.raises(PlanError, match=r"none\.json"):
