@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -29,6 +29,9 @@ HALVES: Final = (0.5, 0.5)
 
 LONGEST_M: Final = 1e4
 
+CLOCK_NS: Final = 1_000_000_000 * 86_400 * 365 * 20
+"""Times beyond this are those of a host's clock, in ns since 1970 (`uwblink record`), and others count from a start."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranges:
@@ -40,7 +43,8 @@ class Ranges:
     `excluded` counts by reason what was left out; `planted` is what a simulation put in, for display only;
     `recordings` are name and `fingerprint` of each that they come from, empty where they come from none;
     `left_skew` says what clock skew may have left in single-sided ranges, None where there are none; `bodies` are tags
-    with the body that carries each, as far as it is known.
+    with the body that carries each, as far as it is known. `session` numbers the sessions (n,), whose names are
+    `sessions`: recordings that are joined, of which those that ran at the same time count as one.
     """
 
     source: str
@@ -60,6 +64,13 @@ class Ranges:
     clocks_apart: ClocksApart | None = None
     recordings: tuple[tuple[str, str], ...] = ()
     bodies: tuple[tuple[int, str], ...] = ()
+    session: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
+    sessions: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Put all ranges into one session where nothing else is said."""
+        if len(self.session) != len(self.time_ns):
+            object.__setattr__(self, "session", np.broadcast_to(np.int32(0), len(self.time_ns)))
 
     @classmethod
     def from_exchanges(
@@ -226,7 +237,7 @@ def require_some(source: str, count: int, excluded: Mapping[str, int], why_no_tr
     raise UnanswerableError(f"{source}: none of its {count} exchanges can be used: {most}{hint}")
 
 
-APART: Final = ("source", "excluded", "planted", "left_skew", "clocks_apart", "recordings", "bodies")
+APART: Final = ("source", "excluded", "planted", "left_skew", "clocks_apart", "recordings", "bodies", "sessions")
 """What is no column."""
 
 COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in APART)
@@ -235,6 +246,7 @@ COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in APART)
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
     """Join the ranges of several recordings, in their order."""
     columns: dict[str, Any] = {name: joined([getattr(p, name) for p in parts]) for name in COLUMNS}
+    columns["session"], names = _sessions(parts)
     reasons = sorted({reason for p in parts for reason in p.excluded})
     return Ranges(
         source=", ".join(p.source for p in parts),
@@ -244,8 +256,29 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         clocks_apart=farthest(p.clocks_apart for p in parts),
         recordings=tuple(one for p in parts for one in p.recordings),
         bodies=_bodies_of_all(parts),
+        sessions=names,
         **columns,
     )
+
+
+def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
+    """Return the session of each range of recordings that are joined (n,), and the names of the sessions.
+
+    Recordings that ran at the same time, by the hosts' clocks, are one session.
+    """
+    number, names, ends = list[Ints](), list[str](), list[tuple[int, int]]()
+    for part in parts:
+        begin, end = (int(part.time_ns.min()), int(part.time_ns.max())) if len(part) else (0, 0)
+        together = [k for k, (first, last) in enumerate(ends) if begin > CLOCK_NS and begin <= last and first <= end]
+        if together and len(part.sessions) < 2:
+            k = together[0]
+            names[k], ends[k] = f"{names[k]}, {part.source}", (min(ends[k][0], begin), max(ends[k][1], end))
+        else:
+            k = len(names)
+            names += part.sessions or (part.source,)
+            ends += [(begin, end)] * max(len(part.sessions), 1)
+        number.append(np.asarray(part.session + k, dtype=np.int32))
+    return np.concatenate(number), tuple(names)
 
 
 def bodies_of(tags: Iterable[Tag]) -> tuple[tuple[int, str], ...]:

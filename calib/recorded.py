@@ -35,7 +35,7 @@ class _Columns:
         self._most, self.length = most, 0
         self._words: set[str] = set()
         kinds = dict.fromkeys(COLUMNS, np.float64) | dict.fromkeys(("time_ns", "initiator", "target"), np.int64)
-        self._room = {name: empty(most, kind) for name, kind in kinds.items() if name != "protocol"}
+        self._room = {name: empty(most, kind) for name, kind in kinds.items() if name not in ("protocol", "session")}
         self._protocol: NDArray[np.str_] | None = None
 
     def add(self, some: Ranges) -> None:

@@ -107,14 +107,14 @@ def students_quantile(freedom: float, share: float) -> float:
     # The tail is convex beyond zero, so steps from below never overshoot.
     for _ in range(STEPS):
         slope = 2 * scale * (1 + value * value / freedom) ** (-(freedom + 1) / 2)
-        step = (_students_beyond(freedom, value) - wanted) / slope
+        step = (students_beyond(freedom, value) - wanted) / slope
         value += step
         if abs(step) <= 1e-14 * value:
             break
     return value
 
 
-def _students_beyond(freedom: float, value: float) -> float:
+def students_beyond(freedom: float, value: float) -> float:
     """Return the share of Student's distribution farther from zero than a value: the incomplete beta function of
     freedom/2 and 1/2, by its continued fraction (DLMF 8.17.22), on the side where that converges.
     """

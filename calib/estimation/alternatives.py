@@ -26,6 +26,7 @@ class Family:
 
     Whose a range is goes by its run: each of `ends` has a place among the names of every run (runs,), and a sign. A
     range belongs to both of its tags; in a family of differences the offset is taken the other way at one.
+    Where offsets belong to sessions, those of one tag or pair in all `sessions` stand side by side.
     """
 
     kind: str
@@ -33,10 +34,12 @@ class Family:
     weight: Floats | float
     runs: Runs
     ends: tuple[tuple[Ints, float], ...]
+    sessions: tuple[str, ...] = ("",)
 
 
-def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Family]:
-    """Yield the alternatives: offsets of a pair, of a tag for a while or as its power changes, and those of arithmetic.
+def families(problem: Problem, louder_m: Floats) -> Iterator[Family]:
+    """Yield the alternatives: offsets of a pair, of a tag for a while, of either in one of several sessions, of a tag
+    as its power changes, and those of arithmetic.
 
     Rows are in the order in which the problem's design keeps them; `louder_m` (n,), in the order of given ones, is what
     a decibel more would do to each range. Where no curve is fitted, errors of all tags may
@@ -52,7 +55,7 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
     names = [f"tag {tag}" for tag in tags]
     named = [f"pair {low}-{high}" for low, high in problem.pairs.ends.tolist()]
     yield Family(kind="pair", names=named, weight=1.0, runs=runs, ends=((pair, 1.0),))
-    count = segments(seconds)
+    count = segments(problem.blocks.seconds)
     edges = -(-np.arange(count + 1) * len(truth_m) // count)
     when = kept(np.repeat(np.arange(count, dtype=np.int32), np.diff(edges)))
     spans = problem.design.runs(when)
@@ -64,6 +67,8 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
         runs=spans,
         ends=tuple((place[spans.block] * count + own, 1.0) for place in (low, high)),
     )
+    if len(problem.blocks.bounds) > 2:
+        yield _between_sessions(problem, names, named, (low, high, pair))
     if problem.unknowns.curve:
         ranks, number = np.linspace(-1, 1, len(bins.count)), kept(bins.number)
         rank = computed(len(number), lambda rows: ranks[number[rows]])
@@ -82,6 +87,37 @@ def families(problem: Problem, louder_m: Floats, seconds: float) -> Iterator[Fam
         far = kept(computed(len(truth_m), lambda rows: (truth_m[rows] - middle) / reach))
         let_go(truth_m)
         yield Family(kind="scale", names=["all tags"], weight=far, runs=runs, ends=((np.zeros_like(low), 1.0),))
+
+
+def _between_sessions(problem: Problem, tags: list[str], pairs: list[str], places: tuple[Ints, Ints, Ints]) -> Family:
+    """Return the offsets of tags, and of pairs, in one session; those of tags alone where time is short for both.
+
+    Between sessions antennas are taken off and screwed on, and things are moved. `places` (blocks,) are the lower tag,
+    the higher one and the pair of the design's blocks.
+    """
+    numbers, session = np.unique(problem.ranges.session, return_inverse=True)
+    count, when = len(numbers), problem.design.kept(session.astype(np.int32))
+    runs = problem.design.runs(when)
+    own = when[runs.starts[:-1]]
+    low, high, pair = (place[runs.block] * count + own for place in places)
+    ends = (low, 1.0), (high, 1.0), (pair + len(tags) * count, 1.0)
+    # The covariance of so many slopes must be known from blocks of time.
+    both = (len(tags) + len(pairs)) * count < problem.blocks.count / 2
+    return Family(
+        kind="session",
+        names=[name for name in (tags + pairs if both else tags) for _ in range(count)],
+        weight=1.0,
+        runs=runs,
+        ends=ends if both else ends[:2],
+        sessions=_distinct([problem.ranges.sessions[k] for k in numbers.tolist()]),
+    )
+
+
+def _distinct(names: list[str]) -> tuple[str, ...]:
+    """Return names of sessions, numbered where two have the same."""
+    if len(set(names)) == len(names):
+        return tuple(names)
+    return tuple(f"{name} ({k} of {len(names)})" for k, name in enumerate(names, 1))
 
 
 def _times(column: Floats, factor: float) -> Floats:

@@ -21,6 +21,7 @@ from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.row_order import stable_order
 from calib.estimation.spacing import bins_of, splines
+from calib.estimation.time_blocks import in_order, time_blocks
 from calib.estimation.unknowns import Unknowns
 from calib.long_columns import EVERY, computed, empty, let_go, picked, put
 from calib.ranges import Ranges
@@ -60,8 +61,7 @@ def build_problem(
         raise UnanswerableError(
             f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST} are needed"
         )
-    if np.any(ranges.time_ns[1:] < ranges.time_ns[:-1]):
-        ranges = ranges[np.argsort(ranges.time_ns, kind="stable")]
+    ranges = in_order(ranges)
     fpp1, fpp2 = ranges.fpp1_dbm, ranges.fpp2_dbm
     lifted = computed(len(ranges), lambda rows: lifted_power(fpp1[rows], fpp2[rows], lift, alpha_dbm))
     let_go(fpp1, fpp2)
@@ -129,6 +129,7 @@ def build_problem(
         free=free,
         unknowns=unknowns,
         powered=powered,
+        blocks=time_blocks(ranges.time_ns, ranges.session),
     )
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from calib.calibration.power_curves import DEGREE, Curve, basis
 from calib.estimation.alternatives import families
-from calib.estimation.intervals import blocks_of
 from calib.estimation.misfit import (
     CLEARLY,
     MATTERS,
@@ -63,21 +62,19 @@ class Doubts:
 
 def doubts(problem: Problem, found: Solved) -> Doubts:
     """Hold a fit against its residuals, and widen the delays' covariance by what does not fit."""
-    ranges = problem.ranges
-    blocks, seconds = blocks_of(ranges.time_ns)
     louder = of_a_decibel(problem, found)
-    tested, kept = families(problem, louder, seconds), found.scores.design.kept
+    tested, kept = families(problem, louder), found.scores.design.kept
     judged = examine(
         found.scores,
         found.by_block,
         found.inverse,
         found.delays,
-        kept(blocks),
-        seconds,
+        kept(problem.blocks.number),
+        problem.blocks,
         tested=tested,
         shape_m=kept(_of_another_shape(problem, found)),
     )
-    places = of_places(problem, found.scores, judged.pairs, kept(blocks))
+    places = of_places(problem, found.scores, judged.pairs, kept(problem.blocks.number))
     covariance, sentences = weighed(problem, found, judged, places)
     sentences += [*reflected(problem, found), *short(found), *_confounded(problem, found)]
     return Doubts(covariance_ns2=covariance, sentences=sentences, of_places_ns2=places.widening_ns2)
@@ -92,9 +89,9 @@ def weighed(problem: Problem, found: Solved, judged: Judgement, places: OfPlaces
     for finding in judged.findings:
         moved = _moved(finding, plain)
         if moved > MATTERS:
-            covariance = covariance + np.outer(finding.effect_ns, finding.effect_ns)
+            covariance = covariance + finding.spread_ns2
         large = abs(finding.offset_m) > SMALLEST_M
-        if moved > MATTERS and (large or (moved > CLEARLY and np.max(np.abs(finding.effect_ns)) > SMALLEST_NS)):
+        if moved > MATTERS and (large or (moved > CLEARLY and finding.largest_ns > SMALLEST_NS)):
             matter.append(finding)
     # A tag that was moved stands out in more than one span of time: once is enough.
     once = {(finding.kind, finding.names): finding for finding in reversed(matter)}
@@ -104,7 +101,7 @@ def weighed(problem: Problem, found: Solved, judged: Judgement, places: OfPlaces
 def _moved(finding: Finding, covariance: Floats) -> float:
     """Return by how many of its standard errors a finding moves some delay."""
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
-    moved = float(np.max(np.abs(finding.effect_ns) / std, initial=0.0))
+    moved = float(np.max(np.abs(finding.effects_ns) / std, initial=0.0))
     if not len(std):
         # Without a delay in the fit the curve takes what an offset does.
         return abs(finding.offset_m) > SMALLEST_M

@@ -17,6 +17,7 @@ from calib.estimation.mixture_slopes import Errors
 from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
 from calib.estimation.persistence import lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
+from calib.estimation.time_blocks import TimeBlocks
 from calib.long_columns import few, let_go, picked, spans
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
@@ -55,16 +56,16 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
     if robust_spread(residual_m) < LEAST_SPREAD_M:
         return None
     pair, names = problem.pairs.number, [f"{low}-{high}" for low, high in problem.pairs.ends.tolist()]
-    cell, time_ns, centred = problem.cell, problem.ranges.time_ns, residual_m
+    cell, blocks, centred = problem.cell, problem.blocks, residual_m
     location = 0.0
     if mixture is None:
         rows = _described(len(residual_m))
-        pair, time_ns, centred = pair[rows], time_ns[rows], residual_m[rows]
+        pair, blocks, centred = pair[rows], blocks.among(rows), residual_m[rows]
         mixture = _about_their_centre(centred, pair, cell[rows], len(names))
         location = -float(mixture.of("design")[0])
         centred = centred - location
     nodes = _middles(problem.lifted, cell)
-    known = _of_pairs(mixture, time_ns, pair)
+    known = _of_pairs(mixture, blocks, pair)
     wild = _outliers(mixture, centred)
     model = ErrorModel(
         lifted=tuple(nodes.tolist()),
@@ -123,11 +124,11 @@ class _PairsPredicted:
     common_detour_m: float
 
 
-def _of_pairs(mixture: PairMixture, time_ns: Ints, pair: Ints) -> _PairsPredicted:
+def _of_pairs(mixture: PairMixture, blocks: TimeBlocks, pair: Ints) -> _PairsPredicted:
     """Draw pairs to what they have in common, by what they know where reflections last."""
     by_share = mixture.slope("share")
     pairs = mixture.layout.pairs
-    factor = lasting_in_pairs(by_share, pair, time_ns)
+    factor = lasting_in_pairs(by_share, pair, blocks)
     reflected = np.bincount(pair, minlength=pairs) * mixture.tail_share
     # One wall has one detour: a mean is known from as many reflections as there were, not from as many ranges.
     told = np.zeros(pairs)

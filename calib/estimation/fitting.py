@@ -155,7 +155,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             *implausible(calibration.delays_ns, residuals),
             *unlike_powers(ranges, calibration),
             *_beyond(reference, alpha_dbm, problem),
-            *warnings_of(ranges, float(np.mean(inliers)), problem.free),
+            *warnings_of(ranges, float(np.mean(inliers)), problem.free, problem.blocks.seconds),
         ]
         problem.let_go()
         let_go(*columns)

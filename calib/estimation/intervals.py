@@ -7,9 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.persistence import Persistence, persistence, short_blocks
+from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.scores import Scores
-from uwblink.arrays import Floats, Ints
+from calib.estimation.time_blocks import TimeBlocks
+from uwblink.arrays import Floats
 
 NORMAL95: Final = 1.959963984540054
 CURVE_SERIES: Final = 5
@@ -30,7 +31,7 @@ class Intervals:
 
 
 def intervals(
-    scores: Scores, inverse: Floats, prior: Floats, delays: Floats, rank: int, *, blocks: Ints, seconds: float
+    scores: Scores, inverse: Floats, prior: Floats, delays: Floats, rank: int, blocks: TimeBlocks
 ) -> Intervals:
     """Return the covariance of the parameters of the design at an optimum.
 
@@ -40,24 +41,19 @@ def intervals(
     """
     columns = scores.design.shape[1]
     reach = inverse[:columns]
-    by_block = scores.by_block(scores.design.kept(blocks), int(blocks[-1]) + 1)
+    by_block = scores.by_block(scores.design.kept(blocks.number), blocks.count)
     pulls = by_block @ reach.T
     # What all delays share is the curve's constant: it would hide how long errors of single delays last.
     apart = delays - delays.mean(axis=0) if len(delays) > 1 else delays
-    lasting = persistence(pulls @ apart.T, seconds, max(len(delays) - 1, 1))
+    lasting = persistence(pulls @ apart.T, blocks, max(len(delays) - 1, 1))
     factors = [lasting] * (rank > 0)
     if columns > rank:
-        factors.append(persistence(pulls[:, rank:], seconds, CURVE_SERIES))
+        factors.append(persistence(pulls[:, rank:], blocks, CURVE_SERIES))
     widths = [np.sqrt(each.factor) * each.quantile95 / NORMAL95 for each in factors]
     width = np.repeat(widths, [rank, columns - rank] if rank and columns > rank else [columns])
     # What is fitted is fitted to these ranges: their slopes are smaller than those of others would be.
     used = float(scores.size - np.sum(inverse * prior))
-    fresh = len(blocks) / max(len(blocks) - used, 0.2 * len(blocks))
+    fresh = len(blocks.number) / max(len(blocks.number) - used, 0.2 * len(blocks.number))
     covariance = fresh * (pulls.T @ pulls) * width[:, None] * width + reach @ prior @ reach.T
     lasting = lasting if rank else factors[-1]
     return Intervals(covariance=np.asarray(covariance), lasting=lasting, by_block=by_block)
-
-
-def blocks_of(time_ns: Ints) -> tuple[Ints, float]:
-    """Return the short block of each range (n,), and the seconds that the ranges span."""
-    return short_blocks(time_ns), float(time_ns[-1] - time_ns[0]) * 1e-9

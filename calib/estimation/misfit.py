@@ -18,13 +18,17 @@ from calib.estimation.alternatives import Family, segments
 from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.row_order import Runs
 from calib.estimation.scores import Scores
+from calib.estimation.time_blocks import TimeBlocks
 from calib.long_columns import let_go
-from calib.tails import students_quantile
+from calib.tails import students_beyond, students_quantile
 from uwblink.arrays import Floats, Ints
 
 ERROR_RATE: Final = 0.005
 """Share of sound fits that may be doubted, all alternatives together."""
 
+
+DRAWN: Final = ("pair", "session")
+"""Families whose offsets are draws with one variance: it is in the intervals, whether one of them stands out or not."""
 
 SPANS: Final = 2
 """Spans of time within which errors are looked at for how long they last, where an alternative does not end."""
@@ -56,7 +60,8 @@ class Finding:
     """An alternative that the residuals ask for: its kind, whose it may be, the offset, and what it does to delays.
 
     `effect_ns` (tags,) is by how much the delays would change, `deviation` how many standard errors the offset is from
-    none.
+    none, `p_value` how likely so much is by chance in any of the tests. An offset of one session may as well be the
+    opposite one of all others: `otherwise_ns` (tags,) is what that does, `sessions` are that session and the others.
     """
 
     kind: str
@@ -64,6 +69,24 @@ class Finding:
     offset_m: float
     deviation: float
     effect_ns: Floats
+    p_value: float
+    otherwise_ns: Floats | None = None
+    sessions: tuple[str, str] = ("", "")
+
+    @property
+    def effects_ns(self) -> tuple[Floats, ...]:
+        """What the offset may do to the delays, by whichever side of a difference is off."""
+        return (self.effect_ns,) if self.otherwise_ns is None else (self.effect_ns, self.otherwise_ns)
+
+    @property
+    def spread_ns2(self) -> Floats:
+        """The covariance (tags, tags) that delays have when nothing says which side of a difference is off."""
+        return np.asarray(np.mean([np.outer(effect, effect) for effect in self.effects_ns], axis=0))
+
+    @property
+    def largest_ns(self) -> float:
+        """By how much a delay would change at most."""
+        return float(np.max(np.abs(self.effects_ns), initial=0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,8 +106,8 @@ class Tested:
     """A family's kind and names, and its efficient slopes: sums (k,), their covariance (k, k), information (k, k), and
     effects (tags, k) in ns/m.
 
-    `by_time` (k,) are sums of the slopes that the covariance is made of, `whole` is the largest information that an
-    alternative would have, were nothing else fitted.
+    `by_time` (k,) are sums of the slopes that the covariance is made of, over so many `blocks`; `whole` is the
+    largest information that an alternative would have, were nothing else fitted.
     """
 
     kind: str
@@ -96,6 +119,8 @@ class Tested:
     whole: float
     effects: Floats
     lasting: Persistence
+    blocks: int
+    sessions: tuple[str, ...] = ("",)
 
 
 def examine(
@@ -103,16 +128,16 @@ def examine(
     own: Floats,
     inverse: Floats,
     delays: Floats,
-    blocks: Ints,
-    seconds: float,
+    number: Ints,
+    blocks: TimeBlocks,
     *,
     tested: Iterable[Family],
     shape_m: Floats,
 ) -> Judgement:
     """Hold a fit against alternatives.
 
-    `own` (blocks, D) are the slopes by the fitted parameters summed over short blocks of time, which `blocks` (n,)
-    number; `inverse` (D, D) is that of information and penalty, `delays` (tags, m) turns the parameters of the design
+    `own` (blocks, D) are the slopes by the fitted parameters summed over short blocks of time, which `number` (n,)
+    numbers; `inverse` (D, D) is that of information and penalty, `delays` (tags, m) turns the parameters of the design
     into delays in ns. `shape_m` (n,) is by how much ranges would be off, were the shape that the fit takes for the tail
     of reflections another one. Rows are in the order in which the design keeps them.
     """
@@ -121,17 +146,28 @@ def examine(
     # One family at a time: each has columns of its own.
     results = []
     for family in tested:
-        results.append(_test(family, scores, own, inverse, delays, blocks, seconds))
+        results.append(_test(family, scores, own, inverse, delays, number, blocks))
         del family
     several = sum(len(result.names) for result in results)
     found = [finding for result in results for finding in findings(result, several)]
-    widening += sum(widening_of_pairs(result) for result in results if result.kind == "pair")
+    widening += sum(widening_of_pairs(result) for result in results if result.kind in DRAWN)
+    found = _told_once(found)
     found += list(_of_gain(found, results))
     return Judgement(
         findings=sorted(found, key=lambda finding: -abs(finding.deviation)),
         widening_ns2=widening,
         pairs=next((result for result in results if result.kind == "pair"), None),
     )
+
+
+def _told_once(found: list[Finding]) -> list[Finding]:
+    """Leave out what a tag does for a while where a difference between sessions says the same more surely."""
+    between = {name: abs(one.deviation) for one in found if one.kind == "session" for name in one.names}
+    return [
+        one
+        for one in found
+        if one.kind != "time" or not any(between.get(name, 0.0) > abs(one.deviation) for name in one.names)
+    ]
 
 
 def everywhere(scores: Scores) -> tuple[Runs, list[tuple[Ints, float]], int]:
@@ -162,7 +198,7 @@ def _of_gain(found: list[Finding], results: list[Tested]) -> Iterator[Finding]:
 
 
 def _test(
-    family: Family, scores: Scores, own: Floats, inverse: Floats, delays: Floats, blocks: Ints, seconds: float
+    family: Family, scores: Scores, own: Floats, inverse: Floats, delays: Floats, number: Ints, blocks: TimeBlocks
 ) -> Tested:
     """Return a family's efficient slopes; `own` (blocks, D) are those by the fitted parameters."""
     size, count, runs = len(family.names), len(own), family.runs
@@ -171,12 +207,12 @@ def _test(
     for which, rows in scores.spans(runs):
         weight = family.weight[rows] if isinstance(family.weight, np.ndarray) else family.weight
         known[which] = np.add.reduceat(scores.known(rows) * weight**2, runs.starts[which] - rows.start)
-        slope, lengths, when = scores.score[rows] * weight, runs.lengths[which], blocks[rows] * size
+        slope, lengths, when = scores.score[rows] * weight, runs.lengths[which], number[rows] * size
         for place, sign in family.ends:
             where = when + np.repeat(place[which], lengths)
             plain += sign * np.bincount(where, slope, minlength=count * size).reshape(count, size)
         scores.let_go()
-        let_go(blocks, family.weight if isinstance(family.weight, np.ndarray) else None)
+        let_go(number, family.weight if isinstance(family.weight, np.ndarray) else None)
     for place, sign in family.ends:
         for other, its in family.ends:
             both = np.bincount(place * size + other, known, minlength=size * size).reshape(size, size)
@@ -188,8 +224,7 @@ def _test(
     whole = max(float(np.diag(square).max()), 1e-300)
     free = np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True)
     # What an alternative does must not pass for errors that last: those are judged within spans of time.
-    spans = segments(seconds) if family.kind == "time" else SPANS
-    lasting = persistence(in_spans(efficient, spans), seconds, int(free))
+    lasting = persistence(efficient, blocks, int(free), spans_of(family, blocks))
     return Tested(
         kind=family.kind,
         names=family.names,
@@ -200,21 +235,22 @@ def _test(
         whole=whole,
         effects=-delays @ taken[:, : delays.shape[1]].T,
         lasting=lasting,
+        blocks=count,
+        sessions=family.sessions,
     )
 
 
-def in_spans(series: Floats, count: int) -> Floats:
-    """Return slopes (blocks, k) as columns of a span of time each, less their means."""
-    length = len(series) // count
-    cut = series[: length * count].reshape(count, length, -1)
-    return np.hstack(list(cut - cut.mean(axis=1, keepdims=True)))
+def spans_of(family: Family, blocks: TimeBlocks) -> int:
+    """Return within how many spans of time to look at how long errors last, where a family may hold some of them."""
+    return segments(blocks.seconds) if family.kind == "time" else SPANS
 
 
 def widening_of_pairs(result: Tested) -> Floats:
-    """Return what pairs that scatter more than their slopes allow add to the delays' covariance.
+    """Return what offsets that scatter more than their slopes allow add to the delays' covariance.
 
-    Offsets of pairs are taken for draws with one variance, which is estimated by the method of moments (DerSimonian and
-    Laird 1986): the weighted square of all slopes exceeds its expectation by the variance times a trace.
+    Offsets of pairs, or of tags and pairs in sessions, are taken for draws with one variance, which is estimated by the
+    method of moments (DerSimonian and Laird 1986): the weighted square of all slopes exceeds its expectation by the
+    variance times a trace.
     """
     values, vectors = np.linalg.eigh(result.information)
     keep = values > REACHED * result.whole
@@ -223,6 +259,8 @@ def widening_of_pairs(result: Tested) -> Floats:
         return np.zeros((len(result.effects),) * 2)
     base = vectors[:, keep]
     inverse = np.linalg.pinv(base.T @ result.covariance @ base, rcond=1e-9, hermitian=True)
+    # The inverse of a covariance of few blocks is too large on average (of Wishart's distribution).
+    inverse *= max(1 - (freedom + 1) / result.blocks, 0.1)
     slope = base.T @ result.total
     reach = base.T @ result.information
     trace = float(np.trace(reach.T @ inverse @ reach))
@@ -232,7 +270,8 @@ def widening_of_pairs(result: Tested) -> Floats:
 
 def findings(result: Tested, several: int) -> Iterator[Finding]:
     """Yield the alternatives that stand out, one after the other, each beside those already found."""
-    limit = students_quantile(max(result.lasting.freedom, 3.0), 1 - ERROR_RATE / several / 2)
+    freedom = max(result.lasting.freedom, 3.0)
+    limit = students_quantile(freedom, 1 - ERROR_RATE / several / 2)
     total, covariance, information = result.total.copy(), result.covariance.copy(), result.information.copy()
     for _ in range(MOST_NAMED):
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
@@ -246,13 +285,15 @@ def findings(result: Tested, several: int) -> Iterator[Finding]:
         alike = np.abs(covariance[top] / (std[top] * std)) > SAME
         close = alike & known & (np.abs(deviation) > SAME * abs(deviation[top]))
         names = tuple(dict.fromkeys(result.names[k] for k in np.flatnonzero(close)))
-        yield Finding(
+        finding = Finding(
             kind=result.kind,
             names=names,
             offset_m=-offset,
             deviation=float(deviation[top]),
             effect_ns=result.effects[:, top] * offset,
+            p_value=min(several * students_beyond(freedom, abs(float(deviation[top]))), 1.0),
         )
+        yield _of_session(finding, result, top, offset) if len(result.sessions) > 1 else finding
         # With this offset fitted too, the others keep what it does not explain.
         taken = information[:, top] / information[top, top]
         step = np.eye(len(total))
@@ -260,15 +301,31 @@ def findings(result: Tested, several: int) -> Iterator[Finding]:
         total, covariance, information = step @ total, step @ covariance @ step.T, step @ information @ step.T
 
 
+def _of_session(finding: Finding, result: Tested, top: int, offset: float) -> Finding:
+    """Return a finding with which session it is, and what it does to delays if all others are off instead."""
+    count = len(result.sessions)
+    own = top % count
+    others = [k for k in range(top - own, top - own + count) if k != top]
+    rest = result.sessions[1 - own] if count == 2 else "the other recordings"
+    return replace(
+        finding,
+        otherwise_ns=-result.effects[:, others].sum(axis=1) * offset,
+        sessions=(result.sessions[own], rest),
+    )
+
+
 def told(finding: Finding) -> str:
     """Return a finding as a sentence."""
     whose = " or ".join(finding.names)
     size = f"{100 * abs(finding.offset_m):.1f} cm"
-    worst = f"delays by up to {1e3 * float(np.max(np.abs(finding.effect_ns), initial=0.0)):.0f} ps"
+    worst = f"delays by up to {1e3 * finding.largest_ns:.0f} ps"
+    own, others = finding.sessions
     way = "long" if finding.offset_m > 0 else "short"
     sentences = {
         "pair": f"{whose}: ranges read {size} too {way} for the other pairs, which moves {worst}; record it anew",
         "time": f"{whose}: ranges are {size} too {way} for a part of the recording, which moves {worst}; touched?",
+        "session": f"{whose}: ranges in {own} are {size} {way}er than in {others} (p = {finding.p_value:.1g}), which "
+        f"moves {worst}; was an antenna changed, or something moved, in between? Fit the recordings apart to see",
         "power": f"{whose}: errors change with power by {size} as no other tag's do, which moves {worst}",
         "decibels": f"{whose}: errors are as if its powers were wrong by some decibels, {size} in its ranges, which "
         f"moves {worst}; does it stand at another gain, or have another antenna?",

@@ -13,12 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.long_columns import computed, let_go, spans
+from calib.estimation.time_blocks import TimeBlocks
+from calib.long_columns import let_go, spans
 from calib.tails import students_quantile
 from uwblink.arrays import Floats, Ints
 
-MOST_BLOCKS: Final = 1000
-SHORTEST_S: Final = 0.1
 FEWEST_GROUPS: Final = 8
 """Sums of so few groups of blocks are looked at, and no fewer."""
 
@@ -52,38 +51,33 @@ class Persistence:
         return students_quantile(self.freedom, 0.975)
 
 
-def short_blocks(time_ns: Ints) -> Ints:
-    """Number short blocks of ascending times (n,) without gaps, a thousand at most."""
-    first = time_ns[0]
-    length = max(int(time_ns[-1] - first) // MOST_BLOCKS, int(SHORTEST_S * 1e9))
-    spans = computed(len(time_ns), lambda rows: (time_ns[rows] - first) // length, np.int32)
-    edges = np.concatenate([[0], np.flatnonzero(spans[1:] > spans[:-1]) + 1, [len(spans)]])
-    let_go(time_ns)
-    return np.repeat(np.arange(len(edges) - 1, dtype=np.int32), np.diff(edges))
-
-
-def lasting_in_pairs(slope: Floats, pair: Ints, time_ns: Ints) -> float:
+def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks) -> float:
     """Return by how much more sums of slopes (n,) by pair (n,) vary than those of independent ranges would."""
-    blocks, pairs = short_blocks(time_ns), int(pair.max()) + 1
-    count, seconds = int(blocks[-1]) + 1, float(time_ns[-1] - time_ns[0]) * 1e-9
-    flat = np.zeros(count * pairs)
+    number, pairs = blocks.number, int(pair.max()) + 1
+    flat = np.zeros(blocks.count * pairs)
     for rows in spans(len(slope)):
-        flat += np.bincount(blocks[rows] * pairs + pair[rows], slope[rows], count * pairs)
+        flat += np.bincount(number[rows] * pairs + pair[rows], slope[rows], blocks.count * pairs)
         let_go(slope, pair)
-    sums = flat.reshape(count, pairs)
+    sums = flat.reshape(blocks.count, pairs)
     within = float(np.sum(sums**2) / max(float(slope @ slope), 1e-300))
     let_go(slope)
-    return max(within, 1.0) * max(persistence(sums, seconds, pairs).factor, 1.0)
+    return max(within, 1.0) * max(persistence(sums, blocks, pairs).factor, 1.0)
 
 
-def persistence(slopes: Floats, seconds: float, independent: int) -> Persistence:
-    """Return what persistence does to sums of slopes (blocks, k), of whose columns so many are independent."""
+def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int = 1) -> Persistence:
+    """Return what persistence does to sums of slopes (blocks, k), of whose columns so many are independent.
+
+    How long errors last is looked at within sessions, and `within` so many spans of time: what differs between them is
+    a matter of its own (`calib.estimation.alternatives`).
+    """
+    slopes, columns = time.pieces(slopes, within), slopes.shape[1]
+    independent *= max(slopes.shape[1] // max(columns, 1) // within, 1)
     blocks = len(slopes)
     size = np.sum(slopes**2, axis=0)
     series = slopes[:, size > 0] / np.sqrt(size[size > 0])
     scales = [2**k for k in range(1, 12) if blocks // 2**k >= FEWEST_GROUPS]
     if not series.shape[1] or not scales:
-        return Persistence(factor=1.0, freedom=max(blocks - 1.0, 1.0), stretches=float(blocks), stretch_s=0.0)
+        return Persistence(factor=1.0, freedom=max(blocks - 1.0, 1.0), stretches=float(time.count), stretch_s=0.0)
     found = np.log([_ratio(series, scale) for scale in scales])
     certain = 0.5 * max(independent, 1) * blocks / np.array(scales) / NESTED
     rho = np.exp(-1 / np.geomspace(0.3, blocks / LONGEST, DURATIONS))
@@ -103,8 +97,8 @@ def persistence(slopes: Floats, seconds: float, independent: int) -> Persistence
     return Persistence(
         factor=mean / max(hidden, 0.25),
         freedom=max(freedom, 2.0),
-        stretches=blocks / mean,
-        stretch_s=seconds / blocks * mean,
+        stretches=time.count / mean,
+        stretch_s=time.seconds / time.count * mean,
     )
 
 

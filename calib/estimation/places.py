@@ -107,7 +107,7 @@ def of_places(problem: Problem, scores: Scores, pairs: Tested | None, blocks: In
     if pairs is None or group is None:
         return nothing
     sums = np.eye(int(group.max()) + 1)[:, group]
-    lasting = _lasting(pairs, sums, int(blocks.max()) + 1)
+    lasting = _lasting(pairs, sums, problem.blocks.count)
     variance, deviation = _moving(problem, scores, sums, blocks)
     moves = deviation > ASKED
     if not moves and not lasting.beyond(ASKED):
@@ -185,10 +185,9 @@ def _moving(problem: Problem, scores: Scores, sums: Floats, blocks: Ints) -> tup
 
 def _by_time(problem: Problem, scores: Scores, blocks: Ints) -> tuple[Floats, Floats]:
     """Return slopes and information of offsets of pairs, summed over about a second each (seconds, pairs)."""
-    time, size = problem.ranges.time_ns, len(problem.pairs.ends)
-    last, seconds = int(blocks.max()), float(time[-1] - time[0]) * 1e-9
-    each = max(round(TOGETHER_S * (last + 1) / max(seconds, 1e-9)), 1)
-    count, pair = last // each + 1, scores.design.kept(problem.pairs.number)
+    time, size = problem.blocks, len(problem.pairs.ends)
+    each = max(round(TOGETHER_S * time.count / max(time.seconds, 1e-9)), 1)
+    count, pair = (time.count - 1) // each + 1, scores.design.kept(problem.pairs.number)
     found = np.zeros((2, count * size))
     for rows in spans(len(pair)):
         where = blocks[rows] // each * size + pair[rows]

@@ -47,12 +47,18 @@ LOUD_M: Final = 0.5
 def refuse_impossible(ranges: Ranges) -> None:
     """Raise `UnanswerableError` where ranges cannot be fitted whatever the settings."""
     _mostly_left_out(ranges)
-    if len(ranges) > 1 and not np.ptp(ranges.time_ns) > 0:
+    if len(ranges) > 1 and not _has_times(ranges):
         raise UnanswerableError(
             f"{ranges.source}: all ranges have the same time, so nothing says how long errors last; give their times"
         )
     _scale(ranges)
     _clock_ratios(ranges)
+
+
+def _has_times(ranges: Ranges) -> bool:
+    """Return whether some session has more than one time."""
+    times = (ranges.time_ns[ranges.session == number] for number in np.unique(ranges.session))
+    return any(np.ptp(some) > 0 for some in times)
 
 
 def _mostly_left_out(ranges: Ranges) -> None:

@@ -14,6 +14,7 @@ from calib.calibration.power_curves import (
 )
 from calib.estimation.design import Design
 from calib.estimation.pairs import Pairs
+from calib.estimation.time_blocks import TimeBlocks
 from calib.estimation.unknowns import Unknowns
 from calib.long_columns import computed, let_go
 from calib.ranges import COLUMNS, Ranges
@@ -32,7 +33,8 @@ class Problem:
     its curve, None where pinned delays leave none that do; the splines of a group are less `centres` (groups, splines),
     their averages over the range where a constant is left to the delays. `shares` say how much of each group's curve is
     in a range, None for all of it. What pinned tags add is in `error` already. `bins` hold the rows of the whole
-    problem, `span` is the range of power with data. Rows are in order of time. `free` are the groups of tags that
+    problem, `span` is the range of power with data. Rows are in order of
+    sessions and of time in them, which is cut into `blocks`. `free` are the groups of tags that
     nothing determines.
 
     `unknowns` say what is looked for. Without a curve there are no splines, and `powered` (n,) says which ranges have a
@@ -56,6 +58,7 @@ class Problem:
     free: list[list[int]]
     unknowns: Unknowns
     powered: Bools
+    blocks: TimeBlocks
 
     def share(self, group: int) -> Floats:
         """Return how much of a group's curve is in each range (n,): a half for each end."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.estimation.design import Design
 from calib.estimation.gauge import stating
-from calib.estimation.intervals import blocks_of, intervals
+from calib.estimation.intervals import intervals
 from calib.estimation.losses import MIXTURE
 from calib.estimation.mixture_slopes import Errors
 from calib.estimation.pair_mixture import PairMixture, climbed, described, foot_of
@@ -110,8 +110,7 @@ def solve(
         scores, inverse, prior = _slopes(problem.design, joint, robust, ridge)
     stated = stating(problem, reference)
     delays = problem.directions @ stated[: problem.rank]
-    blocks, seconds = blocks_of(problem.ranges.time_ns)
-    known = intervals(scores, inverse, prior, delays, problem.rank, blocks=blocks, seconds=seconds)
+    known = intervals(scores, inverse, prior, delays, problem.rank, problem.blocks)
     columns = len(parameters)
     shares = [_of_curve(prior[:columns, :columns], curve) for _, curve in problem.curves()]
     covariance = known.covariance + unsure(inverse[:columns, :columns], parameters, shares)
@@ -141,7 +140,7 @@ def _likeliest(problem: Problem, start: Floats, ridge: Floats) -> PairMixture:
     del place
     foot = foot_of(errors, start, ridge)
     top = climbed(foot)
-    lasting = lasting_in_pairs(top.slope(errors, "share"), pairs.number, problem.ranges.time_ns)
+    lasting = lasting_in_pairs(top.slope(errors, "share"), pairs.number, problem.blocks)
     if lasting > LASTING:
         again = climbed(foot, lasting)
         top = replace(again if again.success else top, steps=top.steps + again.steps)
@@ -216,16 +215,13 @@ def _one_after_the_other(problem: Problem, loss: str, scale_m: float | None, ref
     penalties = [penalty[rank:, rank:] for penalty in problem.penalties()]
     ridge, start = reml_penalty(near, first.parameters, penalties)
     curves = robust_fit(design, left, loss, first.scale, ridge, start, near=True)
-    blocks, seconds = blocks_of(problem.ranges.time_ns)
     covariance = np.zeros((columns, columns))
     scores, inverse, prior = _slopes(only, alone, loss, np.zeros((rank, rank)))
-    known = intervals(scores, inverse, prior, problem.directions, rank, blocks=blocks, seconds=seconds)
+    known = intervals(scores, inverse, prior, problem.directions, rank, problem.blocks)
     covariance[:rank, :rank] = known.covariance
     slopes = _slopes(design, curves, loss, ridge)
     nothing = np.zeros((0, columns - rank))
-    covariance[rank:, rank:] = intervals(
-        *slopes, nothing, 0, blocks=blocks_of(problem.ranges.time_ns[inside])[0], seconds=seconds
-    ).covariance
+    covariance[rank:, rank:] = intervals(*slopes, nothing, 0, problem.blocks.among(inside)).covariance
     stated = stating(problem, reference)
     return Solved(
         parameters=stated @ np.concatenate([alone.parameters, curves.parameters]),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
 from calib.ranges import STATIC, Ranges
 
 MANY_MISSING: Final = 0.05
@@ -13,8 +11,11 @@ MANY_OUTLIERS: Final = 0.4
 SHORT_S: Final = 25.0
 
 
-def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]]) -> list[str]:
-    """Return sentences, the gravest first; `inliers` is the share of ranges within three sigmas."""
+def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> list[str]:
+    """Return sentences, the gravest first.
+
+    `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
+    """
     found = []
     if free:
         groups = "; ".join(", ".join(map(str, group)) for group in free)
@@ -27,7 +28,6 @@ def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]]) -> list[s
             found.append(f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}")
     if 1 - inliers > MANY_OUTLIERS:
         found.append(f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors")
-    seconds = float(np.ptp(ranges.time_ns)) * 1e-9
     if seconds < SHORT_S:
         found.append(f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow")
     return found

@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from calib.estimation.alternatives import Family, families, segments
+from calib.estimation.alternatives import Family, families
 from calib.estimation.doubts import Doubts, of_a_decibel, reflected, short, weighed
-from calib.estimation.intervals import blocks_of
 from calib.estimation.misfit import (
-    SPANS,
     Judgement,
     Tested,
     findings,
-    in_spans,
+    spans_of,
     widening_of_pairs,
 )
 from calib.estimation.persistence import persistence
@@ -28,6 +26,7 @@ from calib.estimation.places import of_places
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
 from calib.estimation.solver import Solved
+from calib.estimation.time_blocks import TimeBlocks
 from calib.trajectories.arrow import Factored
 from uwblink.arrays import Floats, Ints
 
@@ -71,10 +70,9 @@ def doubted(problem: Problem, found: Solved, taken: Taken) -> Doubts:
 
     `problem` has the distances that were found.
     """
-    blocks, seconds = blocks_of(problem.ranges.time_ns)
-    kept = found.scores.design.kept
-    alternatives = list(families(problem, of_a_decibel(problem, found), seconds))
-    tested = [_test(family, found, taken, kept(blocks), seconds) for family in alternatives]
+    number = found.scores.design.kept(problem.blocks.number)
+    alternatives = list(families(problem, of_a_decibel(problem, found)))
+    tested = [_test(family, found, taken, number, problem.blocks) for family in alternatives]
     by_pair = next(family for family in alternatives if family.kind == "pair")
     several = sum(len(one.names) for one in tested)
     judged = Judgement(
@@ -82,9 +80,9 @@ def doubted(problem: Problem, found: Solved, taken: Taken) -> Doubts:
             (one for each in tested for one in findings(each, several)), key=lambda finding: -abs(finding.deviation)
         ),
         widening_ns2=np.asarray(sum(widening_of_pairs(each) for each in tested if each.kind == "pair")),
-        pairs=_test(by_pair, found, taken, kept(blocks), seconds, pulling=True),
+        pairs=_test(by_pair, found, taken, number, problem.blocks, pulling=True),
     )
-    places = of_places(problem, found.scores, judged.pairs, kept(blocks))
+    places = of_places(problem, found.scores, judged.pairs, number)
     covariance, sentences = weighed(problem, found, judged, places)
     return Doubts(
         covariance_ns2=covariance,
@@ -103,7 +101,7 @@ def _offsets(family: Family, kept_rows: int) -> Floats:
 
 
 def _test(
-    family: Family, found: Solved, taken: Taken, blocks: Ints, seconds: float, *, pulling: bool = False
+    family: Family, found: Solved, taken: Taken, number: Ints, blocks: TimeBlocks, *, pulling: bool = False
 ) -> Tested:
     """Return a family's efficient slopes, beside trajectories and all that was fitted.
 
@@ -120,15 +118,14 @@ def _test(
         link[:, : taken.held_design.shape[1]] -= pulls.T @ taken.held_design
     reach = link @ found.inverse
     count = len(found.by_block)
-    plain = np.column_stack([np.bincount(blocks, score * column, minlength=count) for column in mine.T])
+    plain = np.column_stack([np.bincount(number, score * column, minlength=count) for column in mine.T])
     efficient = plain - found.by_block @ reach.T
     information = information - reach @ link.T
     # At the optimum all that was fitted has no slope left, what is known beside ranges included.
     known = 0.0 if pulling else found.by_block.sum(axis=0) @ reach.T
     whole = max(float(np.diag((offsets * taken.informed[:, None]).T @ offsets).max()), 1e-300)
     free = max(int(np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True)), 1)
-    spans = segments(seconds) if family.kind == "time" else SPANS
-    lasting = persistence(in_spans(efficient, spans), seconds, free)
+    lasting = persistence(efficient, blocks, free, spans_of(family, blocks))
     return Tested(
         kind=family.kind,
         names=family.names,
@@ -139,6 +136,7 @@ def _test(
         whole=whole,
         effects=-found.delays @ reach[:, : found.delays.shape[1]].T,
         lasting=lasting,
+        blocks=count,
     )
 
 

@@ -223,7 +223,7 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, riv
         *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
-        *warnings_of(ranges, float(np.mean(inliers)), []),
+        *warnings_of(ranges, float(np.mean(inliers)), [], problem.blocks.seconds),
     ]
     provenance = _provenance(climbed, problem, found, asked) | {
         "inliers": int(np.count_nonzero(inliers)),

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.estimation.gauge import stating
-from calib.estimation.intervals import blocks_of, intervals
+from calib.estimation.intervals import intervals
 from calib.estimation.mixture_start import SPREADS
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores, inverse_of
@@ -186,8 +186,7 @@ def _solved(climbed: Climbed, problem: Problem, reduced: _Reduced, reference: fl
     scores, inverse, precision = _slopes(climbed, problem, reduced.design, -slope, prior)
     stated = stating(problem, reference)
     delays = problem.directions @ stated[: problem.rank]
-    blocks, seconds = blocks_of(problem.ranges.time_ns)
-    of_blocks = intervals(scores, inverse, precision, delays, problem.rank, blocks=blocks, seconds=seconds)
+    of_blocks = intervals(scores, inverse, precision, delays, problem.rank, problem.blocks)
     shares = [_of_curve(ridge, curve) for _, curve in problem.curves()]
     # Residuals are smaller by what trajectories have taken of them (as HC3 has it; MacKinnon and White 1985).
     covariance = of_blocks.covariance / (1 - climbed.used) ** 2 + unsure(inverse[:columns, :columns], found, shares)

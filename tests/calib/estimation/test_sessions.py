@@ -1,0 +1,135 @@
+"""Several recordings in one fit: gaps between them count for nothing, and what differs between them is told."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import calib
+from benchmarks.worlds import LIGHT_M_PER_NS, Recipe, make
+from calib.cli.commands import app
+from uwblink.recording.file import Recording
+
+HOUR_NS = 3_600_000_000_000
+RECIPE = Recipe(tags=4, seconds=20, per_second=120)
+
+
+def moved(ranges, tag, by_ns):
+    """Return ranges as they are when a tag's antenna delay is another one."""
+    weight = (ranges.initiator == tag) * ranges.weight_initiator + (ranges.target == tag) * ranges.weight_target
+    return replace(ranges, raw_m=ranges.raw_m - weight * by_ns * LIGHT_M_PER_NS)
+
+
+def sessions(hours, *, seed=20_001, moved_ns=0.0, recipe=RECIPE):
+    """Return the delays of a world, and two recordings of it, the second so many hours after the first."""
+    world, later = make(recipe, seed), make(recipe, seed, flight=1)
+    begin = int(world.ranges.time_ns[-1] - later.ranges.time_ns[0]) + int(hours * HOUR_NS)
+    second = replace(later.ranges, time_ns=later.ranges.time_ns + begin, source="tuesday.uwb")
+    return world.delays_ns, [replace(world.ranges, source="monday.uwb"), moved(second, 3, moved_ns)]
+
+
+def between(found):
+    """Return the warnings that say what differs between recordings."""
+    return [said for said in found.warnings if "monday.uwb" in said or "tuesday.uwb" in said]
+
+
+def numbers(found):
+    calibration = found.calibration
+    return [*calibration.delays_ns.values(), *calibration.delays_std_ns.values(), *calibration.bias_curve.coefficients]
+
+
+@pytest.mark.parametrize("hours", [1, 6, 72])
+def test_hours_between_sessions_change_nothing(hours):
+    adjacent, apart = (calib.fit(sessions(gap)[1]) for gap in (1e-5, hours))
+    np.testing.assert_allclose(numbers(apart), numbers(adjacent), rtol=1e-6, atol=1e-9)
+    assert between(adjacent) == between(apart) == []
+    assert not [said for said in apart.warnings if "last" in said]
+
+
+def test_sessions_whose_times_begin_at_zero_are_sessions():
+    _, (monday, tuesday) = sessions(6)
+    at_zero = [replace(part, time_ns=part.time_ns - part.time_ns[0]) for part in (monday, tuesday)]
+    np.testing.assert_allclose(numbers(calib.fit(at_zero)), numbers(calib.fit([monday, tuesday])), rtol=1e-6, atol=1e-9)
+
+
+def test_a_pause_within_a_recording_changes_nothing():
+    ranges = make(RECIPE, 5).ranges
+    late = ranges.time_ns + np.where(np.arange(len(ranges)) > len(ranges) // 3, 3 * HOUR_NS, 0)
+    whole, paused = (calib.fit(replace(ranges, time_ns=time)) for time in (ranges.time_ns, late))
+    np.testing.assert_allclose(paused.calibration.delays_ns[1], whole.calibration.delays_ns[1], rtol=1e-9)
+    # Two hundred blocks of time begin a step elsewhere after the pause: each is one more draw of the same variance.
+    widths = [list(found.calibration.delays_std_ns.values()) for found in (whole, paused)]
+    np.testing.assert_allclose(*widths, rtol=0.25)
+    assert len(paused.warnings) == len(whole.warnings)
+
+
+@pytest.mark.parametrize("by_ns", [0.3, 1.5])
+@pytest.mark.parametrize("hours", [1e-5, 72])
+def test_a_tag_whose_delay_changed_between_sessions_is_named_and_intervals_hold(by_ns, hours):
+    known, parts = sessions(hours, moved_ns=by_ns)
+    found = calib.fit(parts)
+    said = between(found)
+    assert len(said) == 1
+    assert said[0].startswith("tag 3")
+    assert "monday.uwb" in said[0]
+    assert "tuesday.uwb" in said[0]
+    assert float(said[0].split("p = ")[1].split(")")[0]) < 1e-6
+    delays, covariance = found.calibration.delays_ns, np.array(found.calibration.uncertainty.delays_ns2)
+    others = np.array([-1 / 3, -1 / 3, 1, -1 / 3])
+    error = others @ [delays[tag] - known[tag] for tag in known]
+    reach = 1.96 * np.sqrt(others @ covariance @ others)
+    assert abs(error) < reach
+    assert abs(error - by_ns) < reach < 3 * by_ns
+
+
+def test_a_pair_that_reads_otherwise_in_one_session_is_named():
+    _, (monday, tuesday) = sessions(72)
+    longer = np.isin(tuesday.initiator, (1, 2)) & np.isin(tuesday.target, (1, 2))
+    found = calib.fit([monday, replace(tuesday, raw_m=tuesday.raw_m + 0.08 * longer)])
+    assert [said.split(":")[0].split(" or ")[0] for said in between(found)] == ["pair 1-2"]
+
+
+def test_the_one_of_three_sessions_in_which_a_tag_differs_is_named():
+    parts = [replace(make(RECIPE, 8, k).ranges, source=f"day{k}.uwb") for k in range(3)]
+    found = calib.fit([parts[0], moved(parts[1], 2, 0.4), parts[2]])
+    assert [said for said in found.warnings if said.startswith("tag 2") and "day1.uwb" in said]
+    assert not [said for said in found.warnings if "day0.uwb" in said or "day2.uwb" in said]
+
+
+def test_scatter_between_sessions_is_in_the_intervals():
+    rng, parts = np.random.default_rng(1), []
+    for k in range(2):
+        ranges = make(RECIPE, 9, k).ranges
+        offset = rng.normal(0, 0.02, (5, 5))[
+            np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
+        ]
+        parts.append((ranges, replace(ranges, raw_m=ranges.raw_m + offset)))
+    sound, scattered = (calib.fit([part[k] for part in parts]).calibration for k in (0, 1))
+    # Two centimetres in each of three pairs of a tag, in each of two sessions, are some 50 ps of its delay.
+    assert np.mean(list(sound.delays_std_ns.values())) < 0.03
+    assert 0.03 < np.mean(list(scattered.delays_std_ns.values())) < 0.15
+
+
+def test_the_command_fits_recordings_three_days_apart(tmp_path):
+    paths = []
+    for seed, hours in ((1, 0), (2, 72)):
+        flight, later = calib.sample_flight(600, seed=seed), hours * HOUR_NS
+        paths.append(tmp_path / f"{hours}.uwb")
+        with Recording.create(paths[-1]) as recording:
+            recording.append_exchanges(replace(flight.exchanges, time_ns=flight.exchanges.time_ns + later))
+            recording.append_poses(replace(flight.poses, time_ns=flight.poses.time_ns + later))
+            recording.append_tags(flight.tags)
+    done = CliRunner().invoke(app, ["fit", *map(str, paths), "-o", str(tmp_path / "both.json")])
+    assert done.exit_code == 0, done.output
+    assert "only 12 s of data" in done.stderr
+    written = json.loads((tmp_path / "both.json").read_text())
+    assert written["provenance"]["exchanges"] > 1100
+
+
+def test_sessions_without_times_are_refused():
+    _, parts = sessions(6)
+    frozen = [replace(part, time_ns=np.full_like(part.time_ns, k)) for k, part in enumerate(parts)]
+    with pytest.raises(calib.UnanswerableError, match="same time"):
+        calib.fit(frozen)
