@@ -15,8 +15,10 @@ from typing import Final
 
 import numpy as np
 
+from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, ColumnMap, load_map
+from uwblink.importers.exchange_rows import optional
 from uwblink.importers.long_tables import exchanges_of_long
 from uwblink.importers.staged_tables import StagedTables, Watch
 from uwblink.importers.stamps import stamps_of
@@ -26,6 +28,7 @@ from uwblink.importers.trials import SAMPLE, Reading, Sample, Trial, try_others
 from uwblink.importers.unusable import Unusable
 from uwblink.importers.usable import Usable, usable_exchanges, usable_ranges
 from uwblink.recording.contents import Contents
+from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK
 from uwblink.twr import LARGEST_ID, STAMPS
 
 MOST_NAMES: Final = 12
@@ -140,7 +143,7 @@ def _sample(source: RowSource, usable: Usable) -> Rows:
     """Return some of the rows that can be used, drawn by chance."""
     random = np.random.default_rng(0)
     chosen = np.sort(random.choice(usable.count, min(SAMPLE, usable.count), replace=False))
-    return source.at(usable.places(chosen), (*STAMPS, "gt_range_m"))
+    return source.at(usable.places(chosen), (*STAMPS, "gt_range_m", "skew2"))
 
 
 def _reading(tables: StagedTables, rows: Rows, reading: Reading, notes: list[str]) -> Reading:
@@ -148,8 +151,10 @@ def _reading(tables: StagedTables, rows: Rows, reading: Reading, notes: list[str
     column_map = tables.column_map
     pair = rows.ids["from_id"] * (LARGEST_ID + 1) + rows.ids["to_id"]
     cells = {name: rows.cells[name] for name in STAMPS if has(rows, name)}
-    truth = rows.cells["gt_range_m"] if "gt_range_m" in rows.cells else np.full(len(rows), np.nan)
-    first, other = try_others(Sample(cells, pair, truth, column_map.ticks_per_unit), reading)
+    sample = Sample(
+        cells, pair, optional(rows, "gt_range_m"), optional(rows, "skew2"), _longer_m(rows), column_map.ticks_per_unit
+    )
+    first, other = try_others(sample, reading)
     if other is None:
         if first.plausible < 0.5 and len(rows) >= 20:
             notes.append(
@@ -158,14 +163,32 @@ def _reading(tables: StagedTables, rows: Rows, reading: Reading, notes: list[str
             )
         return reading
     difference = other.reading.difference(reading)
-    stated = column_map.protocol
-    if other.reading.swapped or (stated and other.reading.protocol != reading.protocol) or column_map.bits:
+    contradicted = (
+        other.reading.swapped
+        or (column_map.protocol and other.reading.protocol != reading.protocol)
+        or (column_map.bits and other.reading.bits != reading.bits)
+        or (column_map.antenna_delays and other.reading.undelayed)
+    )
+    if contradicted:
         raise ImportTableError(
             f'{tables.paths[0]}: by protocol "{reading.protocol}" its ranges are {_span(first)}; '
             f"with {difference} they are {_span(other)}: say so in the map"
         )
     notes.append(f'read with {difference}: by protocol "{reading.protocol}" the ranges would be {_span(first)}')
     return other.reading
+
+
+def _longer_m(rows: Rows) -> Floats:
+    """Return by how much ranges (n,) are longer because of antenna delays that were not programmed, by the map."""
+    delays = rows.column_map.antenna_delays
+    if not delays:
+        return np.broadcast_to(0.0, len(rows))
+    lacking = np.zeros(len(rows))
+    for name in IDS:
+        ids, back = np.unique(rows.ids[name], return_inverse=True)
+        programmed = [sum(delays.get(int(tag), delays[None]).values()) for tag in ids]
+        lacking += (2 * ANTENNA_DELAY_TICKS - np.array(programmed, dtype=np.float64))[back]
+    return lacking / 2 * METRES_PER_TICK
 
 
 def _span(trial: Trial) -> str:

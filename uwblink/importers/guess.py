@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -55,10 +55,11 @@ def guess_map(path: Path) -> Guess:
     if layout == "messages" and _only_words(cells, "message") and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     columns, cells, unplaced = placed(columns, cells)
+    delays: list[str] = []
     top = [f'layout = "{layout}"  # {_WHY[layout]}' if layout in LAYOUTS else f"# {_WHY[layout]}"]
     units = _unit_lines(columns, cells)
     if layout in ("exchanges", "messages", "stamps"):
-        stamps, unit = _stamp_lines(columns, cells, layout)
+        stamps, unit, delays = _stamp_lines(columns, cells, layout)
         top, units = top + stamps, unit + units
     named = [f"{name} = {json.dumps(header)}" for name, header in columns.items() if _belongs(name, layout)]
     missing = [name for name in ("from_id", "to_id") if name not in columns]
@@ -83,7 +84,7 @@ def guess_map(path: Path) -> Guess:
     lines += [f"# distances have one unit for all, here they have {', '.join(sorted(mixed))}: convert some"] * (
         len(mixed) > 1
     )
-    lines += ["# what was programmed into the devices is not in the table: [antenna_delays] says it"]
+    lines += delays or ["# what was programmed into the devices is not in the table: [antenna_delays] says it"]
     return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2, tuple(missing))
 
 
@@ -121,8 +122,10 @@ def _belongs(name: str, layout: str) -> bool:
     return name not in OF_MESSAGES and not (layout == "ranges" and name in STAMPS)
 
 
-def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str) -> tuple[list[str], list[str]]:
-    """Return lines of the map on protocol and counter, and on the unit of the stamps, with their reasons."""
+def _stamp_lines(
+    columns: dict[str, str], cells: dict[str, Floats], layout: str
+) -> tuple[list[str], list[str], list[str]]:
+    """Return lines of the map on protocol and counter, the unit of stamps, and antenna delays, with their reasons."""
     names = [name for name in (STAMPS if layout == "exchanges" else ("tx", "rx", "stamp")) if name in cells]
     stamps: dict[str, Floats] = {name: cells[name] for name in names}
     whole = all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
@@ -131,7 +134,7 @@ def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str)
         unit = next(iter(ended - {None}), None) or ("ticks" if whole else "ns")
         bits, counter = how_counted({n: c * STAMP_UNITS[unit] for n, c in stamps.items()}, None, None)
         why = "whole numbers" if whole else "not whole numbers"
-        return [f"bits = {bits}", f'counter = "{counter}"'], [f'stamps = "{unit}"  # {why}']
+        return [f"bits = {bits}", f'counter = "{counter}"'], [f'stamps = "{unit}"  # {why}'], []
     units = [u for u in ended if u] or (["ticks", "ns", "us", "s", "ps"] if whole else ["ns", "us", "s", "ps", "ticks"])
     metres = DISTANCE_UNITS[min(_distance_units(columns), default="m")]
     trials = [trial for unit in units for trial in _trials(stamps, cells, unit, metres)]
@@ -144,7 +147,8 @@ def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str)
         f'counter = "{counter}"',
     ]
     why = "by the columns' names" if ended - {None} else "whole numbers" if whole else "as ranges are plausible"
-    return lines, [f'stamps = "{unit}"  # {why}']
+    delays = ["[antenna_delays]  # by the true distances nothing was programmed into the devices", "tx = 0", "rx = 0"]
+    return lines, [f'stamps = "{unit}"  # {why}'], ["", *delays] if best.reading.undelayed else []
 
 
 def _trials(
@@ -156,10 +160,16 @@ def _trials(
     sampled = {name: column[chosen] for name, column in stamps.items()}
     bits, counter = how_counted({n: c * STAMP_UNITS[unit] for n, c in sampled.items()}, None, None)
     truth = cells["gt_range_m"][chosen] * metres if "gt_range_m" in cells else np.full(len(chosen), np.nan)
-    sample = Sample(sampled, np.zeros(len(chosen), dtype=np.int64), truth, STAMP_UNITS[unit])
+    nothing = np.zeros(len(chosen))
+    sample = Sample(
+        sampled, np.zeros(len(chosen), dtype=np.int64), truth, np.full(len(chosen), np.nan), nothing, STAMP_UNITS[unit]
+    )
     names = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) == set(stamps)]
     names = [name for name in names if name not in ("ss-cfo", "ds-sym")] or ["ss"]
-    return [(unit, counter, sample.attempt(Reading(name, bits))) for name in names]
+    readings = [Reading(name, bits) for name in names]
+    if np.isfinite(truth).any():
+        readings += [replace(reading, undelayed=True) for reading in readings]
+    return [(unit, counter, sample.attempt(reading)) for reading in readings]
 
 
 def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:

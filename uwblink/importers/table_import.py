@@ -113,6 +113,8 @@ class TableImport:
 
     def _meta(self, notes: list[str]) -> dict[str, Any]:
         delays, names = self.tables.column_map.antenna_delays, self.tables.names
+        if self.reading and self.reading.undelayed:
+            delays = {None: {"tx": 0, "rx": 0}}
         meta: dict[str, Any] = {
             "source": self.kind,
             "imported_from": self.imported_from or ", ".join(path.name for path in self.tables.paths),

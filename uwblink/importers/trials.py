@@ -1,13 +1,14 @@
 """Whether stamps make ranges: the protocol, the counter's width and the columns tried in other ways, and what fits.
 
 A range is plausible from two metres below zero (antenna delays) to two kilometres above, widened for single-sided
-ranging by what clocks 50 ppm apart add in its reply; where a distance was measured, within 50 m of it.
+ranging by what clocks 50 ppm apart add in its reply; where a distance was measured, within 50 m of it. All that is said
+of ranges less what antenna delays of devices add that were not programmed with any: 154 m.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
 
@@ -16,7 +17,7 @@ import numpy as np
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.importers.stamps import ENOUGH_ROWS, NEVER, clocks, stamps_of, to_ticks
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals, raw_range
 
 SAMPLE: Final = 2000
@@ -24,6 +25,9 @@ GOOD_ENOUGH: Final = 0.5
 CLEARLY: Final = 0.9
 LOWEST_M, HIGHEST_M = -2.0, 2000.0
 FROM_TRUTH_M: Final = 50.0
+UNDELAYED_M: Final = 2 * ANTENNA_DELAY_TICKS * METRES_PER_TICK
+"""How much longer ranges are where nothing was programmed: half of what is lacking at both ends, in both directions."""
+
 CLOCKS_APART: Final = 50e-6
 
 
@@ -34,12 +38,15 @@ class Reading:
     protocol: str
     bits: int
     swapped: tuple[tuple[str, str], ...] = ()
+    undelayed: bool = False
+    """Whether no antenna delays were programmed, whatever the map says or leaves open."""
 
     def difference(self, other: Reading) -> str:
         """Say how this differs from another way."""
         said = [f'protocol = "{self.protocol}"'] if self.protocol != other.protocol else []
         said += [f"bits = {self.bits}"] if self.bits != other.bits else []
         said += [f"the columns of {one} and {two} exchanged" for one, two in self.swapped]
+        said += ["[antenna_delays] tx = 0 and rx = 0"] if self.undelayed else []
         return " and ".join(said)
 
 
@@ -56,11 +63,17 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Stamps of some rows to try readings on, in their own unit, their pairs, and measured distances (NaN: none)."""
+    """Stamps of some rows to try readings on, in their own unit, and their pairs.
+
+    Measured distances, and the skew of the second message, are NaN where there is none. `longer_m` is by how much
+    ranges are longer for want of antenna delays in the devices, (n,), by what the map says of these.
+    """
 
     cells: Mapping[str, Floats]
     pair: Ints
     truth_m: Floats
+    skew2_ppm: Floats
+    longer_m: Floats
     ticks_per_unit: float
 
     def attempt(self, reading: Reading) -> Trial:
@@ -75,12 +88,13 @@ class Sample:
         none = np.zeros(count, dtype=np.int64)
         stamps |= {name: none for name in ("tx3", "rx3") if name not in stamps}
         unknown = np.full(count, np.nan)
-        levels = ("range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm", "truth_m")
+        levels = ("range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "truth_m")
         exchanges = Exchanges(
             time_ns=none, initiator=none, target=none + 1, reporter=none, bits=reading.bits,
-            protocol=np.full(count, reading.protocol), **stamps, **dict.fromkeys(levels, unknown),
+            protocol=np.full(count, reading.protocol), skew2_ppm=self.skew2_ppm, **stamps,
+            **dict.fromkeys(levels, unknown),
         )  # fmt: skip
-        raw = raw_range(exchanges)
+        raw = raw_range(exchanges) - (UNDELAYED_M if reading.undelayed else self.longer_m)
         ranges = np.where(np.isfinite(raw), raw, np.nan)  # no time between the last two messages makes them infinite
         good = self._plausible(ranges, exchanges)
         low, high = np.nanpercentile(ranges, [5, 95]) if np.isfinite(ranges).any() else (np.nan, np.nan)
@@ -126,6 +140,8 @@ def _others(sample: Sample, reading: Reading) -> Iterator[list[Reading]]:
     names = [name for name in names if name != "ss-cfo" and (name != "ds-sym" or reading.protocol == name)]
     plain = [Reading(name, bits) for name in names for bits in (reading.bits, 72 - reading.bits)]
     used = stamps_of(reading.protocol)
+    # Without true distances, ranges of devices without antenna delays are as plausible as those with them.
+    yield [replace(reading, undelayed=True)] if np.isfinite(sample.truth_m).any() else []
     yield [other for other in plain if other != reading and stamps_of(other.protocol) == used]
     pairs = list(combinations(used, 2))
     swaps = [(pair,) for pair in pairs] + [(("tx1", "rx1"), ("tx2", "rx2"))]

@@ -243,7 +243,7 @@ def test_memory_does_not_grow_with_a_bag(tmp_path, monkeypatch):
     at_once(monkeypatch, 500)
     (tmp_path / "b.mcap").touch()
     peaks = []
-    for count in (200, 1_000, 4_000):  # the first is for what is only made once
+    for count in (200, 2_500, 5_500):  # the first is for what is only made once; the others fill a sample of 2,000
         bag = Bag(tmp_path / "b.mcap", count)
         monkeypatch.setattr(exchange_bags, "opened", lambda path, bag=bag: nullcontext(bag))
         tracemalloc.start()
