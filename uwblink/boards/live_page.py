@@ -10,6 +10,7 @@ import base64
 import hashlib
 import math
 import shutil
+import sys
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -30,6 +31,8 @@ from uwblink.wire.bulk import exchanges_of
 LOOPBACK: Final = "127.0.0.1"
 MOST_POINTS: Final = 600
 LAST_FAULTS: Final = 8
+IDLE_S: Final = 10.0
+"""A connection that sends no request for so long is closed: each has a thread."""
 
 
 class LivePage(Listener):
@@ -46,10 +49,9 @@ class LivePage(Listener):
         self._faults: deque[Fault] = deque(maxlen=LAST_FAULTS)
         self._progress = Progress()
         try:
-            self._server = ThreadingHTTPServer((LOOPBACK, port), self._handler())
+            self._server = _Server((LOOPBACK, port), self._handler())
         except OSError as error:
             raise PortError(f"port {port}: the page cannot be served there ({error.strerror})") from error
-        self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, name="uwblink page", daemon=True)
         self._thread.start()
 
@@ -100,14 +102,15 @@ class LivePage(Listener):
 
     def html(self) -> str:
         """Return the whole page."""
-        return whole(f"recording {escape(self._path.name)}", self.body())
+        return whole(self.body())
 
     def body(self) -> str:
-        """Return what changes: counts, pairs, faults, disk."""
+        """Return what changes: counts, pairs, faults, disk; and the name, as the next recorder may have this port."""
         with self._lock:
             series = {pair: list(points) for pair, points in self._series.items()}
             faults = list(reversed(self._faults))
         parts = (
+            f"<h1>recording {escape(self._path.name)}</h1>",
             counts(self._progress),
             table(self._progress, series, corrected=self._correct is not None),
             faults_list(self._progress, faults),
@@ -128,6 +131,8 @@ class LivePage(Listener):
         class Handler(BaseHTTPRequestHandler):
             """Answers for one page."""
 
+            timeout = IDLE_S
+
             def do_GET(self) -> None:
                 host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
                 found = {"/": page.html, "/body": page.body}.get(self.path)
@@ -144,6 +149,16 @@ class LivePage(Listener):
         return Handler
 
 
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    request_queue_size = 128
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing of a browser that goes away, which is no error; the terminal belongs to the recorder."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
 def _send(handler: BaseHTTPRequestHandler, text: str) -> None:
     data = text.encode()
     script = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
@@ -153,7 +168,8 @@ def _send(handler: BaseHTTPRequestHandler, text: str) -> None:
     handler.send_header("Cache-Control", "no-store")
     handler.send_header(
         "Content-Security-Policy",
-        f"default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; script-src 'sha256-{script}'",
+        f"default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; script-src 'sha256-{script}'; "
+        "frame-ancestors 'none'",
     )
     handler.end_headers()
     handler.wfile.write(data)

@@ -19,7 +19,8 @@ SILENT_HZ: Final = 1e-9
 STYLE: Final = CSS + (files("uwblink.boards") / "live.css").read_text(encoding="utf-8")
 SCRIPT: Final = """
 setInterval(async()=>{const m=document.querySelector('main');try{const r=await fetch('/body');
-if(r.ok){m.innerHTML=await r.text();}}catch(e){document.title='recording ended';
+if(r.ok){m.innerHTML=await r.text();document.title=m.querySelector('h1').textContent;}
+}catch(e){document.title='recording ended';
 m.querySelector('p').textContent='This recording has ended; below is the last that came.';
 }},1000);
 """
@@ -33,13 +34,14 @@ class Point(NamedTuple):
     corrected_m: float
 
 
-def whole(title: str, body: str) -> str:
-    """Return the page around what changes; both are HTML already."""
+def whole(body: str) -> str:
+    """Return the page around what changes, which is HTML and begins with a heading."""
+    title = body.removeprefix("<h1>").partition("</h1>")[0]
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style>'
         '<noscript><meta http-equiv="refresh" content="2"></noscript></head>'
-        f"<body><h1>{title}</h1><main>{body}</main><script>{SCRIPT}</script></body></html>"
+        f"<body><main>{body}</main><script>{SCRIPT}</script></body></html>"
     )
 
 

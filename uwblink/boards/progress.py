@@ -25,7 +25,8 @@ class PairState:
 
     def rate_hz(self, time_s: float) -> float:
         """Return the successes a second over the last two seconds before `time_s`."""
-        recent = sum(t > time_s - RATE_WINDOW_S for t in self.recent_s)
+        # Of a copy, made at once: a page asks in a thread of its own, while the recorder goes on.
+        recent = sum(t > time_s - RATE_WINDOW_S for t in [*self.recent_s])
         return recent / min(RATE_WINDOW_S, max(time_s, 0.1))
 
 

@@ -1,10 +1,14 @@
 """The live page: what it shows, to whom, and in a browser where there is one."""
 
+import contextlib
 import re
 import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -14,6 +18,7 @@ import pytest
 
 import uwblink
 from tests.boards import bench_scenario, served
+from uwblink.boards import live_page
 from uwblink.boards.corrections import load_correction
 from uwblink.boards.listeners import Turn
 from uwblink.boards.live_page import LivePage
@@ -134,6 +139,10 @@ def test_the_page_is_for_this_computer_alone(tmp_path):
         assert not re.findall(r"(?:src|href)=", text)
         for path, host, status in (
             ("", "evil.example", 403),
+            ("body", "evil.example:8000", 403),
+            ("", "127.0.0.1.evil.example", 403),
+            ("", "localhost.evil.example:80", 403),
+            ("", "", 403),
             ("../etc/passwd", "localhost", 404),
             ("x", "localhost", 404),
         ):
@@ -143,6 +152,51 @@ def test_the_page_is_for_this_computer_alone(tmp_path):
             refused.value.close()
         with pytest.raises(PortError, match="cannot be served there"):
             LivePage(tmp_path / "f.uwb", port=int(page.url.rsplit(":", 1)[1].rstrip("/")))
+
+
+def connected(page):
+    return socket.create_connection(("127.0.0.1", int(page.url.rsplit(":", 1)[1].rstrip("/"))), timeout=20)
+
+
+def test_connections_that_are_reset_or_hold_garbage_print_nothing_and_end_nothing(tmp_path, capfd):
+    requests = (
+        b"",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"GET /body",
+        b"\x00\xff" * 50_000,
+        b"X" * 70_000 + b"\r\n",
+    )
+    with LivePage(tmp_path / "f.uwb") as page:
+        for request in requests * 8:
+            with connected(page) as client:
+                # Closing sends a reset, where an answer comes to nobody.
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                with contextlib.suppress(OSError):
+                    client.sendall(request)
+        assert fetch(page)[0]["Content-Type"] == "text/html; charset=utf-8"
+        while any("process_request_thread" in thread.name for thread in threading.enumerate()):
+            time.sleep(0.01)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_connection_that_says_nothing_is_closed(tmp_path, monkeypatch):
+    monkeypatch.setattr(live_page, "IDLE_S", 0.05)
+    with LivePage(tmp_path / "f.uwb") as page, connected(page) as client:
+        client.sendall(b"GET / HT")
+        assert client.recv(100) == b"", "the other end hung up"
+
+
+def test_what_a_page_fetches_names_the_recording_of_whoever_serves_it_now(tmp_path):
+    """The next recorder may have the same port, and the page of the one before is still open."""
+    with LivePage(tmp_path / "old.uwb") as page:
+        _, whole = fetch(page)
+        port = int(page.url.rsplit(":", 1)[1].rstrip("/"))
+    with LivePage(tmp_path / "new.uwb", port=port) as page:
+        _, body = fetch(page, "body")
+    assert "recording old.uwb" in whole[whole.index("<main>") : whole.index("</main>")]
+    assert "recording new.uwb" in body
+    outside = whole[: whole.index("<main>")].partition("</title>")[2] + whole[whole.index("</main>") :]
+    assert "old.uwb" not in outside, "what is not fetched again says nothing of a recording"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: nothing to open the page with")
