@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats
 from uwbsim.random_streams import stream
-from uwbsim.world import rotations
 from uwbsim.world.world import World
 
 NS_PER_S: Final = 1_000_000_000
@@ -75,8 +75,8 @@ class _Eye:
         """Return position and quaternion at times (n,), None in a gap."""
         spread = self._noise.normal(size=(2, len(time_s), 3))
         position = self._path.position_m(time_s) + spread[0] * self._mocap.position_noise_m
-        wobble = rotations.of_vectors(spread[1] * self._mocap.attitude_noise_rad)
-        turn = rotations.product(rotations.normalized(self._path.quaternion(time_s)), wobble)
+        wobble = Rotation.from_rotvec(spread[1] * self._mocap.attitude_noise_rad)
+        turn = (Rotation.from_quat(self._path.quaternion(time_s)) * wobble).as_quat()
         return [
             None if self._is_blind(at) else np.concatenate(p) for at, *p in zip(time_s, position, turn, strict=True)
         ]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final, Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.scenario.model import Scenario
@@ -22,7 +23,6 @@ from uwbsim.world.geometric_paths import (
     paths_between,
 )
 from uwbsim.world.leading_edge import Detected, Sensing, detect
-from uwbsim.world.rotations import matrices
 from uwbsim.world.surroundings import Placed, PlacedBody, Surroundings
 from uwbsim.world.trajectories import Trajectory
 
@@ -175,4 +175,4 @@ def _chosen(legs: Legs, rows: Ints) -> Legs:
 
 
 def _pose(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
-    return path.position_m(time_s), matrices(path.quaternion(time_s))
+    return path.position_m(time_s), Rotation.from_quat(path.quaternion(time_s)).as_matrix()

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
 from uwbsim.world.propagation import Link
-from uwbsim.world.rotations import matrices
 from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
@@ -100,7 +100,7 @@ class SampledWorld:
         world = self._world
         time = np.asarray((block * STEPS + np.arange(STEPS + 1)) * STEP_S, dtype=np.float64)
         bodies = {name: (b.position_m(time), b.quaternion(time)) for name, b in world.trajectories.items()}
-        turns = {name: matrices(q) for name, (_, q) in bodies.items()}
+        turns = {name: Rotation.from_quat(q).as_matrix() for name, (_, q) in bodies.items()}
         tags = world.scenario.tags
         turned = np.stack([turns[tag.body] for tag in tags], axis=1)
         arms = np.array([tag.lever_arm_m for tag in tags])

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats
 from uwblink.bsplines import BSpline
 from uwbsim.scenario.motion import Carried, Figure, RandomFlight, Recorded, Static, Waypoints
-from uwbsim.world.rotations import turned
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body for a purpose."""
@@ -43,7 +43,7 @@ class Trajectory:
 
     def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
         """Return where a point of the body is, shape (n, 3)."""
-        return np.asarray(self.position(time_s) + turned(self.quaternion(time_s), np.array(lever_arm_m)))
+        return np.asarray(self.position(time_s) + Rotation.from_quat(self.quaternion(time_s)).apply(lever_arm_m))
 
 
 def _quaternions(angles: Floats) -> Floats:
@@ -148,7 +148,7 @@ def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
 def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
     """A monotone cubic through recorded positions, and the shortest turns between recorded attitudes."""
     from scipy.interpolate import PchipInterpolator
-    from scipy.spatial.transform import Rotation, Slerp
+    from scipy.spatial.transform import Slerp
 
     times = np.array(motion.times_s)
     path = PchipInterpolator(times, np.array(motion.positions_m))

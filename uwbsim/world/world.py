@@ -7,6 +7,7 @@ from functools import partial
 from typing import Final, Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses
@@ -15,7 +16,6 @@ from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import NS, NS_PER_S
-from uwbsim.world import rotations
 from uwbsim.world.channel import Ends, PlacedShadow, link_between
 from uwbsim.world.geometric_responses import GeometricResponses
 from uwbsim.world.impulse_response import PathsHeard, Waves, paths_heard
@@ -168,8 +168,8 @@ class World:
         rng = stream(self.scenario.run.seed, "motion capture", name)
         time_s = np.asarray(time_ns * NS, dtype=np.float64)
         position = body.position_m(time_s) + rng.normal(0, 1, (len(time_s), 3)) * mocap.position_noise_m
-        wobble = rotations.of_vectors(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
-        return position, rotations.product(rotations.normalized(body.quaternion(time_s)), wobble)
+        wobble = Rotation.from_rotvec(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
+        return position, (Rotation.from_quat(body.quaternion(time_s)) * wobble).as_quat()
 
 
 def _placed(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
@@ -179,7 +179,7 @@ def _placed(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
 
 def _matrices(path: Trajectory, time_s: Floats) -> Floats:
     """Return rotations body to world, (n, 3, 3)."""
-    return rotations.matrices(path.quaternion(time_s))
+    return Rotation.from_quat(path.quaternion(time_s)).as_matrix()
 
 
 def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
