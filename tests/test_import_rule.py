@@ -42,7 +42,7 @@ CONFINED = {
 FLOORS = {
     "uwblink": (
         ("arrays", "display", "errors", "lazy", "text_files"),
-        ("bsplines", "columns", "output", "pages", "plugins", "ticks", "toml"),
+        ("columns", "output", "pages", "plugins", "ticks", "toml"),
         ("protocols",),
         ("twr",),
         ("wire",),

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.bsplines import combination, derivative, matrix
 
 ALPHA_DBM: Final = -82.0
 DEGREE: Final = 3
@@ -75,7 +75,7 @@ class Curve:
         if self.flat:
             return np.full(np.shape(lifted), self.coefficients[0])
         knots, coefficients = np.array(self.knots), np.array(self.coefficients)
-        return combination(np.clip(lifted, *self.range), knots, coefficients, self.degree)
+        return np.asarray(BSpline(knots, coefficients, self.degree)(np.clip(lifted, *self.range)))
 
     @property
     def flat(self) -> bool:
@@ -135,7 +135,7 @@ def _quantiles(ordered: Floats, shares: Floats) -> Floats:
 
 def basis(lifted: Floats, knots: Floats) -> Floats:
     """Return the cubic B-splines of `knots` at lifted powers, clamped to their span, shape (n, m)."""
-    return matrix(np.clip(lifted, knots[0], knots[-1]), knots, DEGREE)
+    return np.asarray(BSpline.design_matrix(np.clip(lifted, knots[0], knots[-1]), knots, DEGREE).toarray())
 
 
 def curvature(knots: Floats) -> Floats:
@@ -147,9 +147,8 @@ def curvature(knots: Floats) -> Floats:
     edges = np.unique(knots)
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
     points = np.concatenate([middle - half / np.sqrt(3), middle + half / np.sqrt(3)])
-    once, inner = derivative(knots, DEGREE)
-    twice, innermost = derivative(inner, DEGREE - 1)
-    second = matrix(points, innermost, DEGREE - 2) @ twice @ once
+    every = BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)
+    second = every.derivative(2)(points)
     weight = np.concatenate([half, half]) * (edges[-1] - edges[0]) ** 3
     return np.asarray((second * weight[:, None]).T @ second)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from calib.calibration.power_curves import (
     DEGREE,
@@ -26,7 +27,6 @@ from calib.estimation.unknowns import Unknowns
 from calib.long_columns import EVERY, computed, empty, let_go, picked, put
 from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
-from uwblink.bsplines import nonzero
 from uwblink.ticks import SPEED_OF_LIGHT
 
 FEWEST: Final = 100
@@ -219,8 +219,8 @@ def _raw(
     ordered = picked(lifted, order)
     for begin in range(0, len(lifted) if each else 0, ROWS_AT_ONCE):
         rows = slice(begin, begin + ROWS_AT_ONCE)
-        some = nonzero(np.clip(ordered[rows], knots[0], knots[-1]), knots, DEGREE)[1]
-        for into, spline in zip(values[-DEGREE - 1 :], some, strict=True):
+        some = BSpline.design_matrix(np.clip(ordered[rows], knots[0], knots[-1]), knots, DEGREE).data
+        for into, spline in zip(values[-DEGREE - 1 :], some.reshape(-1, DEGREE + 1).T, strict=True):
             put(into, rows, spline)
         if begin % (PIECES_AT_ONCE * ROWS_AT_ONCE) == 0:
             let_go(values, ordered)

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.parts import CorrectedRanges
@@ -16,7 +17,6 @@ from calib.ranges import Ranges
 from calib.sources import Data, load_ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
-from uwblink.bsplines import combination
 from uwblink.ticks import SPEED_OF_LIGHT
 
 CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}
@@ -146,7 +146,7 @@ def planted_curve(ranges: Ranges, which: str, lifted: Floats) -> Floats | None:
         return None
     knots, degree = np.array(curve["knots"], dtype=float), int(curve["degree"])
     inside = np.clip(lifted, knots[degree], knots[-1 - degree])
-    return combination(inside, knots, np.array(curve["coefficients"], dtype=float), degree)
+    return BSpline(knots, np.array(curve["coefficients"], dtype=float), degree)(inside)
 
 
 def pair_rows(ranges: Ranges) -> dict[str, Bools]:

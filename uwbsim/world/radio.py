@@ -7,9 +7,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from uwblink.arrays import Floats
-from uwblink.bsplines import BSpline
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
 from uwbsim.random_streams import stream

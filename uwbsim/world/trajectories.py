@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Floats
-from uwblink.bsplines import BSpline
 from uwbsim.scenario.motion import Carried, Figure, RandomFlight, Recorded, Static, Waypoints
 
 Draw = Callable[[str], np.random.Generator]
@@ -92,8 +92,6 @@ def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory
     points = np.array(motion.points_m)
     if motion.times_s is None:
         return Trajectory(_straight(points, motion.speed_mps or 1.0, motion.acceleration_mps2), _level)
-    from scipy.interpolate import CubicSpline
-
     times = np.array(motion.times_s)
     path = CubicSpline(times, points, bc_type="clamped")
     # Before the first and after the last point the body hovers there.
@@ -147,9 +145,6 @@ def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
 
 def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
     """A monotone cubic through recorded positions, and the shortest turns between recorded attitudes."""
-    from scipy.interpolate import PchipInterpolator
-    from scipy.spatial.transform import Slerp
-
     times = np.array(motion.times_s)
     path = PchipInterpolator(times, np.array(motion.positions_m))
     turns = Slerp(times, Rotation.from_quat(np.array(motion.quaternions)))
