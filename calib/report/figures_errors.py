@@ -15,7 +15,6 @@ from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, INK, MUTED, PALE
 from uwblink.pages.figures import NARROW_IN, label, legend, sheet
-from uwblink.pages.figures_alike import dots, many_alike, strokes
 
 REACH: Final = 6.0
 POINTS: Final = 3000
@@ -26,7 +25,6 @@ MOST_PAIRS: Final = 24
 
 POINTS_OF_PAIR: Final = 800
 PANEL_IN: Final = 1.05
-DOT_PT: Final = 1.65
 
 
 def distribution(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
@@ -92,23 +90,20 @@ def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figu
     pairs = most_spread(ranges, error)
     columns = 2 if width_in < NARROW_IN else 4
     time = (ranges.time_ns - ranges.time_ns.min()) * 1e-9
-    last = float(time.max())
-    figure = many_alike(
-        width_in,
-        [f"tags {name}" for name in pairs],
-        columns,
-        height_in=PANEL_IN,
-        x=(-0.05 * last - 1e-9, 1.05 * last + 1e-9),
-        y=_reach_cm(error),
-    )
-    clouds, bands = [], []
-    for panel, rows in zip(figure.panels, pairs.values(), strict=True):
-        order = rows[np.argsort(time[rows])]
+    rows = -(-len(pairs) // columns)
+    figure = Figure(figsize=(width_in, PANEL_IN * rows + 0.6), layout="constrained")
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for panel, (name, own) in zip(panels, pairs.items(), strict=False):
+        order = own[np.argsort(time[own])]
         shown, some = order[:: max(1, len(order) // POINTS_OF_PAIR)], order[:: max(1, len(order) // 120)]
-        clouds.append(panel.on_figure(time[shown], error[shown]))
-        bands += [panel.on_figure(time[some], side * applied.sigma_m[some]) for side in (-196, 196)]
-    dots(figure, np.concatenate(clouds), size_pt=DOT_PT, color=BLUE, alpha=0.64)
-    strokes(figure, bands, color=INK, lw=0.6, zorder=3)
+        panel.plot(time[shown], error[shown], ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
+        for side in (-196, 196):
+            panel.plot(time[some], side * applied.sigma_m[some], color=INK, lw=0.6)
+        panel.set_title(f"tags {name}", loc="left", pad=2)
+        label(panel, "", "")
+    for panel in panels[len(pairs) :]:
+        panel.set_axis_off()
+    panels[0].set_ylim(*_reach_cm(error))
     figure.supxlabel("time (s)", fontsize="medium")
     figure.supylabel("calibrated error (cm)", fontsize="medium")
     return figure

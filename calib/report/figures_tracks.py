@@ -12,7 +12,6 @@ from calib.evaluation.tracking import Localization
 from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, GREY, INK, MUTED, VERMILION, WINE
 from uwblink.pages.figures import NARROW_IN, label, legend, mark
-from uwblink.pages.figures_placed import Placed
 
 COLOUR_OF: Final = {"raw": VERMILION, "calibrated": WINE, "variance": BLUE, "robust": GREY}
 DASHES_OF: Final[dict[str, Any]] = {
@@ -39,7 +38,7 @@ def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
     """RMSE of each body in each recording over seeds, and their mean."""
     most = 5 if width_in < NARROW_IN else MOST_BARS
     shown = sorted(found, key=lambda one: -float(one.rmse_m["raw"].mean()))[:most] if len(found) > most else found
-    figure = Figure(figsize=(width_in, 2.7), layout=Placed())
+    figure = Figure(figsize=(width_in, 2.7), layout="constrained")
     axes = figure.subplots()
     names = [f"{one.source.removesuffix('.uwb')}\n{one.body}" for one in shown] + ["mean"]
     mean = summarize(found).rmse_m
@@ -67,7 +66,7 @@ def track(width_in: float, one: Localization) -> Figure:
     last = one.tracks["variance"]
     every = slice(None, None, max(1, len(last.time_ns) // SAMPLES))
     time, truth = (last.time_ns - last.time_ns[0])[every] * 1e-9, last.truth_m[every]
-    figure = Figure(figsize=(width_in, 6.0 if width_in < NARROW_IN else 3.8), layout=Placed())
+    figure = Figure(figsize=(width_in, 6.0 if width_in < NARROW_IN else 3.8), layout="constrained")
     places: Any = (
         [["path"], ["height"], ["error"]] if width_in < NARROW_IN else [["path", "height"], ["error", "error"]]
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from calib.report.blocks import VERDICTS, Block, Document, Heading, Listing, Picture, Table, Text, sentence_apart
-from calib.report.pdf_figures import MM_OF_INCH, Place, pages_of, size_mm, with_figures
+from calib.report.pdf_figures import MM_OF_INCH, Place, page_of, size_mm, with_figures
 from uwblink.pages.figures import PAGE_IN
 
 if TYPE_CHECKING:
@@ -65,9 +65,9 @@ class _Placed:
     contents: list[tuple[int, float]] = field(default_factory=list)
 
 
-def to_pdf(document: Document, printed: bytes, pages: Mapping[str, int]) -> bytes:
-    """Return the document as PDF; its figures are `pages` of a PDF, `printed`, by name, of a page's width."""
-    pictures = pages_of(printed, pages)
+def to_pdf(document: Document, figures: Mapping[str, bytes]) -> bytes:
+    """Return the document as PDF; `figures` are the PDFs of its figures by name, as wide as the page's text."""
+    pictures = {name: page_of(pdf) for name, pdf in figures.items()}
     text, placed = _set(document, {name: size_mm(page) for name, page in pictures.items()})
     return with_figures(bytes(text.output()), pictures, placed.figures)
 

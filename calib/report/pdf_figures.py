@@ -1,9 +1,8 @@
-"""Figures among the pages of a PDF: each as a page of its own, or put onto pages as the drawings they are."""
+"""Put figures onto the pages of a PDF as drawings, so that their text stays text."""
 
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -11,8 +10,6 @@ if TYPE_CHECKING:
     from pypdf import PageObject
 
 MM_OF_INCH: Final = 25.4
-DRAWN: Final = re.compile(rb"/([\w.-]+) Do\b")
-"""Images, markers and forms that a page draws."""
 
 
 class Place(NamedTuple):
@@ -24,34 +21,11 @@ class Place(NamedTuple):
     bottom_mm: float
 
 
-def pages_of(printed: bytes, pages: Mapping[str, int]) -> dict[str, PageObject]:
-    """Return the figures that are `pages` of a PDF, `printed`, by name."""
+def page_of(pdf: bytes) -> PageObject:
+    """Return the one page of a figure's PDF."""
     from pypdf import PdfReader
 
-    if not pages:
-        return {}
-    reader = PdfReader(io.BytesIO(printed))
-    return {name: reader.pages[number] for name, number in pages.items()}
-
-
-def single_pages(printed: bytes) -> list[bytes]:
-    """Return each page of a PDF as a PDF of its own, with nothing in it that it does not draw."""
-    from pypdf import PdfReader, PdfWriter
-    from pypdf.generic import DictionaryObject, NameObject
-
-    found = []
-    for page in PdfReader(io.BytesIO(printed)).pages:
-        shared: Any = page["/Resources"].get_object()
-        used = {f"/{name.decode()}" for name in DRAWN.findall(page.get_contents().get_data())}  # type: ignore[union-attr]  # a figure has contents
-        own = DictionaryObject(shared)
-        forms: Any = shared.get("/XObject", DictionaryObject()).get_object()
-        own[NameObject("/XObject")] = DictionaryObject({name: form for name, form in forms.items() if name in used})
-        page[NameObject("/Resources")] = own
-        writer, data = PdfWriter(), io.BytesIO()
-        writer.add_page(page)
-        writer.write(data)
-        found.append(data.getvalue())
-    return found
+    return PdfReader(io.BytesIO(pdf)).pages[0]
 
 
 def size_mm(page: PageObject) -> tuple[float, float]:
@@ -73,6 +47,7 @@ def with_figures(text: bytes, pictures: Mapping[str, PageObject], places: Sequen
         drawn.setdefault(place.page, []).append((f"Fig{number}", place.left_mm, place.bottom_mm))
     for page, some in drawn.items():
         _append(writer.pages[page], some)
+    writer.compress_identical_objects()  # each figure brings the same fonts
     data = io.BytesIO()
     writer.write(data)
     return data.getvalue()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -10,7 +10,7 @@ from calib.errors import BadInputError
 from calib.report.blocks import Document
 from calib.report.html import to_html
 from uwblink.output import check_output, write_bytes, write_files, write_text
-from uwblink.pages.figures import WIDTHS, Printed, drawn
+from uwblink.pages.figures import WIDTHS, drawn
 
 PAPER_KINDS: Final = ("pdf", "svg")
 
@@ -60,47 +60,34 @@ def write_document(
     check_places(output, pdf, figures, force=force)
     papers = [path for path in (output, pdf) if path is not None and (path is pdf or is_pdf(path))]
     page = None if output is None or is_pdf(output) else output
-    of_page = [kind for kind, so in (("svg", page or figures), ("pdf", papers or figures)) if so]
-    of_column = ["svg", "pdf"] if figures else (["svg"] if page else [])
-    made: dict[str, dict[str, bytes]] = {}
-    places: dict[tuple[str, str], int] = {}
-    with Printed() as printed:
-        for picture in document.pictures():
-            progress(f"drawing {picture.name}")
-            made[picture.name] = {}
-            for width, kinds in (("page", of_page), ("column", of_column)):
-                if not kinds:
-                    continue
-                to_print = printed if "pdf" in kinds else None
-                salt = f"{picture.name} {width}"
-                made[picture.name][width] = drawn(picture.draw, WIDTHS[width], ["svg"], salt, to_print)["svg"]
-                places[picture.name, width] = printed.count - 1
+    kinds = {
+        "page": [kind for kind, wanted in (("svg", page or figures), ("pdf", papers or figures)) if wanted],
+        "column": [kind for kind, wanted in (("svg", page or figures), ("pdf", figures)) if wanted],
+    }
+    made: dict[str, dict[str, dict[str, bytes]]] = {}
+    for picture in document.pictures():
+        progress(f"drawing {picture.name}")
+        made[picture.name] = {
+            width: drawn(picture.draw, WIDTHS[width], wanted, salt=f"{picture.name} {width}")
+            for width, wanted in kinds.items()
+            if wanted
+        }
     if papers:
         from calib.report.pdf import to_pdf
 
         progress("setting the PDF")
-        data = to_pdf(document, printed.file(), {name: places[name, "page"] for name in made})
+        data = to_pdf(document, {name: widths["page"]["pdf"] for name, widths in made.items()})
         for path in papers:
             write_bytes(path, data, force=force)
     if figures:
-        _write_figures(figures, made, printed.file(), places, force=force)
+        named = {
+            f"{name}-{width}.{kind}": data
+            for name, widths in made.items()
+            for width, files in widths.items()
+            for kind, data in files.items()
+        }
+        write_files(figures, named, force=force)
     if page:
         progress("writing the page")
-        write_text(page, to_html(document, made), force=force)
-
-
-def _write_figures(
-    folder: Path,
-    made: Mapping[str, Mapping[str, bytes]],
-    printed: bytes,
-    places: Mapping[tuple[str, str], int],
-    *,
-    force: bool,
-) -> None:
-    """Write each figure at each width as drawing and as PDF."""
-    from calib.report.pdf_figures import single_pages
-
-    pages = single_pages(printed)
-    drawings = {f"{name}-{width}.svg": svg for name, widths in made.items() for width, svg in widths.items()}
-    printings = {f"{name}-{width}.pdf": pages[places[name, width]] for name, widths in made.items() for width in widths}
-    write_files(folder, drawings | printings, force=force)
+        drawings = {name: {width: files["svg"] for width, files in widths.items()} for name, widths in made.items()}
+        write_text(page, to_html(document, drawings), force=force)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import gc
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from typing import Any, Final, Self
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Final
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from uwblink.pages.colours import GRID, INK, MUTED
-from uwblink.pages.figures_alike import ManyAlike, Reach
-from uwblink.pages.figures_placed import Placed
 
 COLUMN_IN: Final = 3.5
 """Width of a column of a two-column page, inches."""
@@ -86,7 +83,7 @@ def sheet(width_in: float, count: int = 1, *, height_in: float = 2.3, **kwargs: 
     """
     across = 1 if width_in < NARROW_IN else count
     down = -(-count // across)
-    figure = Figure(figsize=(width_in, height_in * down), layout=Placed())
+    figure = Figure(figsize=(width_in, height_in * down), layout="constrained")
     panels = figure.subplots(down, across, squeeze=False, **kwargs)
     return figure, list(panels.ravel())
 
@@ -120,76 +117,20 @@ def legend(figure: Figure, axes: Axes | None = None, *, texts: Sequence[str] = (
     )
 
 
-class Printed:
-    """Figures as pages of one PDF, which has its fonts once; a context manager, in which pages are added."""
-
-    def __init__(self) -> None:
-        """Begin without pages."""
-        self._data = io.BytesIO()
-        self._pages: Any = None
-        self.count = 0
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Write the fonts."""
-        if self._pages is not None:
-            with style():
-                self._pages.close()
-
-    def add(self, figure: Figure) -> int:
-        """Add a figure that is laid out; return the number of its page, from 0."""
-        if self._pages is None:
-            # What writes PDF takes as long to import as two figures to draw.
-            from matplotlib.backends.backend_pdf import PdfPages
-
-            self._pages = PdfPages(self._data, metadata=METADATA["pdf"])
-        self._pages.savefig(figure, dpi=RASTER_DPI, facecolor="none")
-        self.count += 1
-        return self.count - 1
-
-    def file(self) -> bytes:
-        """Return the PDF, once it is left; without pages it is none."""
-        return self._data.getvalue()
-
-
-def drawn(
-    draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "", printed: Printed | None = None
-) -> dict[str, bytes]:
-    """Draw once and return the files of it: "svg", "pdf" and "png"; it is added to those that are `printed`.
+def drawn(draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> dict[str, bytes]:
+    """Draw once and return the files of it: "svg", "pdf" and "png".
 
     `salt` tells apart what drawings on one page call their parts. What each panel shows, and where, is in the
     drawing's metadata as JSON, for pages that read off values under a pointer.
     """
-    with style(**{"svg.hashsalt": salt or "uwbcal"}), _uncollected():
-        figure = _laid_out(draw(width_in))
-        if printed is not None:
-            printed.add(figure)
+    with style(**{"svg.hashsalt": salt or "uwbcal"}):
+        figure = draw(width_in)
+        engine = figure.get_layout_engine()
+        if engine is not None:
+            # Place the panels once, not once for each file.
+            engine.execute(figure)
+            figure.set_layout_engine("none")
         return {kind: _file(figure, kind) for kind in kinds}
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Leave what a figure is made of, ten thousands of objects, to one collection at its end: a sixth of its time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-def _laid_out(figure: Figure) -> Figure:
-    """Decide where everything is, once; files need not decide it again."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        with matplotlib.rc_context({"figure.constrained_layout.use": False, "figure.autolayout": False}):
-            figure.set_layout_engine(None)
-    return figure
 
 
 def picture(draw: Draw, kind: str, width_in: float = PAGE_IN) -> bytes:
@@ -210,25 +151,23 @@ def _file(figure: Figure, kind: str) -> bytes:
 
 def _panels(figure: Figure) -> list[dict[str, Any]]:
     """Say of each panel where it is (left, top, right, bottom in points) and what its axes run over."""
+    width, height = 72 * figure.get_figwidth(), 72 * figure.get_figheight()
     found = []
     for axes in figure.axes:
-        box, scales = axes.get_position(), [axes.get_xscale(), axes.get_yscale()]
+        place, scales = axes.get_position(), [axes.get_xscale(), axes.get_yscale()]
         if not axes.get_visible() or not set(scales) <= {"linear", "log"}:
             continue
-        names = [axes.get_xlabel() or _shared(figure, "x"), axes.get_ylabel() or _shared(figure, "y")]
-        found.append(_panel(figure, (box.x0, box.x1), (box.y0, box.y1), [axes.get_xlim(), axes.get_ylim()])
-                     | {"scale": scales, "names": names})  # fmt: skip
-    if isinstance(figure, ManyAlike):
-        alike = {"scale": ["linear", "linear"], "names": [_shared(figure, which) for which in "xy"]}
-        found += [_panel(figure, one.across, one.up, [one.x, one.y]) | alike for one in figure.panels]
+        box = (place.x0 * width, (1 - place.y1) * height, place.x1 * width, (1 - place.y0) * height)
+        found.append(
+            {
+                "box": [round(float(v), 1) for v in box],
+                "x": [float(f"{v:.5g}") for v in axes.get_xlim()],
+                "y": [float(f"{v:.5g}") for v in axes.get_ylim()],
+                "scale": scales,
+                "names": [axes.get_xlabel() or _shared(figure, "x"), axes.get_ylabel() or _shared(figure, "y")],
+            }
+        )
     return found
-
-
-def _panel(figure: Figure, across: Reach, up: Reach, views: Sequence[Reach]) -> dict[str, Any]:
-    width, height = 72 * figure.get_figwidth(), 72 * figure.get_figheight()
-    box = (across[0] * width, (1 - up[1]) * height, across[1] * width, (1 - up[0]) * height)
-    over = {which: [float(f"{v:.5g}") for v in view] for which, view in zip("xy", views, strict=True)}
-    return {"box": [round(float(v), 1) for v in box]} | over
 
 
 def _shared(figure: Figure, which: str) -> str:

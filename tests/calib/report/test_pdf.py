@@ -10,7 +10,7 @@ from calib.report.pdf import to_pdf
 
 
 def pages(*blocks):
-    read = PdfReader(io.BytesIO(to_pdf(Document("A report", list(blocks)), b"", {})))
+    read = PdfReader(io.BytesIO(to_pdf(Document("A report", list(blocks)), {})))
     return [page.extract_text() for page in read.pages]
 
 
