@@ -9,6 +9,7 @@ from typing import Any, Final, Self
 from uwblink.errors import PortError
 from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
 from uwblink.streaming.addresses import host_and_port
+from uwblink.streaming.gate import Gate, hidden_address
 from uwblink.streaming.ranges import StreamedRange
 
 NEWS_KEPT: Final = 1024
@@ -17,6 +18,8 @@ NEWS_KEPT: Final = 1024
 
 class FoxgloveServer:
     """Serves ranges to as many viewers as come. A context manager: leaving it ends the server.
+
+    Viewers are programs, Foxglove's own pages, and pages of the computer that serves; other web sites are refused.
 
     Needs the extra `uwbcal[foxglove]`. Sending never waits for a viewer.
     """
@@ -33,17 +36,22 @@ class FoxgloveServer:
             raise PortError(
                 "serving Foxglove needs foxglove-sdk; pip install 'uwbcal[foxglove]'", parameter="foxglove"
             ) from error
-        self._context = foxglove.Context()
+        self._context, behind = foxglove.Context(), hidden_address()
         try:
             self._server = foxglove.start_server(
-                name="uwblink", host=host, port=port, context=self._context, message_backlog_size=NEWS_KEPT
+                name="uwblink", host=behind, port=0, context=self._context, message_backlog_size=NEWS_KEPT
             )
         except (RuntimeError, OSError, ValueError) as error:
-            raise PortError(f"foxglove {address}: cannot be served there ({str(error).splitlines()[0]})") from error
+            raise PortError(f"foxglove {address}: cannot be served ({str(error).splitlines()[0]})") from error
+        try:
+            self._gate = Gate(host, port, (behind, self._server.port))
+        except OSError as error:
+            self._server.stop()
+            raise PortError(f"foxglove {address}: cannot be served there ({error.strerror or error})") from error
         layout = json.dumps(SCHEMAS[RANGE]).encode()
         self._schema = foxglove.Schema(name=RANGE, encoding="jsonschema", data=layout)
         self._channels: dict[tuple[int, int], foxglove.Channel] = {}
-        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
+        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._gate.server_address[1]}"
 
     def __enter__(self) -> Self:
         """Return the server."""
@@ -53,6 +61,7 @@ class FoxgloveServer:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the server."""
+        self._gate.close()
         self._server.stop()
 
     def send(self, found: StreamedRange) -> None:

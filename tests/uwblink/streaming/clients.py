@@ -10,13 +10,15 @@ import struct
 class FoxgloveClient:
     """A viewer that speaks WebSocket (RFC 6455) and Foxglove's protocol by the letter."""
 
-    def __init__(self, url):
+    def __init__(self, url, name=None, origin=None):
+        """Connect as a page of an `origin` that found the server by a `name`."""
         host, port = url.removeprefix("ws://").rsplit(":", 1)
-        self.socket = socket.create_connection((host, int(port)), timeout=20)
+        self.socket = socket.create_connection((host.strip("[]"), int(port)), timeout=20)
         key = base64.b64encode(os.urandom(16)).decode()
         lines = [
             "GET / HTTP/1.1",
-            f"Host: {host}",
+            f"Host: {name or host}",
+            *([f"Origin: {origin}"] if origin else []),
             "Upgrade: websocket",
             "Connection: Upgrade",
             f"Sec-WebSocket-Key: {key}",
@@ -28,7 +30,7 @@ class FoxgloveClient:
         while b"\r\n\r\n" not in self.data:
             self.data += self.socket.recv(65536)
         head, self.data = self.data.split(b"\r\n\r\n", 1)
-        assert head.startswith(b"HTTP/1.1 101")
+        self.status = int(head.split()[1])
 
     def _take(self, count):
         while len(self.data) < count:
