@@ -112,6 +112,9 @@ trajectories: setup ## fits without known distances over 50 seeds a world, into 
 plans: setup ## plans of flights beside fits of them, into docs/planning.md (15 minutes)
 	$(BIN)/python -m benchmarks.plans --write
 
+golden: setup ## fit some forty cases again and compare with tests/golden/fits.json (5 minutes)
+	$(BIN)/python -m benchmarks.golden
+
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy
 
