@@ -42,7 +42,7 @@ CONFINED = {
 FLOORS = {
     "uwblink": (
         ("arrays", "display", "errors", "lazy", "text_files"),
-        ("columns", "output", "pages", "plugins", "ticks", "toml"),
+        ("columns", "database", "output", "pages", "plugins", "ticks", "toml"),
         ("protocols",),
         ("twr",),
         ("wire",),

@@ -6,11 +6,28 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from tempfile import TemporaryDirectory
+from typing import Final, TextIO
 
 from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError, UwblinkError
 
-__all__: Final = ["check_apart", "check_output", "made_folder", "whole", "write_bytes", "write_files", "write_text"]
+__all__: Final = [
+    "check_apart",
+    "check_folder",
+    "check_output",
+    "made_folder",
+    "new_file",
+    "whole",
+    "write_bytes",
+    "write_files",
+    "write_text",
+]
+
+PARTIAL: Final = ".partial"
+"""Ending of folders for what is being written."""
+
+LONGEST_PREFIX: Final = 255 - len(PARTIAL) - 8
+"""Bytes of a name before the eight letters that `tempfile` draws; file systems take names of 255."""
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
@@ -35,22 +52,56 @@ def write_bytes(path: Path, data: bytes, *, force: bool) -> None:
 
 @contextmanager
 def whole(path: Path, *, force: bool) -> Iterator[Path]:
-    """Yield the name of a hidden neighbour to write to, which takes the name of `path` when the block is done.
+    """Yield the name of a new file or folder to be written, which takes the name of `path` when the block is done.
 
-    Raises what `check_output` raises, and `OutputError` where the disk does not take it. Where the block fails, a file
-    that was there stays, and no part of the new one does.
+    Raises what `check_output` raises, and `OutputError` where the disk does not take it. Where the block fails or is
+    interrupted, what was there stays, and no part of the new one does.
     """
     check_output(path, force=force)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        yield partial
-        partial.replace(path)
+        with place_beside(path) as partial:
+            yield partial
+            take_name(partial, path)
     except UwblinkError:
         raise  # of this or of another file of several
     except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+@contextmanager
+def place_beside(path: Path) -> Iterator[Path]:
+    """Yield a name for what is to become `path`, in a new folder beside it that goes away with all that is left in it.
+
+    The folder has a random name and belongs to this user alone: nobody can put a link there for us to write through,
+    whoever opens the file, and whatever he writes beside it.
+    """
+    prefix = f".{path.name}."
+    if len(os.fsencode(prefix)) > LONGEST_PREFIX:
+        prefix = "."
+    # It goes at the end of the process at the latest, wherever an interrupt hits.
+    with TemporaryDirectory(PARTIAL, prefix, path.absolute().parent, ignore_cleanup_errors=True) as folder:
+        yield Path(folder) / path.name
+
+
+def take_name(partial: Path, path: Path) -> None:
+    """Give a new file or folder its name; a folder that had it goes away with the place beside it."""
+    if path.is_dir() and not path.is_symlink():
+        path.replace(partial.with_name(".before"))
+    partial.replace(path)
+
+
+def new_file(path: Path, *, force: bool) -> TextIO:
+    """Open a text file that grows under its own name: a new one, never what a link leads to.
+
+    Raises `OutputError`, and what `check_output` raises.
+    """
+    check_output(path, force=force)
+    try:
+        if force:
+            path.unlink(missing_ok=True)
+        return path.open("x", encoding="utf-8", newline="\n")
+    except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -111,3 +162,16 @@ def check_output(path: Path, *, force: bool) -> None:
         raise RecordingError(f"{path}: the folder {path.parent} does not exist; create it first")
     if not os.access(path.parent, os.W_OK):
         raise RecordingError(f"{path}: no permission to write in {path.parent}")
+
+
+def check_folder(path: Path, names: Iterable[str] = (), *, force: bool = False) -> None:
+    """Raise `OutputError` where a folder can neither be used nor made.
+
+    `names` are files to be written there: raises what `check_output` raises for those.
+    """
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path}: is a file, expected a folder")
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: {path.parent} does not exist")
+    for name in names if path.is_dir() else ():
+        check_output(path / name, force=force)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from uwblink.database import connect
 from uwblink.errors import OutputError, first_line
 from uwblink.output import is_utf8, whole
 
@@ -32,11 +33,9 @@ def fill_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any
 
 def write_parquet(path: Path, rows: Rows, *, force: bool) -> None:
     """Write rows as Parquet; raises what `whole` raises."""
-    import duckdb
-
     if not is_utf8(path):
         raise OutputError(f"{path}: its name and those of its folders must be UTF-8; give another one")
-    with whole(path, force=force) as partial, duckdb.connect() as db:
+    with whole(path, force=force) as partial, connect(paths=[partial]) as db:
         _create(db, "rows", rows)
         fill_parquet(partial, db.table("rows"), path)
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError
+from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, UwblinkError
 from uwblink.exporters.mcap import write_mcap
 from uwblink.exporters.rosbag2 import write_rosbag2
 from uwblink.exporters.tables import write_csv, write_parquet
 from uwblink.exporters.tum import write_tum
+from uwblink.output import place_beside, take_name
 from uwblink.plugins import NAME, Registry
 from uwblink.recording.soundness import check_name
 
@@ -91,17 +91,13 @@ def export_recording(
     """
     final = Path(folder)
     check_export(final, to=to, force=force)
-    partial = final.with_name(f".{final.name}.{os.getpid()}.partial")
     try:
-        partial.mkdir()
-        written = EXPORTERS[to].write(Path(recording), partial)
-        if final.exists():
-            shutil.rmtree(final)
-        partial.replace(final)
+        with place_beside(final) as partial:
+            partial.mkdir()
+            written = EXPORTERS[to].write(Path(recording), partial)
+            take_name(partial, final)
     except OSError as error:
-        if isinstance(error, RecordingError):
+        if isinstance(error, UwblinkError):
             raise
         raise RecordingError(f"{final}: cannot be written ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return written

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from uwblink.arrays import Floats
+from uwblink.database import check_log, connect, log_of
 from uwblink.errors import RecordingError, first_line
 from uwblink.recording.file import Recording
 from uwblink.recording.pieces import distances_by_poses_m
@@ -23,7 +24,7 @@ from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
 if TYPE_CHECKING:
     import duckdb
 
-MEMORY: Final = "400MB"
+MEMORY_MB: Final = 400
 """What DuckDB may keep of the file that it reads; what it writes comes on top of that."""
 
 CSV_CELLS: Final = {"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"}
@@ -49,31 +50,27 @@ def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapp
     paths = {table: folder / f"{table}.{suffix}" for table in TABLES}
     wanted = {table: paths[table] for table in TABLES if counts[table] or table == "exchanges"}
     try:
-        _copy(recording, wanted, options, cells, by_poses)
+        _copy(recording, folder, wanted, options, cells, by_poses)
     except duckdb.Error as error:
         raise RecordingError(f"{recording}: cannot be exported ({first_line(error)})") from error
     return {path.name: counts[table] for table, path in paths.items() if path.exists()}
 
 
 def _copy(
-    recording: Path, wanted: Mapping[str, Path], options: str, cells: Mapping[str, str], by_poses: list[Floats]
+    recording: Path,
+    folder: Path,
+    wanted: Mapping[str, Path],
+    options: str,
+    cells: Mapping[str, str],
+    by_poses: list[Floats],
 ) -> None:
     """Write tables to their paths; raises what DuckDB raises. `by_poses` are true distances, if there are poses."""
-    import duckdb
-
-    with duckdb.connect(":memory:") as db:
-        # What a link leads to has its log beside it, not beside the link.
-        place = recording.resolve()
-        allowed = [str(place), f"{place}.wal", *map(str, wanted.values())]
-        db.execute("SET allowed_paths = ?", [allowed])
-        db.execute("SET enable_progress_bar = false")
-        db.execute("SET preserve_insertion_order = true")
-        db.execute(f"SET memory_limit = '{MEMORY}'")
-        # What one of several threads is behind with, the others keep in memory; one takes no more processor time, and
-        # 4 million exchanges as long (4 to 8 s, 2026-11-22).
-        db.execute("SET threads = 1")
-        db.execute("SET enable_external_access = false")
-        db.execute("SET lock_configuration = true")
+    # What a link leads to has its log beside it, not beside the link.
+    place = recording.resolve()
+    check_log(place)
+    # What one of several threads is behind with, the others keep in memory; one takes no more processor time, and
+    # 4 million exchanges as long (4 to 8 s, 2026-11-22).
+    with connect(paths=[place, log_of(place)], folders=[folder], memory_mb=MEMORY_MB, threads=1) as db:
         db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
         if by_poses:
             db.register("truths", {"by_poses": np.concatenate(by_poses)})

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Ints
+from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line
 from uwblink.output import is_utf8
 
@@ -31,21 +32,10 @@ def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBP
 
     With a `folder` it keeps no more than `STAGED_MB` in memory, and the rest there.
     """
-    import duckdb
-
     for path in paths:
         if not is_utf8(path):
             raise ImportTableError(f"{path}: its name and those of its folders must be UTF-8; rename it")
-    db = duckdb.connect(":memory:")
-    db.execute("SET TimeZone = 'UTC'")
-    db.execute("SET enable_progress_bar = false")
-    if folder is not None:
-        db.execute("SET temp_directory = ?", [folder])
-        db.execute(f"SET memory_limit = '{STAGED_MB}MB'")
-    db.execute("SET allowed_paths = ?", [[str(path) for path in paths]])
-    db.execute("SET enable_external_access = false")
-    db.execute("SET lock_configuration = true")
-    return db
+    return connect(paths=paths, temporary=folder, memory_mb=None if folder is None else STAGED_MB)
 
 
 class Stage:

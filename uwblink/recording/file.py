@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from uwblink.database import log_of
 from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError
-from uwblink.output import check_output
+from uwblink.output import check_output, place_beside
 from uwblink.recording.readers import TableReaders, known_tables
 from uwblink.recording.schema import (
     FORMAT_VERSION,
@@ -24,7 +25,7 @@ from uwblink.recording.schema import (
     standard_meta,
 )
 from uwblink.recording.snapshots import open_snapshot
-from uwblink.recording.soundness import is_locked, log_of
+from uwblink.recording.soundness import is_locked
 from uwblink.recording.store import Store
 from uwblink.recording.writers import TableWriters
 
@@ -58,6 +59,8 @@ class Recording(TableWriters, TableReaders):
         self._store = store
         self.path = store.path
         self._partial = partial
+        self._place = ExitStack()
+        """The folder of `partial`, which goes when this is closed."""
 
     @classmethod
     def create(
@@ -80,19 +83,19 @@ class Recording(TableWriters, TableReaders):
         check_output(final, force=force)
         if final.exists() and is_locked(final, update=False):
             raise RecordingInUseError(f"{final}: another process is writing it; give another name")
-        place = final if live else final.with_name(f".{final.name}.{os.getpid()}.partial")
-        _remove(place)
         try:
-            recording = cls(Store.create(place, final, memory_mb), None if live else place)
-            recording.append_meta(standard_meta() | dict(meta or {}))
-            if live:
+            with ExitStack() as place:
+                partial = place.enter_context(place_beside(final))
+                recording = cls(Store.create(partial, final, memory_mb), partial)
+                recording.append_meta(standard_meta() | dict(meta or {}))
+                if not live:
+                    recording._place = place.pop_all()
+                    return recording
                 # So that the tables are in the file itself, and only rows ever in the log beside it.
-                recording._store.finish()
-                recording._store.vanishes = False
-        except RecordingError:
-            _remove(place)
-            raise
-        return recording
+                recording._complete()
+            return cls(Store.grow(final, memory_mb))
+        except OSError as error:
+            raise RecordingError(f"{final}: cannot be written ({error.strerror or error})") from error
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], *, update: bool = False, memory_mb: int | None = None) -> Self:
@@ -139,18 +142,22 @@ class Recording(TableWriters, TableReaders):
 
         Raises `RecordingError` where the disk does not take all of it.
         """
-        try:
-            if kind is None and self._store.writes:
-                self._store.finish()
-            self._store.close()
-            if kind is None and self._partial:
-                self._partial.replace(self.path)
-        except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be written ({error.strerror})") from error
-        finally:
-            self._store.close()
-            if self._partial:
-                _remove(self._partial)
+        with self._place:
+            try:
+                if kind is None and self._store.writes:
+                    self._complete()
+            except OSError as error:
+                raise RecordingError(f"{self.path}: cannot be written ({error.strerror})") from error
+            finally:
+                self._store.close()
+
+    def _complete(self) -> None:
+        """Put everything into the file, close it, and give it its name."""
+        self._store.finish()
+        self._store.close()
+        if self._partial:
+            log_of(self.path).unlink(missing_ok=True)  # of the file that had the name before
+            self._partial.replace(self.path)
 
     def snapshot(self, place: str | os.PathLike[str]) -> None:
         """Write everything committed so far to a new file, while others go on appending; raises `RecordingError`."""
@@ -238,8 +245,3 @@ _APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
     "arrangements": Recording.append_arrangements,
     "distances": Recording.append_distances,
 }
-
-
-def _remove(path: Path) -> None:
-    for name in (path, log_of(path)):
-        name.unlink(missing_ok=True)

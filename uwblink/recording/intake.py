@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Timer
@@ -66,35 +66,36 @@ _ROWS: Final = "SELECT table_name, estimated_size FROM system.main.duckdb_tables
 _META: Final = "SELECT coalesce(sum(strlen(key) + strlen(value)), 0)::HUGEINT FROM meta"
 
 
-def check_intake(ask: Ask, path: Path, size: int) -> None:
-    """Raise `RecordingError` for a file of `size` bytes with anything in it that is not data of a recording."""
+def check_tables(ask: Ask, path: Path, size: int, tables: Mapping[str, Mapping[str, str]]) -> None:
+    """Raise `RecordingError` for a file of `size` bytes that holds programs, or other columns than `tables` have."""
     for kind in _REFUSED:
         found = ask(kind.query)
         if found:
             raise RecordingError(
-                f"{path}: holds {kind.word}, {printable(str(found[0][0]))}, and recordings consist of tables alone; "
+                f"{path}: holds {kind.word}, {printable(str(found[0][0]))}, and such files consist of tables alone; "
                 "it is not read, because such things are programs"
             )
     for table, column, kind_found in ask(_COLUMNS):
-        expected = TABLES.get(table, {}).get(column)
+        expected = tables.get(table, {}).get(column)
         if expected not in (None, kind_found):
             raise RecordingError(
                 f"{path}: table {table}: column {column} is {printable(str(kind_found))}, expected {expected}"
             )
-    _check_lengths(dict(ask(_ROWS)), path, size)
+    most = ROWS_OF_ANY_FILE + size // BYTES_A_ROW
+    for table, count in ask(_ROWS):
+        if table in tables and count > most:
+            raise RecordingError(
+                f"{path}: table {table} holds {count} rows, and a file of {size} bytes at most {most}; it is not read"
+            )
+
+
+def check_intake(ask: Ask, path: Path, size: int) -> None:
+    """Raise `RecordingError` for a file of `size` bytes with anything in it that is not data of a recording."""
+    check_tables(ask, path, size, TABLES)
     if "meta" in TABLES and ask(f"{_ROWS} AND table_name = 'meta'"):
         ((length,),) = ask(_META)
         if length > MOST_META_BYTES:
             raise RecordingError(f"{path}: table meta holds {length} bytes, at most {MOST_META_BYTES} are read")
-
-
-def _check_lengths(rows: dict[str, int], path: Path, size: int) -> None:
-    most = ROWS_OF_ANY_FILE + size // BYTES_A_ROW
-    for table, count in rows.items():
-        if table in TABLES and count > most:
-            raise RecordingError(
-                f"{path}: table {table} holds {count} rows, and a file of {size} bytes at most {most}; it is not read"
-            )
 
 
 def longest_read_s(size: int) -> float:

@@ -8,17 +8,20 @@ that recording goes on meanwhile; and the reader opens that and deletes its name
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, TypeVar
 from uuid import uuid4
 
 from uwblink.errors import RecordingError, RecordingInUseError
+from uwblink.output import PARTIAL, place_beside
 
 WANTED: Final = ".wanted"
-PARTIAL: Final = ".partial"
+BEGUN: Final = ".partial-begun"
 READY: Final = ".snapshot"
 PATIENCE_S: Final = 30.0
 LOOK_EVERY_S: Final = 0.02
@@ -57,15 +60,13 @@ class SnapshotMaker:
 
     def _answer(self, wanted: list[Path]) -> None:
         for request in wanted:
-            place = request.with_suffix(PARTIAL)
-            try:
-                request.rename(place.with_suffix(PARTIAL + "-begun"))  # the reader sees that somebody works on it
-                self._make(place)
-                place.rename(request.with_suffix(READY))
-            except (OSError, RecordingError):
-                place.unlink(missing_ok=True)
-            finally:
-                place.with_suffix(PARTIAL + "-begun").unlink(missing_ok=True)
+            begun = request.with_suffix(BEGUN)
+            with suppress(OSError, RecordingError):
+                request.rename(begun)  # the reader sees that somebody works on it
+                with place_beside(self._recording) as place:
+                    self._make(place)
+                    place.rename(request.with_suffix(READY))
+            begun.unlink(missing_ok=True)
 
 
 def open_snapshot(recording: Path, reopen: Callable[[Path], Opened]) -> Opened:
@@ -75,7 +76,7 @@ def open_snapshot(recording: Path, reopen: Callable[[Path], Opened]) -> Opened:
     written, or the disk is full.
     """
     request = recording.with_name(f".{recording.name}.{uuid4().hex}{WANTED}")
-    ready, begun = request.with_suffix(READY), request.with_suffix(PARTIAL + "-begun")
+    ready, begun = request.with_suffix(READY), request.with_suffix(BEGUN)
     try:
         request.touch()
     except OSError as error:
@@ -113,6 +114,9 @@ def _beside(recording: Path, kind: str) -> list[Path]:
 
 def _sweep(recording: Path) -> None:
     """Remove what processes that were killed have left."""
-    for kind in (WANTED, PARTIAL, PARTIAL + "-begun", READY):
+    for kind in (WANTED, BEGUN, READY, PARTIAL):
         for left in _beside(recording, kind):
-            left.unlink(missing_ok=True)
+            if left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+from uwblink.database import log_of
+from uwblink.display import printable
 from uwblink.errors import RecordingError, first_line
 from uwblink.output import is_utf8
 from uwblink.recording.schema import SUFFIX
@@ -12,6 +14,9 @@ from uwblink.recording.schema import SUFFIX
 HEADER_BYTES: Final = 3 * 4096
 BLOCK_BYTES: Final = 16_384
 """Smallest block of a DuckDB file; every larger one is a multiple of it."""
+
+WRITER: Final = slice(52, 84)
+"""Where the first header of a file has the version of the DuckDB that wrote it."""
 
 _TABLES: Final = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".jsonl", ".ndjson")
 IMPORTED_AS: Final = {**dict.fromkeys(_TABLES, "csv"), **dict.fromkeys((".bag", ".mcap", ".db3"), "bag")}
@@ -36,7 +41,21 @@ def is_locked(path: Path, *, update: bool) -> bool:
 
 def damaged(path: Path, error: Exception) -> RecordingError:
     """Return what to raise for a file that DuckDB cannot open."""
+    if "version number" in str(error):
+        from duckdb import __version__ as installed
+
+        return RecordingError(
+            f"{path}: {_writer(path)} stored it in a way that the installed DuckDB {installed} cannot read; "
+            "update DuckDB, or export the recording where it was made"
+        )
     return _no_recording(path, first_line(error))
+
+
+def _writer(path: Path) -> str:
+    """Return which DuckDB wrote a file, as its first header says."""
+    with path.open("rb") as file:
+        text = file.read(WRITER.stop)[WRITER].split(b"\0")[0].decode(errors="replace")
+    return f"DuckDB {printable(text)}" if text else "another DuckDB"
 
 
 def _no_recording(path: Path, seen: str) -> RecordingError:
@@ -44,11 +63,6 @@ def _no_recording(path: Path, seen: str) -> RecordingError:
     if form:
         return RecordingError(f"{path}: is no recording yet; `uwblink import {form}` makes one of it")
     return RecordingError(f"{path}: not a {SUFFIX} recording, or a truncated one ({seen})")
-
-
-def log_of(path: Path) -> Path:
-    """Return where DuckDB keeps what was committed to a file and is not in the file itself yet."""
-    return path.with_name(path.name + ".wal")
 
 
 def check_name(path: Path) -> None:

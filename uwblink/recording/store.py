@@ -6,6 +6,7 @@ locked, and are looked over (`uwblink.recording.intake`) before anything in them
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,27 +15,21 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from uwblink.database import connect, log_of
 from uwblink.errors import RecordingError, RecordingInUseError, first_line
 from uwblink.recording.batches import batch_of
 from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
-from uwblink.recording.soundness import check_length, check_name, damaged, is_locked, log_of
+from uwblink.recording.soundness import check_length, check_name, damaged, is_locked
 
 if TYPE_CHECKING:
     import duckdb
 
+LONGEST_LOOK_S: Final = 2.0
+"""A reader that finds a new recording before its writer has opened it again looks it over in this time."""
+
 ROWS_AT_A_TIME: Final = 100_000
 """Rows that a copy holds in memory at once; of impulse responses, which are the largest, 0.2 GB."""
-
-
-_LOCKED: Final = (
-    "autoinstall_known_extensions = false",
-    "autoload_known_extensions = false",
-    "allow_community_extensions = false",
-    "enable_external_access = false",
-    "lock_configuration = true",
-)
-"""Settings of every connection, in this order: the last one makes them last."""
 
 
 class Store:
@@ -55,21 +50,33 @@ class Store:
     @classmethod
     def create(cls, place: Path, path: Path, memory_mb: int | None = None) -> Self:
         """Make a file at `place` with empty tables, for a recording that is called `path`; raises `RecordingError`."""
-        import duckdb
-
         check_name(path)
-        try:
-            store = cls(duckdb.connect(str(place)), path, writes=True, vanishes=True)
-            # Snapshots are written beside the recording, and nothing ever elsewhere.
-            if memory_mb is not None:
-                store.execute(f"SET memory_limit = '{memory_mb}MB'")
-            store.execute("SET allowed_directories = ?", [[str(place.absolute().parent)]])
-            for setting in _LOCKED:
-                store.execute(f"SET {setting}")
-        except duckdb.Error as error:
-            raise RecordingError(f"{path}: cannot be written ({first_line(error)})") from error
+        store = cls._writing(place, path, memory_mb)
+        store.vanishes = True
         store._create_missing()
         return store
+
+    @classmethod
+    def grow(cls, path: Path, memory_mb: int | None = None) -> Self:
+        """Open a file that was just made, for a recording that goes on for long; raises `RecordingError`."""
+        end_s = time.monotonic() + LONGEST_LOOK_S
+        while True:
+            try:
+                return cls._writing(path, path, memory_mb)
+            except RecordingError:
+                if time.monotonic() > end_s or not is_locked(path, update=True):
+                    raise
+                time.sleep(0.02)
+
+    @classmethod
+    def _writing(cls, place: Path, path: Path, memory_mb: int | None) -> Self:
+        import duckdb
+
+        try:
+            # Snapshots are written beside the recording, and nothing ever elsewhere.
+            return cls(connect(place, folders=[place.parent], memory_mb=memory_mb), path, writes=True)
+        except duckdb.Error as error:
+            raise RecordingError(f"{path}: cannot be written ({first_line(error)})") from error
 
     @classmethod
     def open(cls, path: Path, *, update: bool, memory_mb: int | None = None) -> Self:
@@ -82,16 +89,14 @@ class Store:
 
         check_name(path)
         check_length(path)
-        config: dict[str, Any] = dict(setting.split(" = ") for setting in _LOCKED)
         size = path.stat().st_size
-        limit = {} if memory_mb is None else {"memory_limit": f"{memory_mb}MB"}
         try:
             try:
-                connection = duckdb.connect(str(path), read_only=not update, config=limit | config)
+                connection = connect(path, read_only=not update, memory_mb=memory_mb)
             except duckdb.ConnectionException:
-                if not limit:
+                if memory_mb is None:
                     raise
-                connection = duckdb.connect(str(path), read_only=not update, config=config)
+                connection = connect(path, read_only=not update)
             store = cls(connection, path, size, writes=update)
         except duckdb.ConnectionException as error:
             raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats
+from uwblink.output import new_file
 from uwbsim.random_streams import stream
 from uwbsim.world.world import World
 
@@ -28,7 +29,7 @@ class LivePoses:
         self._world, self._epoch_ns = world, epoch_ns
         self._eyes = {name: _Eye(world, name) for name in world.trajectories}
         self._next = 0
-        self._file = path.open("w", encoding="utf-8", newline="\n")
+        self._file = new_file(path, force=True)
         self._file.write(HEADER)
         self._file.flush()
 

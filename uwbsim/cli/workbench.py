@@ -59,7 +59,7 @@ def compare(
 ) -> None:
     """Range with every protocol in the same random world, and say what each knows and costs."""
     import uwbsim
-    from uwbsim.output import check_folder
+    from uwblink.output import check_folder
     from uwbsim.pages import FILES, write_comparison
     from uwbsim.protocols import chosen
 
@@ -182,7 +182,7 @@ def optimum(
     rows = chosen(_names(protocols))
     loaded = uwbsim.load(scenario, overrides or ())
     if output:
-        from uwbsim.output import check_folder
+        from uwblink.output import check_folder
         from uwbsim.pages import optimum_file, write_optima
 
         check_folder(output, [optimum_file(row.name) for row in rows], force=force)

@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from uwblink.output import made_folder, write_text
+from uwblink.output import check_folder, made_folder, write_text
 from uwblink.pages.html import both_widths, page_html, table_html
-from uwbsim.output import check_folder
 from uwbsim.pages import protocol_figures as figures
 from uwbsim.protocols.comparison import Comparison, ProtocolErrors
 from uwbsim.protocols.conditions import conditions_of

@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
-from uwblink.output import write_files
+from uwblink.output import check_folder, write_files
 from uwblink.pages.figures import picture
-from uwbsim.output import check_folder
 from uwbsim.pages.protocol_figures import optimum_curve
 from uwbsim.protocols.reply_delay import Optimum
 

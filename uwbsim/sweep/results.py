@@ -6,15 +6,27 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
+from uwblink.database import connect
 from uwblink.errors import UwblinkError
 from uwblink.output import is_utf8, whole
+from uwblink.recording.intake import check_tables, interrupted_after, longest_read_s
 from uwbsim.tables import fill_csv, fill_parquet
 
 
 class TableError(UwblinkError, ValueError):
     """A table or store that cannot be read or written: what, where, what to do."""
+
+
+TABLES: Final = {
+    "identity": {"key": "VARCHAR", "value": "VARCHAR"},
+    "results": {"number": "BIGINT", "part": "BIGINT", "document": "VARCHAR"},
+}
+LONGEST_DOCUMENT: Final = 100_000
+"""Letters of a row: fifty times what a run has with a hundred figures, and 0.5 GB of `ROWS_AT_A_TIME` of them."""
+
+ROWS_AT_A_TIME: Final = 5000
 
 
 class Store:
@@ -30,9 +42,9 @@ class Store:
         db = _connect(path)
         with _writing(path):
             db.execute("BEGIN")
-            db.execute("CREATE TABLE identity (key VARCHAR, value VARCHAR)")
+            for table, columns in TABLES.items():
+                db.execute(f"CREATE TABLE {table} ({', '.join(f'{name} {kind}' for name, kind in columns.items())})")
             db.executemany("INSERT INTO identity VALUES (?, ?)", [[k, json.dumps(v)] for k, v in identity.items()])
-            db.execute("CREATE TABLE results (number BIGINT, part BIGINT, document VARCHAR)")
             db.execute("COMMIT")
         return cls(db, path)
 
@@ -42,18 +54,29 @@ class Store:
         if not path.exists():
             return False
         with _connect(path) as db, _reading(path):
-            return bool(db.execute("SELECT 1 FROM information_schema.tables").fetchall())
+            return bool(db.execute("SELECT 1 FROM system.main.duckdb_tables() WHERE NOT internal").fetchall())
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open a store; raises `TableError` where the file is none."""
+        """Open a store, which may be a stranger's; raises `TableError` where the file is none, or more than that."""
         db = _connect(path)
-        with _reading(path):
-            names = {row[0] for row in db.execute("SELECT table_name FROM information_schema.tables").fetchall()}
-        if not {"identity", "results"} <= names:
+        try:
+            with _reading(path), interrupted_after(longest_read_s(path.stat().st_size), db.interrupt):
+                cls._check(db, path)
+        except UwblinkError:
             db.close()
-            raise TableError(f"{path}: not a store of results")
+            raise
         return cls(db, path)
+
+    @staticmethod
+    def _check(db: Any, path: Path) -> None:
+        check_tables(lambda query: db.execute(query).fetchall(), path, path.stat().st_size, TABLES)
+        found = set(db.execute("SELECT table_name, column_name FROM system.main.duckdb_columns()").fetchall())
+        if not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
+            raise TableError(f"{path}: not a store of results")
+        ((longest,),) = db.execute("SELECT coalesce(max(strlen(document)), 0) FROM results").fetchall()
+        if longest > LONGEST_DOCUMENT:
+            raise TableError(f"{path}: a row of {longest} letters, and results have at most {LONGEST_DOCUMENT}")
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -89,19 +112,17 @@ class Store:
         with _reading(self._path):
             cursor = self._db.cursor()
             cursor.execute("SELECT document FROM results ORDER BY number, part")
-            while batch := cursor.fetchmany(5000):
+            while batch := cursor.fetchmany(ROWS_AT_A_TIME):
                 for (document,) in batch:
                     yield dict(json.loads(document))
 
 
 def export(store: Store, table: Path, parquet: Path) -> None:
     """Write the rows of a store as CSV and Parquet, row by row, with the columns of all of them; replaces both."""
-    import duckdb
-
     columns = list(dict.fromkeys(key for row in store.rows() for key in row))
     with whole(table, force=True) as rows, whole(parquet, force=True) as packed:
         fill_csv(rows, columns, store.rows())
-        with duckdb.connect() as db:
+        with connect(paths=[rows, packed]) as db:
             fill_parquet(packed, db.read_csv(str(rows), header=True, sample_size=-1), parquet)
 
 
@@ -110,8 +131,10 @@ def _connect(path: Path) -> Any:
 
     if not is_utf8(path):
         raise TableError(f"{path}: its name and those of its folders must be UTF-8; give another one")
+    if path.is_symlink():
+        raise TableError(f"{path}: is a link; a sweep goes on in the folder that it was begun in")
     try:
-        return duckdb.connect(str(path))
+        return connect(path)
     except duckdb.Error as error:
         reason = str(error).splitlines()[0]
         if "lock" in reason:
@@ -127,7 +150,7 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (duckdb.Error, ValueError, TypeError, KeyError, RecursionError) as error:
-        if isinstance(error, TableError):
+        if isinstance(error, UwblinkError):
             raise
         raise TableError(f"{path}: its results are damaged ({_first_line(error)}); begin in another folder") from error
 

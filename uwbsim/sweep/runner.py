@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import uwblink
+from uwblink.output import check_folder
 from uwbsim.errors import ParameterError, ScenarioError
-from uwbsim.output import check_folder
 from uwbsim.scenario.loading import load
 from uwbsim.sweep.design import SweepDesign
 from uwbsim.sweep.executors import Chunk, Workers, workers_for

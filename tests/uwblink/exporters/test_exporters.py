@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - full is a fixture
-from uwblink.errors import ArgumentError, ImportTableError, RecordingError, RecordingExistsError
+from uwblink.errors import (
+    ArgumentError,
+    ImportTableError,
+    RecordingError,
+    RecordingExistsError,
+    RecordingMissingError,
+)
 from uwblink.exporters import EXPORTERS, Exporter, export_recording, register_exporter
 from uwblink.importers import import_recording
 from uwblink.recording.contents import Contents
@@ -77,7 +83,7 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     before = sorted(tmp_path.iterdir())
     with pytest.raises(ArgumentError, match="`to`: found 'xls', allowed: csv, parquet, tum, mcap, rosbag2"):
         export_recording(whole, tmp_path / "out", to="xls")
-    with pytest.raises(RecordingError, match="no such recording"):
+    with pytest.raises(RecordingMissingError, match="no such recording"):
         export_recording(tmp_path / "no.uwb", tmp_path / "out", to="csv")
     with pytest.raises(RecordingError, match="does not exist"):
         export_recording(whole, tmp_path / "no" / "out", to="csv")

@@ -127,6 +127,7 @@ def test_a_snapshot_that_cannot_be_written_is_an_error_of_the_reader_alone(tmp_p
 def test_what_killed_processes_have_left_is_swept_away(tmp_path):
     for kind in (".wanted", ".snapshot", ".partial"):
         (tmp_path / f".f.uwb.123{kind}").touch()
+    (tmp_path / ".f.uwb.456.partial" / "f.uwb").mkdir(parents=True)
     (tmp_path / ".other.uwb.123.wanted").touch()
     SnapshotMaker(tmp_path / "f.uwb", lambda place: None)
     assert [p.name for p in tmp_path.iterdir()] == [".other.uwb.123.wanted"]

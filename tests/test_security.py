@@ -1,0 +1,291 @@
+"""What docs/security.md says of files from strangers and of outputs, each by what tries to break it."""
+
+import ast
+import functools
+import operator
+import os
+import shutil
+import struct
+from pathlib import Path
+
+import duckdb
+import pytest
+
+import uwblink
+import uwbsim
+from tests.in_process import run
+from uwblink.database import STORAGE_VERSION
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("uwblink", "uwbsim", "calib")
+SECRET = "what nobody else may read"  # noqa: S105 - of this test
+STORAGE_OF_1_5 = 68
+"""What DuckDB 1.5 calls the storage that it writes, in the header of a file."""
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    """A flight, its scenario, a sweep and its results; and a file that nobody names."""
+    folder = tmp_path_factory.mktemp("seeds")
+    text = (ROOT / "scenarios" / "noiseless.toml").read_text().replace("duration_s = 60.0", "duration_s = 1.0")
+    (folder / "s.toml").write_text(text)
+    (folder / "plan.toml").write_text("sweep = { scenario = 's.toml', protocols = ['ds'], ranges = 10 }\n")
+    uwbsim.simulate(folder / "s.toml").save(folder / "f.uwb")
+    uwbsim.run_sweep(uwbsim.load_design(folder / "plan.toml"), folder / "results", workers=1)
+    (folder / "secret.txt").write_text(SECRET)
+    return folder
+
+
+@pytest.fixture
+def place(seeds, tmp_path):
+    """A folder of our own with all of that."""
+    folder = tmp_path / "place"
+    shutil.copytree(seeds, folder)
+    return folder
+
+
+def refused(ended, *named):
+    """Whether a command ended with one line and status 2, which names what it must and quotes no secret."""
+    assert ended.status == 2, ended
+    assert ended.err.count("\n") == 1, ended
+    assert SECRET not in ended.out + ended.err
+    for name in named:
+        assert str(name) in ended.err
+    return True
+
+
+def names(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+# One place opens DuckDB.
+
+
+def opens_duckdb(source):
+    """Whether a module takes anything from duckdb but types, errors and its version."""
+    harmless = ("Exception", "Error", "DuckDBPyConnection", "__version__")
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "duckdb":
+            taken = [alias.name for alias in node.names]
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "duckdb":
+            taken = [node.attr]
+        else:
+            continue
+        if not all(name.endswith(harmless) for name in taken):
+            return True
+    return False
+
+
+def test_one_module_opens_duckdb():
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    found = [path.relative_to(ROOT).as_posix() for path in files if opens_duckdb(path.read_text(encoding="utf-8"))]
+    assert found == ["uwblink/database.py"]
+
+
+@pytest.mark.parametrize("source", ["duckdb.connect()", "from duckdb import connect", "x = duckdb.sql"])
+def test_the_walk_sees_what_opens_duckdb(source):
+    assert opens_duckdb(source)
+
+
+# Sweep folders of strangers.
+
+
+def spoil(store, *statements):
+    with duckdb.connect(str(store)) as db:
+        for statement in statements:
+            db.execute(statement)
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        [
+            "DROP TABLE results",
+            "CREATE VIEW results AS SELECT 0 AS number, 0 AS part, "
+            "json_object('status', (SELECT content FROM read_text('{secret}')))::VARCHAR AS document",
+        ],
+        ["CREATE VIEW other AS SELECT content FROM read_text('{secret}')"],
+        ["CREATE MACRO json_object(a) AS 1"],
+        ["ALTER TABLE results ALTER number TYPE VARCHAR"],
+        ["ALTER TABLE results ADD COLUMN more VARCHAR DEFAULT 'x'"],
+        ["INSERT INTO results SELECT 0, 9, repeat('x', 200000)"],
+    ],
+)
+def test_a_sweep_folder_of_a_stranger_holds_results_and_no_programs(place, statements):
+    store = place / "results" / "results.duckdb"
+    spoil(store, *(statement.format(secret=place / "secret.txt") for statement in statements))
+    before = (place / "results" / "results.csv").read_bytes()
+    ended = run("uwbsim", "sweep", place / "plan.toml", "-o", place / "results", "--resume", "--workers", 1)
+    assert refused(ended, store)
+    assert (place / "results" / "results.csv").read_bytes() == before
+
+
+def test_the_store_of_a_sweep_is_no_link_to_another_file(place):
+    store = place / "results" / "results.duckdb"
+    store.rename(place / "elsewhere.duckdb")
+    store.symlink_to(place / "elsewhere.duckdb")
+    ended = run("uwbsim", "sweep", place / "plan.toml", "-o", place / "results", "--resume", "--workers", 1)
+    assert refused(ended, store)
+
+
+# What lies beside a file of a stranger.
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling", "pipe"])
+@pytest.mark.parametrize("beside", [".wal", ".tmp"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["uwblink", "show", "f.uwb"],
+        ["uwblink", "poses", "f.uwb", "--from", "poses.csv"],
+        ["uwblink", "export", "f.uwb", "--to", "csv", "-o", "out"],
+    ],
+)
+def test_what_lies_beside_a_recording_leads_nowhere(place, kind, beside, words):
+    (place / "poses.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n0,ifo001,0,0,0,0,0,0,1\n1,ifo001,0,0,0,0,0,0,1\n")
+    log = place / f"f.uwb{beside}"
+    if kind == "pipe":
+        os.mkfifo(log)
+    else:
+        log.symlink_to("secret.txt" if kind == "link" else "new.txt")
+    before = names(place)
+    assert refused(run(*words, folder=place), log.name)
+    assert (place / "secret.txt").read_text() == SECRET
+    assert names(place) == before
+
+
+@pytest.mark.parametrize("what", ["pipe", "device"])
+def test_a_recording_is_a_file(place, what):
+    path = place / "x.uwb"
+    if what == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    assert refused(run("uwblink", "show", path), path)
+
+
+# Outputs.
+
+WRITERS = (
+    ("uwbsim run s.toml -o out.uwb", "out.uwb"),
+    ("uwbsim run s.toml -o out.uwb --force", "out.uwb"),
+    ("uwblink export f.uwb --to csv -o out", "out"),
+    ("uwblink export f.uwb --to parquet -o out", "out"),
+    ("uwbsim show s.toml -o out.png --force", "out.png"),
+    ("calib sample -o out.uwb -n 100 --force", "out.uwb"),
+    ("uwbsim compare s.toml -o . -n 200 --protocols ds --force", "compare.csv"),
+    ("uwbsim sweep plan.toml -o results --resume --workers 1", "results/results.csv"),
+)
+
+
+@pytest.mark.parametrize(("line", "output"), WRITERS)
+def test_outputs_go_through_no_planted_link(place, line, output):
+    secret, path = place / "secret.txt", place / output
+    for name in (path.name, f"{path.name}.wal", f".{path.name}.partial", f".{path.name}.{os.getpid()}.partial"):
+        link = path.with_name(name)
+        link.unlink(missing_ok=True)
+        if "--force" in line or name != path.name or output.startswith("results"):
+            link.symlink_to(secret)
+    ended = run(*line.split(), folder=place)
+    assert ended.status == 0, ended
+    assert secret.read_text() == SECRET
+    assert not path.is_symlink()
+    assert path.exists()
+
+
+def test_a_live_recording_goes_through_no_planted_link(tmp_path):
+    path, secret = tmp_path / "live.uwb", tmp_path / "secret.txt"
+    for name, target in (("live.uwb", "new.txt"), ("live.uwb.wal", "secret.txt")):
+        (tmp_path / name).symlink_to(target)
+    secret.write_text(SECRET)
+    with uwblink.Recording.create(path, live=True) as recording:
+        recording.append_tags([uwblink.Tag(1, "a", (0.0, 0.0, 0.0))])
+        assert secret.read_text() == SECRET
+    assert names(tmp_path) == ["live.uwb", "secret.txt"]
+    assert not path.is_symlink()
+    assert uwblink.load(path).tags[0].body == "a"
+
+
+def test_live_poses_go_through_no_planted_link(tmp_path):
+    from tests.boards import served
+
+    (tmp_path / "poses.csv").symlink_to(tmp_path / "secret.txt")
+    (tmp_path / "secret.txt").write_text(SECRET)
+    with served() as server:
+        server.write_poses(tmp_path / "poses.csv")
+    assert (tmp_path / "secret.txt").read_text() == SECRET
+    assert (tmp_path / "poses.csv").read_text().startswith("time_ns,")
+
+
+def test_a_snapshot_goes_through_no_planted_link(tmp_path):
+    from uwblink.recording.snapshots import SnapshotMaker
+
+    path, secret = tmp_path / "live.uwb", tmp_path / "secret.txt"
+    secret.write_text(SECRET)
+    with uwblink.Recording.create(path, live=True) as recording:
+        maker = SnapshotMaker(path, recording.snapshot)
+        for kind in (".wanted", ".partial", ".snapshot", ".snapshot.wal"):
+            (tmp_path / f".live.uwb.abc{kind}").symlink_to(secret)
+        maker.look()
+        maker.close()
+    assert secret.read_text() == SECRET
+
+
+def test_a_log_left_by_the_file_that_is_replaced_goes_with_it(place):
+    path = place / "f.uwb"
+    with uwblink.Recording.create(place / "old.uwb", live=True) as recording:
+        recording.append_tags([uwblink.Tag(7, "old", (0.0, 0.0, 0.0))])
+        shutil.copy(place / "old.uwb", path)
+        shutil.copy(place / "old.uwb.wal", place / "f.uwb.wal")
+    assert run("calib", "sample", "-o", path, "-n", 100, "--force").status == 0
+    assert 7 not in {tag.tag for tag in uwblink.load(path).tags}
+
+
+def test_an_output_that_cannot_be_written_leaves_the_folder_that_it_would_have_replaced(place, monkeypatch):
+    from uwblink.exporters import Exporter, export_recording, register_exporter
+
+    def write(recording, folder):
+        (folder / "half.txt").write_text("half")
+        raise uwblink.errors.RecordingError("no more")
+
+    register_exporter(Exporter("half", write, "half a file"), replace=True)
+    with pytest.raises(uwblink.errors.RecordingError, match="no more"):
+        export_recording(place / "f.uwb", place / "results", to="half", force=True)
+    assert "results/results.csv" in names(place)
+    assert not [name for name in names(place) if "half" in name or "partial" in name]
+
+
+# Versions of DuckDB.
+
+
+def storage(path):
+    """Return the number of a file's storage, as DuckDB's first header has it."""
+    head = path.read_bytes()[:20]
+    assert head[8:12] == b"DUCK"
+    return struct.unpack("<Q", head[12:20])[0]
+
+
+def test_what_is_written_the_lowest_allowed_version_reads(place):
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'"duckdb>={STORAGE_VERSION.removeprefix("v").rpartition(".")[0]}.' in text
+    with uwblink.Recording.create(place / "live.uwb", live=True) as recording:
+        recording.snapshot(place / "snapshot.uwb")
+    assert run("calib", "sample", "-o", place / "sample.uwb", "-n", 100).status == 0
+    made = [*place.glob("*.uwb"), place / "results" / "results.duckdb"]
+    assert {path.name: storage(path) for path in made} == {path.name: STORAGE_OF_1_5 for path in made}
+    assert len(made) == 5
+
+
+def test_a_file_of_a_newer_duckdb_is_named_so(place):
+    path = place / "newer.uwb"
+    with duckdb.connect() as db:
+        db.execute(f"ATTACH '{path}' AS newer")
+        db.execute("CREATE TABLE newer.meta(key VARCHAR)")
+    data = bytearray(path.read_bytes())
+    data[12:20] = struct.pack("<Q", 5000)
+    data[52:60] = b"v9.8.7\0\0"
+    # The checksum of a block: each word times an odd number, all exclusive-or.
+    words = struct.unpack("<511Q", data[8:4096])
+    data[:8] = struct.pack("<Q", functools.reduce(operator.xor, (w * 0xBF58476D1CE4E5B9 % 2**64 for w in words), 5381))
+    path.write_bytes(data)
+    assert refused(run("uwblink", "show", path), path, "DuckDB v9.8.7", f"installed DuckDB {duckdb.__version__}")
