@@ -152,8 +152,21 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
         taken[place] = name
 
 
-def check_output(path: Path, *, force: bool) -> None:
-    """Raise the one clear error if `path` cannot be written to; writes nothing."""
+_TABLES: Final = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson")
+OTHER_FORMATS: Final = (*_TABLES, ".bag", ".mcap", ".db3", ".toml", ".html", ".pdf")
+"""Endings by which programs choose how to read a file, and none of which is a recording's."""
+
+
+def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
+    """Raise the one clear error if `path` cannot be written to; writes nothing.
+
+    A `recording` may not have the name of another kind of file: who reads a table would be handed a database.
+    """
+    if recording and path.suffix.lower() in OTHER_FORMATS:
+        raise RecordingError(
+            f"{path}: a recording is written here, and {path.suffix} is the ending of another kind of file; name it "
+            f"{path.stem}.uwb (`uwblink export` makes tables of it)"
+        )
     if path.is_dir():
         raise RecordingError(f"{path}: is a directory, expected the name of an output file")
     if path.exists() and not force:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ def heads(keys: Iterable[FileKey]) -> tuple[str, ...]:
 class TomlReader:
     """Reads one file and checks its values; raises `error`, whose text begins with the path and the key."""
 
-    def __init__(self, path: Path, error: type[Exception], what: str = "file") -> None:
+    def __init__(self, path: Path, error: Callable[[str], Exception], what: str = "file") -> None:
         """Read `path`, which holds a `what`."""
         self.path, self.error = path, error
         self.text = read_text(path, error, what)
@@ -49,6 +49,15 @@ class TomlReader:
         found = self.table.get(name, {})
         self.check(name, found, isinstance(found, dict), "a table")
         return dict(found)
+
+    def rows(self, name: str, keys: Iterable[str] | None) -> list[dict[str, Any]]:
+        """Return an array of tables, which may be absent; raises for a key that is none of `keys` (None: any)."""
+        found = self.table.get(name, [])
+        good = isinstance(found, list) and all(isinstance(row, dict) for row in found)
+        self.check(name, found, good, f"tables [[{name}]]" + (f" with {', '.join(keys)}" if keys else ""))
+        for k, row in enumerate(found if keys is not None else ()):
+            self.known(row, keys or (), f"{name}[{k}].")
+        return list(found)
 
     def choice(self, key: str, value: Any, allowed: Iterable[Any]) -> Any:
         """Return a value that is one of `allowed`; None among them stands for a key that is not there."""

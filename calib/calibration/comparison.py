@@ -20,7 +20,9 @@ class Comparison:
     """Differences second minus first, after a shift common to all delays has been taken out.
 
     The shift and a constant of the curve are the same thing, so only together do they mean anything: `offset_m` is
-    what the second calibration adds to every range beyond the first, at equal power.
+    what the second calibration adds to every range beyond the first, at equal power. `std_ns` is NaN for tags of which
+    a calibration states no standard error, as published ones; where fewer than two tags have one in both, nothing can
+    be tested, and `chi_square` and `probability` are NaN.
     """
 
     difference_ns: dict[int, float]
@@ -34,8 +36,15 @@ class Comparison:
 
     @property
     def same(self) -> bool:
-        """Whether differences as large as these come by chance more than once in twenty."""
+        """Whether differences as large as these come by chance more than once in twenty; False where not tested."""
         return self.probability >= SIGNIFICANT
+
+    @property
+    def verdict(self) -> str:
+        """Return "same", "different", or "unknown" where no differences could be tested."""
+        if np.isnan(self.probability):
+            return "unknown"
+        return "same" if self.same else "different"
 
     def __repr__(self) -> str:
         """Return the table: a line a tag, and what it comes to."""
@@ -44,7 +53,7 @@ class Comparison:
     def table(self, first: str = "the first", second: str = "the second") -> str:
         """Return a line a tag in ns, the common shift in cm, and the verdict; `first` and `second` name the two."""
         lines = [
-            f"  tag {tag:3d}  {difference:+.4f} ns  ± {1.96 * self.std_ns[tag]:.4f} (95 %)"
+            f"  tag {tag:3d}  {difference:+.4f} ns  {_interval(self.std_ns[tag])}"
             for tag, difference in self.difference_ns.items()
         ]
         lines.append(
@@ -54,25 +63,38 @@ class Comparison:
         for name, tags in ((first, self.only_first), (second, self.only_second)):
             if tags:
                 lines.append(f"only in {name}: tags {', '.join(map(str, tags))}")
-        lines.append(
-            f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
-            f"{len(self.difference_ns) - 1} degrees of freedom, probability {self.probability:.3f}"
-        )
+        tested = sum(np.isfinite(std) for std in self.std_ns.values())
+        if self.verdict == "unknown":
+            lines.append("no verdict: fewer than two tags have a standard error in both calibrations")
+        else:
+            lines.append(
+                f"the delays are {'the same' if self.same else 'different'}: chi-square {self.chi_square:.1f} with "
+                f"{tested - 1} degrees of freedom, probability {self.probability:.3f}"
+            )
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib compare --json` prints."""
         return {
             "difference_ns": {str(t): d for t, d in self.difference_ns.items()},
-            "std_ns": {str(t): d for t, d in self.std_ns.items()},
+            "std_ns": {str(t): _or_none(d) for t, d in self.std_ns.items()},
             "offset_m": self.offset_m,
             "curve_rms_m": self.curve_rms_m,
-            "chi_square": self.chi_square,
-            "probability": self.probability,
-            "verdict": "same" if self.same else "different",
+            "chi_square": _or_none(self.chi_square),
+            "probability": _or_none(self.probability),
+            "verdict": self.verdict,
             "only_first": list(self.only_first),
             "only_second": list(self.only_second),
         }
+
+
+def _interval(std_ns: float) -> str:
+    return f"± {1.96 * std_ns:.4f} (95 %)" if np.isfinite(std_ns) else "standard error not stated"
+
+
+def _or_none(value: float) -> float | None:
+    """Return a number as JSON has it, which knows no NaN."""
+    return value if np.isfinite(value) else None
 
 
 def compare(first: Calibration, second: Calibration) -> Comparison:
@@ -92,31 +114,38 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
 
     if first.pair_offsets or second.pair_offsets:
         raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
-    known = [{t for t in c.delays_ns if np.isfinite(c.delays_std_ns.get(t, 0.0))} for c in (first, second)]
+    known = [{t for t in c.delays_ns if not np.isinf(c.delays_std_ns.get(t, np.nan))} for c in (first, second)]
     common = sorted(known[0] & known[1])
     if len(common) < 2:
         raise UnanswerableError(
             f"{len(common)} tags have determined delays in both calibrations, at least two are needed to compare"
         )
-    delta = np.array([second.delays_ns[t] - first.delays_ns[t] for t in common])
-    # The shift is the most likely one; what is left has a covariance of one rank less.
-    covariance = sum(_covariance_ns2(c, common) for c in (first, second)) + 1e-12 * np.eye(len(common))
-    precision = np.linalg.inv(covariance)
-    weight = precision.sum(axis=0)
-    shift = float(weight @ delta / weight.sum())
-    score = float((delta - shift) @ precision @ (delta - shift))
-    std = np.sqrt(np.maximum(np.diag(covariance - 1 / weight.sum()), 0))
+    delta = {t: second.delays_ns[t] - first.delays_ns[t] for t in common}
+    stated = [t for t in common if all(t in c.delays_std_ns for c in (first, second))]
+    std_ns = dict.fromkeys(common, np.nan)
+    shift, score, probability = float(np.mean(list(delta.values()))), np.nan, np.nan
+    if len(stated) > 1:
+        # The shift is the most likely one; what is left has a covariance of one rank less.
+        covariance = sum(_covariance_ns2(c, stated) for c in (first, second)) + 1e-12 * np.eye(len(stated))
+        precision = np.linalg.inv(covariance)
+        weight = precision.sum(axis=0)
+        left = np.array([delta[t] for t in stated])
+        shift = float(weight @ left / weight.sum())
+        score = float((left - shift) @ precision @ (left - shift))
+        probability = float(chdtrc(len(stated) - 1, score))
+        std = np.sqrt(np.maximum(np.diag(covariance - 1 / weight.sum()), 0))
+        std_ns |= dict(zip(stated, std.tolist(), strict=True))
     low = max(first.bias_curve.range[0], second.bias_curve.range[0])
     high = min(first.bias_curve.range[1], second.bias_curve.range[1])
     grid = np.linspace(low, max(high, low + 1e-9), 400)
     curves = second.bias_curve(grid) - first.bias_curve(grid)
     return Comparison(
-        difference_ns=dict(zip(common, (delta - shift).tolist(), strict=True)),
-        std_ns=dict(zip(common, std.tolist(), strict=True)),
+        difference_ns={tag: one - shift for tag, one in delta.items()},
+        std_ns=std_ns,
         offset_m=shift * 1e-9 * SPEED_OF_LIGHT - float(curves.mean()),
         curve_rms_m=float(curves.std()),
         chi_square=score,
-        probability=float(chdtrc(len(common) - 1, score)),
+        probability=probability,
         only_first=tuple(sorted(set(first.delays_ns) - set(common))),
         only_second=tuple(sorted(set(second.delays_ns) - set(common))),
     )
@@ -124,7 +153,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
 
 def _covariance_ns2(calibration: Calibration, tags: list[int]) -> Floats:
     """Covariance of some tags' delays: as fitted where it is known, else from the standard errors alone."""
-    found = np.diag([calibration.delays_std_ns.get(tag, 0.0) ** 2 for tag in tags])
+    found = np.diag([calibration.delays_std_ns[tag] ** 2 for tag in tags])
     known = calibration.uncertainty
     if known is None:
         return found

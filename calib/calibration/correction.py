@@ -74,7 +74,7 @@ def apply(
 
 
 def _write(source: str | os.PathLike[str], calibration: Calibration, output: Path, *, force: bool) -> Applied:
-    check_output(output, force=force)
+    check_output(output, force=force, recording=True)
     with Recording.open(source, memory_mb=READING_MB) as recording:
         if "calibration" in recording.meta():
             raise BadInputError(f"{source}: its ranges are corrected already; apply to the original")

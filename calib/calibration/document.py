@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from calib.calibration.content import CalibrationContent
 from calib.calibration.error_model import read_errors
-from calib.calibration.json_format import Reader
+from calib.calibration.json_format import DELAY_NS, LIGHT, POWER_DBM, STD_NS, Reader
 from calib.calibration.pair_offsets import offsets_from, table_of
 from calib.calibration.parts import TagGroup, Uncertainty
 from calib.calibration.power_curves import LIFTS, Curve
@@ -36,9 +36,7 @@ def text_of(calibration: CalibrationContent) -> str:
     document: dict[str, Any] = {
         "schema_version": _version(calibration),
         "delays_ns": {str(t): d for t, d in sorted(calibration.delays_ns.items())},
-        "delays_std_ns": {
-            str(t): d if math.isfinite(d) else None for t, d in sorted(calibration.delays_std_ns.items())
-        },
+        "delays_std_ns": {str(t): d if STD_NS.hold(d) else None for t, d in sorted(calibration.delays_std_ns.items())},
         "loss": calibration.loss,
         "scale_ns": calibration.scale_ns,
         "lift": calibration.lift,
@@ -105,14 +103,14 @@ def fields_of(text: str, where: str) -> dict[str, Any]:
     return {
         "lift": _one_of(read, "lift", LIFTS, where),
         "power_at": _one_of(read, "power_at", POWER_AT, where) if read.has("power_at") else "exchange",
-        "delays_ns": read.delays("delays_ns"),
-        "delays_std_ns": read.delays("delays_std_ns", missing=math.inf),
+        "delays_ns": read.delays("delays_ns", DELAY_NS),
+        "delays_std_ns": read.delays("delays_std_ns", STD_NS, missing=math.inf),
         "loss": read.word("loss"),
-        "scale_ns": read.number("scale_ns"),
-        "alpha_dbm": read.number("alpha_dbm"),
-        "speed_of_light": read.number("speed_of_light"),
+        "scale_ns": read.number("scale_ns", STD_NS),
+        "alpha_dbm": read.number("alpha_dbm", POWER_DBM),
+        "speed_of_light": read.number("speed_of_light", LIGHT),
         "bias_curve": read.curve("bias_curve"),
-        "sigma_curve": read.curve("sigma_curve"),
+        "sigma_curve": read.curve("sigma_curve", positive=True),
         "provenance": read.table("provenance"),
         "uncertainty": _uncertainty(read),
         "groups": _groups(read),
@@ -172,5 +170,5 @@ def _groups(read: Reader) -> dict[str, TagGroup]:
     for name in read.table("groups"):
         inner = every.inside(name)
         tags = tuple(int(tag) for tag in inner.numbers("tags"))
-        found[name] = TagGroup(tags, inner.curve("bias_curve"), inner.curve("sigma_curve"))
+        found[name] = TagGroup(tags, inner.curve("bias_curve"), inner.curve("sigma_curve", positive=True))
     return found

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.calibration.json_format import Reader, is_tag
+from calib.calibration.json_format import METRES, POSITIVE, SHARE, STD_M, Reader, is_tag
 from calib.calibration.power_curves import Curve
 from calib.densities import ROOT_2PI, densities
 from calib.errors import BadInputError
@@ -252,9 +252,11 @@ def read_errors(read: Reader) -> ErrorModel:
         lifted=lifted,
         noise_m=noise,
         tail_share=share,
-        **{name: read.number(name) for name in ("least_m", "detour_m", "outlier_share", "outlier_m")},
-        **{name: read.number(name) for name in ("location_m", "scale")},
-        levels=read.couples("levels"),
+        **{name: read.number(name, STD_M) for name in ("least_m", "detour_m", "outlier_m")},
+        outlier_share=read.number("outlier_share", SHARE),
+        location_m=read.number("location_m", METRES),
+        scale=read.number("scale", POSITIVE),
+        levels=read.couples("levels", SHARE),
         pairs={name: _pair(pairs.inside(name)) for name in names},
     )
 
@@ -265,8 +267,4 @@ def _is_pair(name: str) -> bool:
 
 
 def _pair(read: Reader) -> PairErrors:
-    found = {name: read.number(name) for name in ("noise", "odds", "detour")}
-    for name, value in found.items():
-        if value <= 0:
-            raise read.wrong(name, "a factor above 0")
-    return PairErrors(**found)
+    return PairErrors(**{name: read.number(name, POSITIVE) for name in ("noise", "odds", "detour")})

@@ -102,7 +102,7 @@ def _registers(calibration: Calibration, base: Programmed | None = None) -> str:
 
 def _csv(calibration: Calibration, _base: Programmed | None = None) -> str:
     rows = [
-        f"{tag},{delay!r},{calibration.delays_std_ns.get(tag, 0.0)!r}"
+        f"{tag},{delay!r},{calibration.delays_std_ns.get(tag, '')!s}"
         for tag, delay in sorted(calibration.delays_ns.items())
     ]
     return "\n".join(["tag,delay_ns,delay_std_ns", *rows]) + "\n"
@@ -248,9 +248,9 @@ def read_miluv(path: Path) -> Calibration:
         raise BadInputError(f"{path}: not a MILUV calibration ({type(error).__name__}: {error!s:.200})") from error
     rest = {key: value for key, value in table.items() if key not in ("delays_ns", "bias_spline_m", "std_spline_m")}
     order = list(table)
-    return Calibration(
+    found = Calibration(
         delays_ns=delays,
-        delays_std_ns=dict.fromkeys(delays, 0.0),
+        delays_std_ns={},
         loss="cauchy",
         scale_ns=0.1,
         lift="mean-of-lifted",
@@ -261,6 +261,7 @@ def read_miluv(path: Path) -> Calibration:
         power_at="reception",
         provenance={"imported_from": path.name, "miluv": {key: rest.get(key) for key in order}},
     )
+    return Calibration.from_json(found.to_json(), str(path))
 
 
 def _finite(text: str) -> float:

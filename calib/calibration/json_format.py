@@ -2,14 +2,53 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
+
+import numpy as np
 
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
+from calib.ranges import LONGEST_M
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import LARGEST_ID
+
+SAMPLED: Final = 200
+"""Points at which a curve is looked at; it has some ten pieces."""
 
 LARGEST: Final = 1e100
 """Whatever it is of, squares and products of such numbers are numbers still."""
+
+
+class Bounds(NamedTuple):
+    """Between which numbers a quantity lies, and what errors call it."""
+
+    least: float
+    most: float
+    what: str
+
+    def hold(self, value: float) -> bool:
+        """Return whether a number lies between them; NaN does not."""
+        return self.least <= value <= self.most
+
+
+LARGEST_DELAY_NS: Final = 1e4
+"""A register holds 1026 ns and a device has two; ten metres of cable are 50 ns. The rest is margin (3 km of range)."""
+
+ANY: Final = Bounds(-LARGEST, LARGEST, f"a finite number up to {LARGEST:g}")
+POSITIVE: Final = Bounds(1e-100, LARGEST, "a number above 0")
+SHARE: Final = Bounds(0.0, 1.0, "a share, 0 to 1")
+DELAY_NS: Final = Bounds(-LARGEST_DELAY_NS, LARGEST_DELAY_NS, f"nanoseconds, up to ±{LARGEST_DELAY_NS:g}")
+STD_NS: Final = Bounds(0.0, LARGEST_DELAY_NS, f"nanoseconds, 0 to {LARGEST_DELAY_NS:g}")
+METRES: Final = Bounds(-LONGEST_M, LONGEST_M, f"metres, up to ±{LONGEST_M:g}, the longest range that is read")
+STD_M: Final = Bounds(0.0, LONGEST_M, f"metres, 0 to {LONGEST_M:g}")
+POWER_DBM: Final = Bounds(-200.0, 100.0, "dBm, -200 to 100: the noise in a bandwidth of 500 MHz is -87 dBm")
+LIGHT: Final = Bounds(
+    0.999 * SPEED_OF_LIGHT, 1.001 * SPEED_OF_LIGHT, f"metres a second in air or vacuum, about {SPEED_OF_LIGHT:.0f}"
+)
+"""The refractive index of air is 1.0003; a thousandth is three centimetres in thirty metres."""
+
+ROUNDING: Final = 1e-9
+"""A variance that is 0 may come out of a decomposition a little below it."""
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -44,11 +83,11 @@ class Reader:
         found = repr(self._table[key])
         return BadInputError(f"{self._where}: {key}: found {found[:60]}, expected {expected}")
 
-    def number(self, key: str) -> float:
-        """Return a finite number."""
+    def number(self, key: str, bounds: Bounds = ANY) -> float:
+        """Return a number within its bounds."""
         value = self._value(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-            raise self.wrong(key, f"a finite number up to {LARGEST:g}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not bounds.hold(value):
+            raise self.wrong(key, bounds.what)
         return float(value)
 
     def word(self, key: str) -> str:
@@ -65,14 +104,14 @@ class Reader:
             raise self.wrong(key, "a table")
         return value
 
-    def delays(self, key: str, missing: float | None = None) -> dict[int, float]:
+    def delays(self, key: str, bounds: Bounds, missing: float | None = None) -> dict[int, float]:
         """Return numbers by tag; `missing` stands for null, which is wrong by default."""
         table = self.table(key)
         inner = Reader(table, f"{self._where}: {key}")
         if not all(map(is_tag, table)):
             raise self.wrong(key, "tag ids as keys")
         return {
-            int(tag): missing if value is None and missing is not None else inner.number(tag)
+            int(tag): missing if value is None and missing is not None else inner.number(tag, bounds)
             for tag, value in table.items()
         }
 
@@ -83,32 +122,35 @@ class Reader:
             raise self.wrong(key, f"{size} rows")
         inner = Reader({str(k): row for k, row in enumerate(value)}, f"{self._where}: {key}")
         rows = tuple(inner.numbers(str(k)) for k in range(size))
-        if any(len(row) != size for row in rows):
-            raise self.wrong(key, f"{size} numbers a row")
+        if any(len(row) != size or row[k] < -ROUNDING for k, row in enumerate(rows)):
+            raise self.wrong(key, f"{size} numbers a row, and no variance below 0")
         return rows
 
-    def numbers(self, key: str, least: int = 1) -> tuple[float, ...]:
-        """Return a list of finite numbers, `least` of them or more."""
+    def numbers(self, key: str, bounds: Bounds = ANY, least: int = 1) -> tuple[float, ...]:
+        """Return a list of numbers within their bounds, `least` of them or more."""
         value = self._value(key)
         if not isinstance(value, list) or len(value) < least:
             raise self.wrong(key, "a list of numbers")
         inner = Reader({str(k): v for k, v in enumerate(value)}, f"{self._where}: {key}")
-        return tuple(inner.number(str(k)) for k in range(len(value)))
+        return tuple(inner.number(str(k), bounds) for k in range(len(value)))
 
-    def couples(self, key: str) -> tuple[tuple[float, float], ...]:
+    def couples(self, key: str, bounds: Bounds) -> tuple[tuple[float, float], ...]:
         """Return a list of two numbers each, which may be empty."""
         value = self._value(key)
         if not isinstance(value, list) or any(not isinstance(row, list) or len(row) != 2 for row in value):
             raise self.wrong(key, "a list of two numbers each")
         inner = Reader({str(k): row for k, row in enumerate(value)}, f"{self._where}: {key}")
-        return tuple((row[0], row[1]) for row in (inner.numbers(str(k)) for k in range(len(value))))
+        return tuple((row[0], row[1]) for row in (inner.numbers(str(k), bounds) for k in range(len(value))))
 
-    def curve(self, key: str) -> Curve:
-        """Return a curve whose parts fit each other."""
+    def curve(self, key: str, *, positive: bool = False) -> Curve:
+        """Return a curve in metres whose parts fit each other; one that is `positive` is nowhere below 0."""
         inner = Reader(self.table(key), f"{self._where}: {key}")
-        knots, coefficients = inner.numbers("knots"), inner.numbers("coefficients")
+        knots, coefficients = inner.numbers("knots"), inner.numbers("coefficients", METRES)
         span, degree = inner.numbers("range"), int(inner.number("degree"))
         fits = len(knots) == len(coefficients) + degree + 1 and 0 <= degree <= 5
         if not fits or list(knots) != sorted(knots) or len(span) != 2 or span[0] >= span[1]:
             raise BadInputError(f"{self._where}: {key}: knots, coefficients, degree, range do not fit")
-        return Curve(knots, coefficients, degree, (span[0], span[1]))
+        found = Curve(knots, coefficients, degree, (span[0], span[1]))
+        if positive and min(coefficients) < 0 and not np.all(found(np.linspace(*span, SAMPLED)) >= 0):
+            raise inner.wrong("coefficients", "a standard deviation that is nowhere below 0 m")
+        return found

@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from calib.calibration.json_format import Reader, is_tag
+from calib.calibration.json_format import METRES, STD_M, Reader, is_tag
 from calib.errors import BadInputError
 from calib.ranges import Ranges
 from uwblink.arrays import Floats
@@ -66,5 +66,5 @@ def offsets_from(read: Reader) -> dict[tuple[int, int], PairOffset]:
             raise BadInputError(f"pair_offsets: found {key[:40]!r}, expected two tag ids, as in 1-2")
         one = inner.inside(key)
         pair = sorted((int(first), int(second)))
-        found[pair[0], pair[1]] = PairOffset(one.number("offset_m"), one.number("std_m"))
+        found[pair[0], pair[1]] = PairOffset(one.number("offset_m", METRES), one.number("std_m", STD_M))
     return found

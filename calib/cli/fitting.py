@@ -161,8 +161,10 @@ def delay_lines(found: calib.Calibration) -> Iterator[str]:
     if found.pair_offsets and not any(found.delays_ns.values()):
         return
     for tag, delay in sorted(found.delays_ns.items()):
-        half = 1.96 * found.delays_std_ns[tag]
-        if math.isinf(half):
+        half = 1.96 * found.delays_std_ns.get(tag, math.nan)
+        if math.isnan(half):
+            yield f"  tag {tag:3d}  delay {delay:+.4f} ns  standard error not stated"
+        elif math.isinf(half):
             yield f"  tag {tag:3d}  delay {delay:+.4f} ns  undetermined"
         else:
             pinned = "  pinned" if half == 0 else f"  ± {half:.4f} (95 %)"

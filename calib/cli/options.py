@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 from calib.errors import BadInputError
 from calib.estimation import FitSettings
+from uwblink.toml import TomlReader
 
 
 def fit_options(
@@ -43,12 +44,7 @@ def fit_options(
 
 def groups_of_tags(path: Path) -> dict[str, tuple[int, ...]]:
     """Read a design file: a table `groups` that maps names to lists of tags; raises `BadInputError`."""
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise BadInputError(f"{path}: no such file", parameter="groups") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInputError(f"{path}: not valid TOML ({error})", parameter="groups") from error
+    table = TomlReader(path, partial(BadInputError, parameter="groups")).table
     groups = table.get("groups")
     if not isinstance(groups, dict) or not groups or set(table) != {"groups"}:
         raise BadInputError(f"{path}: expected one table [groups], as in: monopole = [1, 2]", parameter="groups")

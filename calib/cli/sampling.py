@@ -29,7 +29,7 @@ def sample(
     from uwblink import Contents
     from uwblink.output import check_output
 
-    check_output(output, force=force)
+    check_output(output, force=force, recording=True)
     flight = calib.sample_flight(count, seed=seed, anchors=anchors)
     meta = {"planted": flight.planted, "source": "sample", "seed": seed}
     contents = Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags, meta=meta)

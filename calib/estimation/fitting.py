@@ -140,8 +140,9 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         doubted = doubts(problem, found)
         problem.let_go()
         calibration = calibration_of(problem, found, doubted.covariance_ns2, loss, lift, alpha_dbm, fixed, groups)
-        stds = std_taken_over(source, set(fixed) - set(pinned))
-        calibration = replace(calibration, delays_std_ns=calibration.delays_std_ns | stds)
+        given = set(fixed) - set(pinned)
+        fitted = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
+        calibration = replace(calibration, delays_std_ns=fitted | std_taken_over(source, given))
         # Of the search no more than this is asked from here on.
         problem, ended = problem.without_design(), found.ended
         del found

@@ -39,5 +39,5 @@ def taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dic
 
 
 def std_taken_over(known: Calibration | None, tags: Iterable[int]) -> dict[int, float]:
-    """Return the standard errors that a calibration has for delays that were taken over from it."""
-    return {} if known is None else {tag: known.delays_std_ns.get(tag, 0.0) for tag in tags}
+    """Return the standard errors that a calibration states for delays that were taken over from it."""
+    return {} if known is None else {tag: known.delays_std_ns[tag] for tag in tags if tag in known.delays_std_ns}

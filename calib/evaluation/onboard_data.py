@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib.calibration.model import Calibration
 from calib.errors import UnanswerableError
 from calib.evaluation.range_updates import RangeErrors
-from calib.ranges import LONGEST_M, Ranges
+from calib.ranges import LONGEST_M, Ranges, require_some
 from calib.sources import Data, opened, require_times
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses
@@ -61,8 +61,11 @@ def readings(data: Data, calibration: Calibration) -> list[Readings]:
         poses, tags = source.poses, list(source.tags)
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     ranges = Ranges.from_exchanges(exchanges, source=name)
-    powered = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm)
-    ranges = ranges[powered & np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < LONGEST_M)]
+    powered = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm) | (not calibration.needs_power)
+    possible = np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < LONGEST_M)
+    excluded = {"no power": int(np.sum(~powered)), "impossible stamps": int(np.sum(powered & ~possible))}
+    require_some(name, len(ranges), excluded, "")
+    ranges = ranges[powered & possible]
     anchors = _anchors(poses)
     fixed = {tag.tag: anchors[tag.body] + tag.lever_arm_m for tag in tags if tag.body in anchors}
     if len(fixed) < FEWEST_ANCHORS:

@@ -131,7 +131,7 @@ def beside_planted(ranges: Ranges, applied: CorrectedRanges, calibration: Calibr
     if truth is not None and inside.any():
         fitted = (applied.delay_corrected_m - applied.corrected_m)[inside]
         curve = fitted - truth - shift * 1e-9 * SPEED_OF_LIGHT
-        wrong = np.zeros(max(ranges.tags()) + 1)
+        wrong = np.zeros(max(*ranges.tags(), *delays) + 1)
         wrong[list(delays)] = list(delays.values())
         ends = ranges.weight_initiator * wrong[ranges.initiator] + ranges.weight_target * wrong[ranges.target]
         curve_rms = float(np.sqrt(np.mean(curve**2)))

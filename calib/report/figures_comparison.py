@@ -25,7 +25,7 @@ def differences(width_in: float, found: Comparison) -> Figure:
     figure, (axes,) = sheet(width_in, height_in=2.6)
     tags = sorted(found.difference_ns)
     place, values = np.arange(len(tags)), 1e3 * np.array([found.difference_ns[tag] for tag in tags])
-    half = 1e3 * TWO_SIDED_95 * np.array([found.std_ns[tag] for tag in tags])
+    half = 1e3 * TWO_SIDED_95 * np.nan_to_num([found.std_ns[tag] for tag in tags])
     axes.errorbar(place, values, half, fmt="o", ms=3.5, capsize=2.5, color=BLUE, label="difference, 95 % interval")
     axes.axhline(0, color=MUTED, lw=0.7)
     keep_strays_out(axes, np.concatenate([values - half, values + half, [0.0]]))

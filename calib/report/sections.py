@@ -112,7 +112,8 @@ def delays(
     rows = []
     for tag, delay in sorted(calibration.delays_ns.items()):
         half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, float("nan"))
-        bounds = [f"{delay - half:+.4f}", f"{delay + half:+.4f}"] if np.isfinite(half) else ["undetermined", ""]
+        unknown = ["not stated" if np.isnan(half) else "undetermined", ""]
+        bounds = [f"{delay - half:+.4f}", f"{delay + half:+.4f}"] if np.isfinite(half) else unknown
         row = [str(tag), f"{delay:+.4f}", *bounds]
         if known and planted:
             beside = (

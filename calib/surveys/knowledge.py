@@ -27,6 +27,10 @@ LATEST_S: Final = 1e9
 """Of seconds within a recording: thirty years either way."""
 
 
+DISTANCE_KEYS: Final = ("between", "distance_m", "sigma_m", "arrangement")
+POSITION_KEYS: Final = ("tag", "position_m", "sigma_m", "arrangement")
+
+
 @dataclass(frozen=True, slots=True)
 class KnownPosition:
     """Where a tag's antenna is, metres, and the standard deviation of each coordinate; in one arrangement or in all.
@@ -89,16 +93,13 @@ def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
         shapes=shapes,
         spans_s=spans,
         orders=orders,
-        distances=tuple(_distance(file, f"distances[{k}].", row) for k, row in enumerate(_rows(file, "distances"))),
-        positions=tuple(_position(file, f"positions[{k}].", row) for k, row in enumerate(_rows(file, "positions"))),
+        distances=tuple(
+            _distance(file, f"distances[{k}].", row) for k, row in enumerate(file.rows("distances", DISTANCE_KEYS))
+        ),
+        positions=tuple(
+            _position(file, f"positions[{k}].", row) for k, row in enumerate(file.rows("positions", POSITION_KEYS))
+        ),
     )
-
-
-def _rows(file: TomlReader, name: str) -> list[dict[str, Any]]:
-    rows = file.table.get(name, [])
-    good = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
-    file.check(name, rows, good, f"tables [[{name}]]")
-    return list(rows)
 
 
 def _shape(file: TomlReader, key: str, value: Any) -> str:
@@ -112,9 +113,8 @@ def _arrangements(
     spans: dict[str, tuple[float, float]] = {}
     orders: dict[str, tuple[int, ...]] = {}
     names: set[str] = set()
-    for k, row in enumerate(_rows(file, "arrangements")):
+    for k, row in enumerate(file.rows("arrangements", ("name", "known", "order", "start_s", "end_s"))):
         where = f"arrangements[{k}]."
-        file.known(row, ("name", "known", "order", "start_s", "end_s"), where)
         name = _word(file, f"{where}name", row.get("name"))
         file.check(f"{where}name", name, name not in names, "each name once")
         names.add(name)
@@ -140,7 +140,6 @@ def _order(file: TomlReader, key: str, order: Any, shape: Any) -> tuple[int, ...
 
 
 def _distance(file: TomlReader, where: str, row: dict[str, Any]) -> KnownDistance:
-    file.known(row, ("between", "distance_m", "sigma_m", "arrangement"), where)
     ends: Any = row.get("between")
     length: Any = row.get("distance_m")
     good = isinstance(ends, list) and len(ends) == 2 and all(map(_is_id, ends)) and ends[0] != ends[1]
@@ -151,7 +150,6 @@ def _distance(file: TomlReader, where: str, row: dict[str, Any]) -> KnownDistanc
 
 
 def _position(file: TomlReader, where: str, row: dict[str, Any]) -> KnownPosition:
-    file.known(row, ("tag", "position_m", "sigma_m", "arrangement"), where)
     tag: Any = row.get("tag")
     place: Any = row.get("position_m")
     file.check(f"{where}tag", tag, _is_id(tag), f"a whole number 0 to {LARGEST_ID}")

@@ -75,7 +75,7 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     if order and known != "line":
         raise PlanError("order: is that of boards on a line; say that they are known to be on one")
     path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
-    check_output(path, force=force)
+    check_output(path, force=force, recording=True)
     found = identify(ports, using)
     turns = plan.turns(sorted(found))
     if order and sorted(order) != sorted(found):

@@ -159,7 +159,7 @@ def replay(
     from uwblink.output import check_output
 
     if output:
-        check_output(output, force=force)
+        check_output(output, force=force, recording=True)
     with Recording.open(recording) as opened:
         if serve:
             count = play(opened, _announce, speed=speed, link_dir=link_dir)

@@ -72,7 +72,7 @@ def record(
     from uwblink.errors import PlanError
     from uwblink.output import check_output
 
-    check_output(output, force=force)
+    check_output(output, force=force, recording=True)
     if (plan is None) == (pairs is None):
         raise PlanError("give either --plan plan.toml or --pairs all")
     if pairs not in (None, "all", "none"):

@@ -182,7 +182,7 @@ def import_file(
     `watch` is called with what is being done ("reading", "checking", "writing", and between the first two "sorting" and
     "grouping" where an exchange has several rows) and which share of it is done, by importers that say so.
     """
-    check_output(Path(output), force=force)
+    check_output(Path(output), force=force, recording=True)
     sources, row, explained = _chosen(source, importer, map_file)
     if row.open_all is not None:
         with row.open_all(sources, explained, watch) as found:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from uwblink.errors import ImportTableError
 from uwblink.importers.json_mcap import JsonBag, has_json
+from uwblink.text_files import require_regular
 
 
 class Bag(Protocol):
@@ -60,6 +61,9 @@ def opened(path: Path) -> Iterator[Bag]:
 
     Messages of ROS need rosbags; an MCAP file of JSON messages does not.
     """
+    require_regular(path, ImportTableError, "bag", folders=True)
+    for part in path.iterdir() if path.is_dir() else ():
+        require_regular(part, ImportTableError, "part of a bag", folders=True)
     try:
         json_bag = JsonBag(path) if has_json(path) else None
     except OSError as error:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from uwblink.errors import ImportTableError
+from uwblink.text_files import require_regular
 
 HEAD_BYTES: Final = 65_536
 DELIMITERS: Final = (",", ";", "\t", "|", " ")
@@ -63,16 +64,13 @@ def _header_lines(lines: list[str], delimiter: str) -> list[int]:
 
 
 def _head(path: Path) -> str:
-    if path.is_dir():
-        raise ImportTableError(f"{path}: is a directory, expected a table (.csv or .csv.gz)")
+    require_regular(path, ImportTableError, "table (.csv or .csv.gz)")
     try:
         opener = gzip.open if path.suffix == ".gz" else open
         with opener(path, "rb") as file:
             raw = file.read(HEAD_BYTES)
         # A letter of several bytes may be cut in two at the end of what was read.
         return raw.decode("utf-8-sig", errors="strict" if len(raw) < HEAD_BYTES else "ignore")
-    except FileNotFoundError as error:
-        raise ImportTableError(f"{path}: no such table") from error
     except UnicodeDecodeError as error:
         raise ImportTableError(f"{path}: not a text file in UTF-8") from error
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:

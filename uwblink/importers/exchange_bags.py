@@ -66,8 +66,6 @@ def open_exchange_bag(
 
 def _as_table(source: Path, column_map: ColumnMap, table: Path) -> ColumnMap:
     """Write the messages of a bag as JSON lines; returns the map of these."""
-    if not source.exists():
-        raise ImportTableError(f"{source}: no such bag")
     with opened(source) as bag:
         column_map = _own(bag, column_map)
         try:

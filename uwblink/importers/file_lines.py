@@ -13,6 +13,7 @@ import numpy as np
 
 from uwblink.arrays import Ints
 from uwblink.errors import ImportTableError
+from uwblink.text_files import require_regular
 
 AT_ONCE: Final = 1 << 20
 """Bytes of a file that are looked at together."""
@@ -69,10 +70,7 @@ def _is_plain(piece: bytes) -> bool:
 
 def check_file(path: Path) -> None:
     """Raise `ImportTableError` for a path at which there is no file that can be read."""
-    if path.is_dir():
-        raise ImportTableError(f"{path}: is a directory, expected a table (.csv, .csv.gz, .parquet or .jsonl)")
-    if not path.exists():
-        raise ImportTableError(f"{path}: no such table")
+    require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
     if path.suffix == ".gz":
         _check_gzip(path)
 

@@ -19,7 +19,7 @@ from uwblink.errors import ImportTableError
 from uwblink.importers.pose_bags import Row, read_bag
 from uwblink.importers.pose_columns import LATEST_NS, NUMBERS, poses_of_lines, poses_of_table
 from uwblink.recording.schema import Poses
-from uwblink.text_files import read_text
+from uwblink.text_files import read_text, require_regular
 
 Reader = Callable[[Path, str | None], Iterable[Row]]
 
@@ -29,8 +29,7 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
 
     `body` names the body of a file that does not; `topics` are those of a bag to read, by body.
     """
-    if not path.exists():
-        raise ImportTableError(f"{path}: no such file of poses")
+    require_regular(path, ImportTableError, "file of poses", folders=True)
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
     reader = _READERS.get(kind)
     if reader is None:

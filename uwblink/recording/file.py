@@ -28,6 +28,7 @@ from uwblink.recording.snapshots import open_snapshot
 from uwblink.recording.soundness import is_locked
 from uwblink.recording.store import Store
 from uwblink.recording.writers import TableWriters
+from uwblink.text_files import require_regular
 
 if TYPE_CHECKING:
     from uwblink.recording.summary import Summary
@@ -80,7 +81,7 @@ class Recording(TableWriters, TableReaders):
         the block raises, nothing is left behind of one that is not live.
         """
         final = Path(path)
-        check_output(final, force=force)
+        check_output(final, force=force, recording=True)
         if final.exists() and is_locked(final, update=False):
             raise RecordingInUseError(f"{final}: another process is writing it; give another name")
         try:
@@ -111,8 +112,7 @@ class Recording(TableWriters, TableReaders):
         source = Path(path)
         if not source.exists():
             raise RecordingMissingError(f"{source}: no such recording")
-        if source.is_dir():
-            raise RecordingError(f"{source}: is a directory, expected a {SUFFIX} recording")
+        require_regular(source, RecordingError, f"{SUFFIX} recording")
         try:
             store = Store.open(source, update=update, memory_mb=memory_mb)
         except RecordingInUseError:

@@ -29,6 +29,8 @@ def is_locked(path: Path, *, update: bool) -> bool:
         import fcntl
     except ImportError:  # not a POSIX system, where opening the file says it
         return False
+    if not path.is_file():  # opening a FIFO would wait
+        return False
     try:
         with path.open("r+b" if update else "rb") as file:
             fcntl.lockf(file, (fcntl.LOCK_EX if update else fcntl.LOCK_SH) | fcntl.LOCK_NB)

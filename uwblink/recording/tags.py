@@ -10,11 +10,13 @@ from uwblink.recording.schema import Tag
 from uwblink.toml import TomlReader, is_number
 
 LARGEST_BOARD_ID: Final = 254
+PLAN_KEYS: Final = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir")
+"""What a ranging plan has beside its tags: a plan says where tags sit, too."""
 
 
 def load_tags(path: Path) -> tuple[Tag, ...]:
     """Read the `[[tags]]` of a plan or a scenario; raises `PlanError`."""
-    tags = read_tags(TomlReader(path, PlanError))
+    tags = read_tags(_file_of_tags(path))
     if not tags:
         raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m")
     return tags
@@ -26,17 +28,15 @@ def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, flo
     An anchor may have `covariance_m2` (xx xy xz yy yz zz), as `calib survey --anchors` writes it; poses have no place
     for it. Raises `PlanError` where there are neither, or an id is there twice.
     """
-    file = TomlReader(path, PlanError)
-    tags, rows = read_tags(file), file.table.get("anchors", [])
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise file.error(f"{path}: anchors: expected [[anchors]] tables with id and position_m")
+    file = _file_of_tags(path)
+    tags, rows = read_tags(file), file.rows("anchors", ("id", "position_m", "covariance_m2"))
     if not tags and not rows:
         raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m, and no [[anchors]]")
     found: dict[int, tuple[float, float, float]] = {}
     taken = {tag.tag for tag in tags}
     for k, row in enumerate(rows):
-        file.known(row, ("id", "position_m", "covariance_m2"), f"anchors[{k}].")
-        number, place = row.get("id"), row.get("position_m")
+        number: Any = row.get("id")
+        place: Any = row.get("position_m")
         file.check(f"anchors[{k}].id", number, is_board_id(number), f"a whole number 0 to {LARGEST_BOARD_ID}")
         if number in found or number in taken:
             raise PlanError(f"{path}: anchors[{k}].id: found a second {number}, ids must differ")
@@ -48,13 +48,14 @@ def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, flo
 
 
 def read_tags(file: TomlReader) -> tuple[Tag, ...]:
-    """Return tags from the array of tables `tags` of a file, none where there is none; raises the file's error."""
-    rows = file.table.get("tags", [])
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise file.error(f"{file.path}: tags: expected [[tags]] tables with id, body and lever_arm_m")
+    """Return tags from the array of tables `tags` of a file, none where there is none; raises the file's error.
+
+    The tags of a scenario have more keys, which its own reader checks.
+    """
     tags: list[Tag] = []
-    for k, row in enumerate(rows):
-        number, body = row.get("id"), row.get("body")
+    for k, row in enumerate(file.rows("tags", None if _is_scenario(file) else ("id", "body", "lever_arm_m"))):
+        number: Any = row.get("id")
+        body: Any = row.get("body")
         arm = row.get("lever_arm_m", [0.0, 0.0, 0.0])
         file.check(f"tags[{k}].id", number, is_board_id(number), f"a whole number 0 to {LARGEST_BOARD_ID}")
         if any(tag.tag == number for tag in tags):
@@ -63,6 +64,19 @@ def read_tags(file: TomlReader) -> tuple[Tag, ...]:
         file.check(f"tags[{k}].lever_arm_m", arm, _are_numbers(arm, 3), "three numbers (metres)")
         tags.append(Tag(number, body, (float(arm[0]), float(arm[1]), float(arm[2]))))
     return tuple(tags)
+
+
+def _file_of_tags(path: Path) -> TomlReader:
+    """Return a reader of a plan, a scenario, or a file of tags and anchors."""
+    file = TomlReader(path, PlanError, "file of tags (.toml)")
+    if not _is_scenario(file):
+        file.known(file.table, ("tags", "anchors", *PLAN_KEYS))
+    return file
+
+
+def _is_scenario(file: TomlReader) -> bool:
+    """Return whether a file is a scenario: only those have bodies or a run."""
+    return "bodies" in file.table or "run" in file.table
 
 
 def _are_numbers(value: Any, count: int) -> bool:

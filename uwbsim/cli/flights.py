@@ -51,7 +51,7 @@ def run(
     import uwbsim
     from uwblink.output import check_output
 
-    check_output(output, force=force)
+    check_output(output, force=force, recording=True)
     loaded = uwbsim.load(scenario, overrides or (), seed)
     with progress(loaded.run.name) as report:
         simulated = uwbsim.simulate(loaded, report, contention=contention)

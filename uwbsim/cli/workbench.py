@@ -118,8 +118,11 @@ def predict(
         float, typer.Option(min=0.0, rich_help_panel=TIMING, help="The target's reply, dt32.")
     ] = 300.0,
     final_delay_us: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel=TIMING, help="The third message's delay, dt53.")
-    ] = 1538.7,
+        float | None,
+        typer.Option(
+            min=0.0, rich_help_panel=TIMING, help="The third message's delay, dt53 (of ds, ds-alt); 1538.7 by default."
+        ),
+    ] = None,
     distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel=TRUTH, help="Distance.")] = 5.0,
     speed_mps: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Speed apart.")] = 0.0,
     drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Change of the relative skew.")] = 0.0,

@@ -14,6 +14,9 @@ from uwbsim.protocols.prediction import predict
 from uwbsim.units import PS, PS_PER_S, US
 
 LARGEST: Final = 1e9
+FINAL_DELAY_US: Final = 1538.7
+"""What the boards' firmware waits by default: 1500 of its own microseconds (512/499.2 us), and a step of its clock."""
+
 SHORTEST_US: Final = 1.0
 """A third message that follows at once leaves nothing to tell the clocks' rates from."""
 
@@ -23,8 +26,9 @@ class State:
     """One state of the world to predict ranges in; `protocol` is a name or a row of `PROTOCOLS`.
 
     The skew is that of the initiator's clock relative to the target's, shared by both equally. `reply_delay_us` is the
-    target's reply (dt32), `final_delay_us` the third message's delay (dt53). An aggregate antenna delay is split 0.44
-    to 0.56 between transmission and reception, which changes nothing.
+    target's reply (dt32), `final_delay_us` the third message's delay (dt53), None for that of the boards, 1538.7; a
+    protocol without a third message, or whose third message waits as long as the reply ("ds-sym"), takes none. An
+    aggregate antenna delay is split 0.44 to 0.56 between transmission and reception, which changes nothing.
 
     >>> from uwbsim import State
     >>> State(protocol="ss", skew_ppm=4.0).reply_delay_us
@@ -34,7 +38,7 @@ class State:
     protocol: str | RangingProtocol = "ds"
     skew_ppm: float = 0.0
     reply_delay_us: float = 300.0
-    final_delay_us: float = 1538.7
+    final_delay_us: float | None = None
     distance_m: float = 5.0
     speed_mps: float = 0.0
     drift_ppm_per_s: float = 0.0
@@ -53,13 +57,13 @@ NOT_NEGATIVE: Final = ("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_
 def _check(q: State) -> None:
     for field in fields(q):
         value = getattr(q, field.name)
-        if field.name in ("protocol", "whole_ticks"):
+        if field.name in ("protocol", "whole_ticks") or value is None:
             continue
         if not isinstance(value, int | float) or not abs(value) < LARGEST:
             raise ParameterError(f"found {value}, expected a number below {LARGEST:g}", parameter=field.name)
         if field.name in NOT_NEGATIVE and value < 0:
             raise ParameterError(f"found {value:g}, expected 0 or more", parameter=field.name)
-    if q.final_delay_us < SHORTEST_US:
+    if q.final_delay_us is not None and q.final_delay_us < SHORTEST_US:
         raise ParameterError(
             f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}", parameter="final_delay_us"
         )
@@ -120,9 +124,14 @@ def predict_state(q: State) -> Prediction:
     _check(q)
     # The target's reply is the scheduled message where there is no third one, or where both replies are equal.
     timings = [message.timing for message in protocol.messages]
-    target_waits = timings[1] == "scheduled"
-    scheduled = q.reply_delay_us if target_waits else q.final_delay_us
-    at_once = q.final_delay_us if timings[1:] == ["scheduled", "at once"] else q.reply_delay_us
+    target_waits, final_at_once = timings[1] == "scheduled", timings[1:] == ["scheduled", "at once"]
+    if q.final_delay_us is not None and target_waits and not final_at_once:
+        what = "has no third message" if len(timings) < 3 else "waits as long with its third message as with its reply"
+        text = f"{protocol.name} {what}; leave it out, and give that of the reply"
+        raise ParameterError(text, parameter="final_delay_us")
+    final_us = FINAL_DELAY_US if q.final_delay_us is None else q.final_delay_us
+    scheduled = q.reply_delay_us if target_waits else final_us
+    at_once = final_us if final_at_once else q.reply_delay_us
     conditions = Conditions.single(
         flight=q.distance_m / SPEED_OF_LIGHT,
         flight_rate=q.speed_mps / SPEED_OF_LIGHT,

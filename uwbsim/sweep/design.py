@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.text_files import read_text
+from uwblink.text_files import read_text, require_regular
 from uwblink.toml import FileKey
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
@@ -261,6 +261,7 @@ def _hypercube(path: Path, head: Mapping[str, Any], vary: Mapping[str, Any]) -> 
 
 def _fingerprint(text: str, scenario: Path) -> str:
     """What a result depends on besides its number: the plan's text and the scenario's."""
+    require_regular(scenario, ScenarioError, "scenario file")
     try:
         known = scenario.read_bytes()
     except OSError as error:
@@ -272,7 +273,9 @@ def _check_keys(plan: SweepDesign) -> None:
     """Load the scenario with one value of each key, so that a key which is not there is found before anything runs."""
     load(plan.scenario)
     first = {key: listed[0] for key, listed in plan.axes.items()}
-    for key, value in (first or (plan.rows or [{}])[0]).items():
+    for row in reversed(plan.rows or []):
+        first |= row
+    for key, value in first.items():
         try:
             load(plan.scenario, [f"{key}={toml_value(value)}"])
         except UnknownKeyError as error:
