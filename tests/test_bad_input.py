@@ -270,7 +270,7 @@ def test_calibrations_of_other_tags_and_versions(tmp_path, flight):
     )
     huge = document | {"delays_ns": document["delays_ns"] | {"3": 10**400}}
     (tmp_path / "c.json").write_text(json.dumps(huge))
-    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "delays_ns: 3", "a finite number")
+    refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "delays_ns: 3", "nanoseconds")
     huge = document | {"delays_ns": document["delays_ns"] | {"9" * 5000: 0.1}}
     (tmp_path / "c.json").write_text(json.dumps(huge))
     refused(run("calib", "evaluate", flight / "f.uwb", "-c", tmp_path / "c.json"), 2, "delays_ns", "tag ids as keys")

@@ -153,8 +153,8 @@ def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
         ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\n" * 2, "a second 9"),
         ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\ncovariance_m2 = [1.0]\n", "six numbers"),
         ("[[anchors]]\nid = 9\nplace = [1, 2, 3]\n", "unknown key"),
-        ("anchors = 3\n", "expected [[anchors]] tables"),
-        ("a = 3\n", "no [[anchors]]"),
+        ("anchors = 3\n", "expected tables [[anchors]]"),
+        ("a = 3\n", "a: unknown key"),
     ],
 )
 def test_anchors_that_cannot_be(recording, tmp_path, text, fragment):
