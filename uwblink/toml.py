@@ -6,9 +6,11 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from uwblink.text_files import read_text
+
+__all__: Final = ["FileKey", "TomlReader", "heads", "is_number"]
 
 
 class FileKey(NamedTuple):
