@@ -69,8 +69,8 @@ def guess(
         return
     write_text(output, found.text, force=force)
     then = f"uwblink import csv {quote(str(table))} --map {quote(str(output))} -o {quote(table.name.split('.')[0])}.uwb"
-    assumed = f"say {' and '.join(found.assumed)} in it" if found.assumed else "look at it"
-    typer.echo(f"{output}: {assumed if found.complete else 'fill in what is missing'}, then {then}")
+    asked = f"say {' and '.join(found.asked)} in it" if found.asked else "look at it"
+    typer.echo(f"{output}: {asked if found.complete else 'fill in what is missing'}, then {then}")
 
 
 def _with_map(row: Importer) -> Any:

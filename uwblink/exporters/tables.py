@@ -69,7 +69,7 @@ def _copy(
     place = recording.resolve()
     check_log(place)
     # What one of several threads is behind with, the others keep in memory; one takes no more processor time, and
-    # 4 million exchanges as long (4 to 8 s, 2026-11-22).
+    # for 4 million exchanges as CSV 0.29 GB in place of 0.41 GB (2026-11-22).
     with connect(paths=[place, log_of(place)], folders=[folder], memory_mb=MEMORY_MB, threads=1) as db:
         db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
         if by_poses:

@@ -17,6 +17,7 @@ tx1 = "poll_tx_ticks"
 stamps = "ticks"           # or "ns", "us", "s", or the length of a unit in seconds
 time = "s"                 # or "ms", "us", "ns", "iso"
 distance = "m"             # or "cm", "mm", "ft", "in"
+power = "dBm"              # or "-dBm": without its sign
 [constants]                # columns that the table does not have
 from_id = 1
 [ids]                      # numbers for ids that are words or too large
@@ -49,7 +50,10 @@ POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in
 LEVELS: Final = ("fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2")
 DISTANCES: Final = ("range_m", "gt_range_m", *POSITIONS)
 MESSAGE_NAMES: Final = ("sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp")
-IDS: Final = ("from_id", "to_id")
+IDS: Final = {"from_id": "who begins each exchange", "to_id": "who answers"}
+ASKED: Final = "?"
+"""What `uwblink import guess` writes where somebody has to say it."""
+
 EVENT: Final = "event"
 """The column that says whether a stamp is of sending or of receiving, in words."""
 
@@ -67,6 +71,8 @@ STAMP_UNITS: Final = {
 TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 ISO: Final = "iso"
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
+POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
+POWER_UNITS: Final = {"dBm": 1.0, "-dBm": -1.0}
 DELIMITERS: Final = (",", ";", "\t", "|", " ")
 FILE_KEYS: Final = (
     FileKey(
@@ -105,7 +111,18 @@ FILE_KEYS: Final = (
         "s, or iso where the column holds no number",
         "Unit of `time_s`; iso is as 2024-05-06T07:08:09.5+02:00, UTC where no zone is named.",
     ),
-    FileKey("units.distance", '"m", "cm", "mm", "ft" or "in"', "m", "Unit of ranges, true distances and positions."),
+    FileKey(
+        "units.distance",
+        '"m", "cm", "mm", "ft" or "in"',
+        "m, where the numbers can be metres; else it must be said",
+        "Unit of ranges, true distances and positions.",
+    ),
+    FileKey(
+        "units.power",
+        '"dBm" or "-dBm"',
+        "dBm, where the numbers are negative; else it must be said",
+        "Unit of powers; -dBm is for those that are written without their sign.",
+    ),
     FileKey(
         "constants.NAME", "number; text for an id", "none", "A value for all rows, for a column that is not there."
     ),
@@ -157,12 +174,23 @@ class ColumnMap:
     columns: dict[str, str] = field(default_factory=dict)
     ticks_per_unit: float = 1.0
     time_unit: str | None = None
-    metres_per_unit: float = 1.0
+    distance_unit: str | None = None
+    power_unit: str | None = None
     constants: dict[str, float | str] = field(default_factory=dict)
     ids: dict[str, int] = field(default_factory=dict)
     antenna_delays: dict[int | None, dict[str, int]] = field(default_factory=dict)
     each: str | None = None
     topics: dict[str, dict[str, float | str]] = field(default_factory=dict)
+
+    @property
+    def metres_per_unit(self) -> float:
+        """The unit of distances, metres where it is not said."""
+        return DISTANCE_UNITS[self.distance_unit or "m"]
+
+    @property
+    def power_sign(self) -> float:
+        """What powers are multiplied by."""
+        return POWER_UNITS[self.power_unit or "dBm"]
 
     def header(self, name: str) -> str:
         """Return what the table calls one of `NAMES`."""
@@ -177,7 +205,7 @@ def load_map(path: Path) -> ColumnMap:
     columns, units, constants, ids = (file.section(name) for name in ("columns", "units", "constants", "ids"))
     file.known(columns, NAMES, "columns.")
     file.known(constants, NAMES, "constants.")
-    file.known(units, ("stamps", "time", "distance"), "units.")
+    file.known(units, ("stamps", "time", "distance", "power"), "units.")
     for name, value in columns.items():
         file.check(f"columns.{name}", value, isinstance(value, str), "the name of a column")
     _constants(file, "constants", constants)
@@ -202,7 +230,8 @@ def load_map(path: Path) -> ColumnMap:
         columns=columns,
         ticks_per_unit=_ticks_per_unit(file, units.get("stamps", "ticks")),
         time_unit=file.choice("units.time", units.get("time"), (None, ISO, *TIME_UNITS)),
-        metres_per_unit=DISTANCE_UNITS[file.choice("units.distance", units.get("distance", "m"), DISTANCE_UNITS)],
+        distance_unit=file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)),
+        power_unit=file.choice("units.power", units.get("power"), (None, *POWER_UNITS)),
         constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
         ids=ids,
         antenna_delays=_antenna_delays(file),
@@ -213,8 +242,13 @@ def load_map(path: Path) -> ColumnMap:
 
 def _constants(file: TomlReader, where: str, values: dict[str, Any]) -> None:
     for name, value in values.items():
-        good = is_number(value) or (name in IDS and isinstance(value, str))
-        file.check(f"{where}.{name}", value, good, "a finite number")
+        if name in IDS:
+            good = is_number(value) or (isinstance(value, str) and value != ASKED)
+            file.check(
+                f"{where}.{name}", value, good, f"{IDS[name]}: a number or a word; or name its column in [columns]"
+            )
+        else:
+            file.check(f"{where}.{name}", value, is_number(value), "a finite number")
 
 
 def _is_id(value: Any) -> bool:

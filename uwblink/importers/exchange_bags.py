@@ -83,7 +83,8 @@ def _own(bag: Bag, column_map: ColumnMap) -> ColumnMap:
     if column_map.topics or not own:
         return column_map
     topics: dict[str, dict[str, float | str]] = {topic: {} for topic in own}
-    return replace(column_map, topics=topics, columns=OWN_COLUMNS | column_map.columns)
+    columns = OWN_COLUMNS | column_map.columns
+    return replace(column_map, topics=topics, columns=columns, distance_unit=column_map.distance_unit or "m")
 
 
 def _topics(bag: Bag, column_map: ColumnMap) -> list[str]:

@@ -58,7 +58,7 @@ def _of_rows(rows: Rows, protocol: str, bits: int, stamps: dict[str, Ints], befo
         fpp2_dbm=optional(rows, "fpp2"),
         skew1_ppm=optional(rows, "skew1"),
         skew2_ppm=optional(rows, "skew2"),
-        truth_m=_truth(rows),
+        truth_m=truth_m(rows),
         bits=bits,
         **stamps,
     )
@@ -73,7 +73,8 @@ def optional(rows: Rows, name: str) -> Floats:
     return column if finite.all() else np.where(finite, column, np.nan)
 
 
-def _truth(rows: Rows) -> Floats:
+def truth_m(rows: Rows) -> Floats:
+    """Return distances (n,) that were measured, or those between antennas; NaN where there are none."""
     if "gt_range_m" in rows.cells:
         return optional(rows, "gt_range_m")
     if not all(name in rows.cells for name in POSITIONS):

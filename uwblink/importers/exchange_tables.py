@@ -17,7 +17,7 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import IDS, ColumnMap, load_map
+from uwblink.importers.column_map import DISTANCES, IDS, LEVELS, ColumnMap, load_map
 from uwblink.importers.exchange_rows import optional
 from uwblink.importers.long_tables import exchanges_of_long
 from uwblink.importers.staged_tables import StagedTables, Watch
@@ -25,6 +25,7 @@ from uwblink.importers.stamps import stamps_of
 from uwblink.importers.table_import import TableImport
 from uwblink.importers.table_rows import Rows, RowSource, has
 from uwblink.importers.trials import SAMPLE, Reading, Sample, Trial, try_others
+from uwblink.importers.units import check_units
 from uwblink.importers.unusable import Unusable
 from uwblink.importers.usable import Usable, usable_exchanges, usable_ranges
 from uwblink.recording.contents import Contents
@@ -89,6 +90,7 @@ def plan(tables: StagedTables, watch: Watch | None = None) -> TableImport:
         watch("checking", 0.0)
     if layout == "ranges":
         usable, reading = _plain_ranges(tables, source, unusable, total), None
+        check_units(tables, _sample(source, usable), None)
     else:
         usable, reading = _from_stamps(tables, source, protocol, unusable, total, notes)
     return TableImport(
@@ -129,7 +131,10 @@ def _from_stamps(
     _half(tables, unusable, total)
     if counter != "wrapped":
         notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
-    return usable, _reading(tables, _sample(source, usable), Reading(chosen, bits), notes)
+    sample = _sample(source, usable)
+    reading = _reading(tables, sample, Reading(chosen, bits), notes)
+    check_units(tables, sample, reading)
+    return usable, reading
 
 
 def _half(tables: StagedTables, unusable: Unusable, total: int) -> None:
@@ -143,7 +148,7 @@ def _sample(source: RowSource, usable: Usable) -> Rows:
     """Return some of the rows that can be used, drawn by chance."""
     random = np.random.default_rng(0)
     chosen = np.sort(random.choice(usable.count, min(SAMPLE, usable.count), replace=False))
-    return source.at(usable.places(chosen), (*STAMPS, "gt_range_m", "skew2"))
+    return source.at(usable.places(chosen), (*STAMPS, *LEVELS, *DISTANCES))
 
 
 def _reading(tables: StagedTables, rows: Rows, reading: Reading, notes: list[str]) -> Reading:

@@ -17,13 +17,30 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, DISTANCES, EVENT, ISO, LAYOUTS, STAMP_UNITS
+from uwblink.importers.column_map import (
+    ASKED,
+    DISTANCE_UNITS,
+    DISTANCES,
+    EVENT,
+    IDS,
+    ISO,
+    LAYOUTS,
+    POWERS,
+    STAMP_UNITS,
+    TIME_UNITS,
+)
 from uwblink.importers.guess_columns import OF_MESSAGES, named_columns, placed, stamp_and_event
 from uwblink.importers.stamps import how_counted, stamps_of
 from uwblink.importers.table import Table
-from uwblink.importers.trials import CLEARLY, SAMPLE, Reading, Sample, Trial
+from uwblink.importers.trials import CLEARLY, GOOD_ENOUGH, SAMPLE, Reading, Sample, Trial
+from uwblink.importers.units import ENOUGH_ROWS, doubted_dbm, doubted_metres
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.twr import STAMPS
+
+FULL: Final = 0.9
+"""Share of a counter that some of 22 stamps pass in nine tables of ten, if they are ticks of it."""
+
+_ANY_UNIT: Final = f"of any unit: write {', '.join(STAMP_UNITS)}"
 
 RECORDING: Final = ".uwb"
 
@@ -32,12 +49,12 @@ RECORDING: Final = ".uwb"
 class Guess:
     """A map as TOML text with its reasons as comments, and whether it is enough to import the table.
 
-    `assumed` are ids that no column names: the map says 1 and 2, which somebody who knows must change.
+    `asked` are keys that the table does not tell: the map says "?" there, which somebody who knows must replace.
     """
 
     text: str
     complete: bool
-    assumed: tuple[str, ...] = ()
+    asked: tuple[str, ...] = ()
 
 
 def guess_map(path: Path) -> Guess:
@@ -62,8 +79,13 @@ def guess_map(path: Path) -> Guess:
         stamps, unit, delays = _stamp_lines(columns, cells, layout)
         top, units = top + stamps, unit + units
     named = [f"{name} = {json.dumps(header)}" for name, header in columns.items() if _belongs(name, layout)]
-    missing = [name for name in ("from_id", "to_id") if name not in columns]
-    constants = [f"{name} = {k}  # no column names it; say who it is" for k, name in enumerate(missing, start=1)]
+    missing = [name for name in IDS if name not in columns]
+    constants = [
+        f'{name} = "{ASKED}"  # no column is seen to name {IDS[name]}: write a number or a word for all rows, or the '
+        "column above"
+        for name in missing
+    ]
+    asked = [*missing, *(line.split()[0] for line in [*top, *units] if f'= "{ASKED}"' in line)]
     left = [name for name in table.names if name not in columns.values()]
     # Names are a stranger's, and a line break in one would end the comment.
     lines = [
@@ -85,7 +107,7 @@ def guess_map(path: Path) -> Guess:
         len(mixed) > 1
     )
     lines += delays or ["# what was programmed into the devices is not in the table: [antenna_delays] says it"]
-    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2, tuple(missing))
+    return Guess("\n".join(lines) + "\n", layout != "nothing" and not lacking and len(mixed) < 2, tuple(asked))
 
 
 _NEEDED: Final = {
@@ -131,23 +153,29 @@ def _stamp_lines(
     whole = all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
     ended = {_suffix(columns[name], STAMP_UNITS) for name in names}
     if layout != "exchanges":
-        unit = next(iter(ended - {None}), None) or ("ticks" if whole else "ns")
-        bits, counter = how_counted({n: c * STAMP_UNITS[unit] for n, c in stamps.items()}, None, None)
-        why = "whole numbers" if whole else "not whole numbers"
+        named = next(iter(ended - {None}), None)
+        bits, counter = how_counted({n: c * STAMP_UNITS[named or "ticks"] for n, c in stamps.items()}, None, None)
+        largest = max(float(np.nanmax(column, initial=0.0)) for column in stamps.values())
+        full = whole and FULL * 2.0**bits < largest < 2.0**bits
+        unit = named or ("ticks" if full else ASKED)
+        why = "by the columns' names" if named else f"whole numbers up to 2^{bits}" if full else _ANY_UNIT
         return [f"bits = {bits}", f'counter = "{counter}"'], [f'stamps = "{unit}"  # {why}'], []
     units = [u for u in ended if u] or (["ticks", "ns", "us", "s", "ps"] if whole else ["ns", "us", "s", "ps", "ticks"])
     metres = DISTANCE_UNITS[min(_distance_units(columns), default="m")]
     trials = [trial for unit in units for trial in _trials(stamps, cells, unit, metres)]
     unit, counter, best = max(trials, key=lambda found: round(found[2].plausible, 2))
-    sure = best.plausible >= CLEARLY
+    sure, known = best.plausible >= CLEARLY, best.plausible >= GOOD_ENOUGH
     share = f"{100 * best.plausible:.0f} % of its ranges are plausible, {best.low_m:.3g} to {best.high_m:.3g} m"
     lines = [
-        f'protocol = "{best.reading.protocol}"  # {share}' + ("" if sure else "; check columns and units"),
+        f'protocol = "{best.reading.protocol if known else ASKED}"  # {share}'
+        + ("" if sure else "; check columns and units"),
         f"bits = {best.reading.bits}  # the stamps fit",
         f'counter = "{counter}"',
     ]
     why = "by the columns' names" if ended - {None} else "whole numbers" if whole else "as ranges are plausible"
     delays = ["[antenna_delays]  # by the true distances nothing was programmed into the devices", "tx = 0", "rx = 0"]
+    if not known and not ended - {None}:
+        unit, why = ASKED, _ANY_UNIT
     return lines, [f'stamps = "{unit}"  # {why}'], ["", *delays] if best.reading.undelayed else []
 
 
@@ -178,8 +206,13 @@ def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:
         unit, why = _time_unit(columns["time_s"], cells["time_s"])
         lines.append(f'time = "{unit}"  # {why}')
     units = _distance_units(columns)
-    if len(units) == 1 and units != {"m"}:
-        lines.append(f'distance = "{units.pop()}"  # by the columns\' names')
+    if len(units) == 1:
+        lines += [f'distance = "{unit}"  # by the columns\' names' for unit in units]
+    elif not units and "range_m" in cells and (why := doubted_metres(cells["range_m"])):
+        lines.append(f'distance = "{ASKED}"  # ranges are {why}: write {", ".join(DISTANCE_UNITS)}')
+    doubts = [doubted_dbm(cells[name]) for name in POWERS if name in cells]
+    if why := next(filter(None, doubts), ""):
+        lines.append(f'power = "{ASKED}"  # powers are {why}: write -dBm where they lack their sign')
     return lines
 
 
@@ -199,7 +232,9 @@ def _time_unit(header: str, values: Floats) -> tuple[str, str]:
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
         if largest > least:
             return unit, f"{largest:.3g} would be no date in seconds"
-    return "s", f"numbers up to {largest:.6g}"
+    if len(values) < ENOUGH_ROWS or not np.array_equal(values, np.rint(values), equal_nan=True):
+        return "s", f"numbers up to {largest:.6g}"
+    return ASKED, f"whole numbers up to {largest:.6g}, of any unit: write {', '.join(TIME_UNITS)}"
 
 
 def _suffix(header: str, units: Iterable[str]) -> str | None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from itertools import product
 from typing import Final
 
 import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.importers.column_map import EVENT, POSITIONS
-from uwblink.importers.guess_words import END, PATTERNS, numbered, plain
+from uwblink.importers.guess_words import DEVICE, END, ID, PATTERNS, TWO_ENDS, numbered, plain
 from uwblink.importers.table import Table
 from uwblink.importers.trials import CLEARLY
 from uwblink.twr import STAMPS
@@ -82,9 +83,9 @@ def placed(columns: dict[str, str], cells: dict[str, Floats]) -> tuple[dict[str,
 
 def named_columns(names: Iterable[str]) -> dict[str, str]:
     """Return which column each of our names is, raw ones before others, first ones before later ones."""
-    found: dict[str, str] = {}
     listed = sorted(names, key=lambda name: "raw" not in name.lower())
     called = numbered({name: plain(name) for name in listed})
+    found = _ends(called)
     for ours, pattern in PATTERNS.items():
         whole = re.compile(f"({pattern}){END}")
         for header in listed:
@@ -92,6 +93,20 @@ def named_columns(names: Iterable[str]) -> dict[str, str]:
                 found[ours] = header
                 break
     return found
+
+
+def _ends(called: dict[str, str]) -> dict[str, str]:
+    """Return which columns are of the two devices where these are called alike, as `node_i` and `node_j`."""
+    for words in product(TWO_ENDS, ("{0}_?{1}", "{0}{2}_{1}", "{0}_?{1}{2}")):
+        (one, other), form = words
+        ends = []
+        for letter in (one, other):
+            whole = re.compile(form.format(f"({DEVICE})", letter, ID))
+            ends.append([header for header, name in called.items() if whole.fullmatch(name)])
+        stems = [{called[header][:2] for header in headers} for headers in ends]
+        if all(len(headers) == 1 for headers in ends) and stems[0] == stems[1]:
+            return {"from_id": ends[0][0], "to_id": ends[1][0]}
+    return {}
 
 
 def _free(ours: str, header: str, found: dict[str, str]) -> bool:

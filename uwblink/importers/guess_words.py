@@ -10,7 +10,13 @@ from typing import Final
 from uwblink.importers.column_map import POSITIONS
 
 END: Final = r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|dbm|db|ppm))*"
-_ID: Final = r"(_?(id|addr|address|mac|name))?"
+ID: Final = r"(_?(id|addr|address|mac|name))?"
+DEVICE: Final = (
+    r"(tag|node|device|dev|board|robot|agent|anchor|module|modul|radio|unit|uwb|id|addr|address|mac|geraet|knoten)"
+)
+TWO_ENDS: Final = (("a", "b"), ("i", "j"), ("1", "2"), ("0", "1"), ("one", "two"))
+"""How the two ends of a range are told apart where both are called alike."""
+
 _RANGE: Final = r"(range|dist|distance|abstand|distanz|entfernung)"
 _TRUE: Final = (
     r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|laser|"
@@ -42,10 +48,10 @@ PATTERNS: Final = {
         r"(ros_?|host_?|unix_?|utc_?|mess_?)?"
         r"(time|timestamp|stamp|t|datetime|date(_?time)?|epoch|zeit|zeitstempel|uhrzeit|datum)(_(utc|iso))?"
     ),
-    "from_id": rf"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|quelle|von|id_?(from|von)|id_?1){_ID}",
+    "from_id": rf"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|quelle|von|id_?(from|von)|id_?1){ID}",
     "to_id": (
         r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|ziel|an|nach|anker|"
-        rf"empf(ae|a)nger|id_?(to|an|nach)|id_?2){_ID}"
+        rf"empf(ae|a)nger|id_?(to|an|nach)|id_?2){ID}"
     ),
     "tx1": _OF_TIME + r"(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
     "rx1": _OF_TIME + r"(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCES, EVENT, IDS, ISO, NAMES, TIME_UNITS, ColumnMap
+from uwblink.importers.column_map import DISTANCES, EVENT, IDS, ISO, NAMES, POWERS, TIME_UNITS, ColumnMap
 from uwblink.importers.ids import Numbering
 from uwblink.importers.staging import Kept, Stage
 from uwblink.importers.stamps import NEVER, whole
@@ -115,6 +115,8 @@ class StagedFile:
         for name in DISTANCES:
             if name in cells:
                 cells[name] = cells[name] * self.column_map.metres_per_unit
+        if self.column_map.power_sign < 0:
+            cells |= {name: -cells[name] for name in POWERS if name in cells}
         words = {name: _words(piece(kept, ["r"])["r"]) for name, kept in self.words.items()}
         if numbering.known is not None:
             words |= {n: np.full(count, v) for n, v in self.column_map.constants.items() if isinstance(v, str)}

@@ -1,5 +1,6 @@
 """What a table is taken for, and that the map says so in words that work."""
 
+import numpy as np
 import pytest
 
 from tests import processes
@@ -8,6 +9,7 @@ from tests.uwblink.importers.test_table_forms import HEADER, as_messages, flight
 from uwblink.importers.column_map import load_map
 from uwblink.importers.exchange_tables import read_table
 from uwblink.importers.guess import guess_map
+from uwblink.recording.contents import load
 from uwblink.ticks import TICKS_PER_SECOND
 
 POLL = ("poll_tx", "poll_rx", "resp_tx", "resp_rx", "final_tx", "final_rx")
@@ -60,7 +62,7 @@ def test_what_is_not_there_is_said(tmp_path):
     guess = guess_map(path)
     assert not guess.complete
     assert "neither stamps nor ranges were recognised" in guess.text
-    assert "from_id = 1  # no column names it" in guess.text
+    assert guess.asked == ("from_id", "to_id")
     assert '# not used: "colour"' in guess.text
 
 
@@ -77,7 +79,9 @@ def test_hostile_names_stay_text(tmp_path):
 def test_the_public_table_of_single_sided_ranges(tmp_path):
     guess = guess_map(shared("hanyang_sstwr.csv.gz"))
     assert guess.complete
-    (tmp_path / "map.toml").write_text(guess.text)
+    assert guess.asked == ("from_id",)
+    said = guess.text.replace('from_id = "?"', "from_id = 1")
+    (tmp_path / "map.toml").write_text(said)
     found = load_map(tmp_path / "map.toml")
     assert (found.protocol, found.bits, found.layout) == ("ss", 32, "exchanges")
     assert [found.columns[n] for n in ("tx1", "rx1", "tx2", "rx2")] == [f"{name}_ticks" for name in POLL[:4]]
@@ -131,7 +135,7 @@ def test_places_beside_ranges(tmp_path, mine, other):
 
     rows = []
     for k in range(30):
-        row = {"t": k, "tag_id": 1, "anchor_id": 2, "range": (9 + k * k) ** 0.5 + 0.25}
+        row = {"t_s": k, "tag_id": 1, "anchor_id": 2, "range": (9 + k * k) ** 0.5 + 0.25}
         row |= {called(mine, axis): v for axis, v in zip("xyz", (k, 0, 1), strict=True)}
         rows.append(row | {called(other, axis): v for axis, v in zip("xyz", (0, 3, 1), strict=True)})
     path = write(tmp_path / "t.csv", rows)
@@ -145,7 +149,7 @@ def test_places_beside_ranges(tmp_path, mine, other):
 
 def test_places_that_cannot_be_used_are_left_out_and_it_is_said(tmp_path):
     rows = [
-        {"t": k, "src": 1, "dst": 2, "dist_mm": 1000 * (9 + k * k) ** 0.5}
+        {"t_s": k, "src": 1, "dst": 2, "dist_mm": 1000 * (9 + k * k) ** 0.5}
         | dict(zip(("tag_x", "tag_y", "tag_z", "anchor_x", "anchor_y", "anchor_z"), (k, 0, 1, 0, 3, 1), strict=True))
         for k in range(30)
     ]
@@ -210,7 +214,7 @@ def test_messages_that_are_counted_from_zero(tmp_path, third):
 
 
 def test_distances_in_two_units_are_not_read_as_one(tmp_path):
-    table = [{"t": k, "src": 1, "dst": 2, "range_cm": 300 + k, "gt_m": 3.0} for k in range(30)]
+    table = [{"t_s": k, "src": 1, "dst": 2, "range_cm": 300 + k, "gt_m": 3.0} for k in range(30)]
     guess = guess_map(write(tmp_path / "t.csv", table))
     assert not guess.complete
     assert "# distances have one unit for all, here they have cm, m: convert some" in guess.text
@@ -235,14 +239,79 @@ def test_messages_that_are_words_are_told_by_their_order(tmp_path):
     [({"src": 1, "dst": 2}, "look at it"), ({"src": 1}, "say to_id in it"), ({}, "say from_id and to_id")],
 )
 def test_the_command_says_what_to_do_and_how_to_go_on(tmp_path, ids, todo):
-    write(tmp_path / "my log.csv", [{"t": k, **ids, "range_m": 3.0} for k in range(30)])
+    write(tmp_path / "my log.csv", [{"t_s": k, **ids, "range_m": 3.0} for k in range(30)])
     said = processes.run("uwblink", "import", "guess", "my log.csv", "-o", "map.toml", cwd=tmp_path).stdout
     assert said.startswith(f"map.toml: {todo}")
     assert said.endswith(", then uwblink import csv 'my log.csv' --map map.toml -o 'my log'.uwb\n")
 
 
 def test_words_for_ids_are_told_with_their_numbers(tmp_path):
-    rows = [{"t": k, "src": chr(65 + k % 13), "dst": chr(66 + k % 13), "range_m": 3.0} for k in range(60)]
+    rows = [{"t_s": k, "src": chr(65 + k % 13), "dst": chr(66 + k % 13), "range_m": 3.0} for k in range(60)]
     (note,) = guessed(tmp_path, write(tmp_path / "t.csv", rows)).meta["notes"]
     assert note.startswith("14 ids are words or too large, and get numbers: A = 1, B = 2,")
     assert note.endswith(", L = 12 and 2 more")
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [
+        ("tag_a", "tag_b"), ("node_i", "node_j"), ("TagA", "TagB"), ("id_0", "id_1"), ("node_id_1", "node_id_2"),
+        ("robot 1 id", "robot 2 id"), ("MAC_1", "MAC_2"),
+    ],
+)  # fmt: skip
+def test_ends_that_are_called_alike(tmp_path, ends):
+    """Twelve pairs stay twelve."""
+    pairs = [(one, two) for one in range(1, 5) for two in range(1, 5) if one != two]
+    rows = [{"t_s": k, **dict(zip(ends, pairs[k % 12], strict=True)), "range_m": 3 + k / 7} for k in range(60)]
+    e = guessed(tmp_path, write(tmp_path / "t.csv", rows)).exchanges
+    assert list(zip(e.initiator.tolist(), e.target.tolist(), strict=True)) == pairs * 5
+
+
+def command(*words):
+    return processes.run("uwblink", "import", *words)
+
+
+@pytest.mark.parametrize(
+    ("row", "asked", "answer"),
+    [
+        ({"t_s": 0.5, "range_m": 3.01}, "from_id", '"?"'),
+        ({"t": 1, "src": 1, "dst": 2, "range_m": 3.01}, "time", "ms"),
+        ({"t_s": 0.5, "src": 1, "dst": 2, "range": 1500}, "distance", "mm"),
+        ({"t_s": 0.5, "src": 1, "dst": 2, "range": 1500.25}, "distance", "mm"),
+        ({"t_s": 0.5, "src": 1, "dst": 2, "range_m": 3.01, "rssi": 84}, "power", "-dBm"),
+    ],
+)
+def test_what_a_table_does_not_tell_is_asked_for(tmp_path, row, asked, answer):
+    """The map as it was guessed imports nothing, and nor does one without the line; one with an answer does."""
+    rows = [{n: v + k if n in ("t", "range", "t_s") else v for n, v in row.items()} for k in range(40)]
+    path, map_file = write(tmp_path / "t.csv", rows), tmp_path / "map.toml"
+    assert command("guess", path, "-o", map_file).returncode == 0
+    text = map_file.read_text()
+    assert f'{asked} = "?"' in text
+    done = command("csv", path, "--map", map_file, "-o", tmp_path / "o.uwb")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert asked in done.stderr
+    assert not (tmp_path / "o.uwb").exists()
+    if answer == '"?"':
+        return
+    if asked != "time":
+        map_file.write_text(text.replace(f'{asked} = "?"', "#"))
+        assert f"units.{asked}" in command("csv", path, "--map", map_file, "-o", tmp_path / "o.uwb").stderr
+    map_file.write_text(text.replace(f'{asked} = "?"', f'{asked} = "{answer}"'))
+    assert command("csv", path, "--map", map_file, "-o", tmp_path / "o.uwb").returncode == 0
+    found = load(tmp_path / "o.uwb")
+    assert found.exchanges.time_ns[1] - found.exchanges.time_ns[0] == (10**6 if asked == "time" else 10**9)
+    if asked == "distance":
+        assert found.exchanges.range_m[0] == pytest.approx(1.5, abs=0.001)
+    if asked == "power":
+        assert set(found.powers["rxp2_dbm"]) == {-84.0}
+
+
+def test_neither_protocol_nor_unit_is_made_up(tmp_path):
+    random = np.random.default_rng(0)
+    names = ("tx1", "rx1", "tx2", "rx2")
+    rows = [{"src": 1, "dst": 2, **dict(zip(names, random.random(4), strict=True))} for _ in range(60)]
+    assert guess_map(write(tmp_path / "t.csv", rows)).asked == ("protocol", "stamps")
+    rows = [{"src": 1, "dst": 2, "msg": 1 + k % 2, "tx": 0.5 * k, "rx": 0.7 * k} for k in range(60)]
+    assert guess_map(write(tmp_path / "m.csv", rows)).asked == ("stamps",)

@@ -1,0 +1,114 @@
+"""Lengths and powers whose unit nobody said: whether they can be what they are taken for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+
+from uwblink.arrays import Floats
+from uwblink.errors import ImportTableError
+from uwblink.importers.column_map import DISTANCE_UNITS, POWERS, REGISTER_MAX
+from uwblink.importers.exchange_rows import exchanges_of, optional, truth_m
+from uwblink.importers.staged_tables import StagedTables
+from uwblink.importers.table_rows import Rows
+from uwblink.importers.trials import Reading
+from uwblink.ticks import METRES_PER_TICK
+from uwblink.twr import raw_range
+
+ENOUGH_ROWS: Final = 20
+"""Fewer ranges may agree with anything."""
+
+FARTHEST_M: Final = 300.0
+"""How far DW1000 devices reach: 290 m in the open by their data sheet."""
+
+LONGEST_DELAY_M: Final = REGISTER_MAX * METRES_PER_TICK
+"""How much longer or shorter ranges can be by antenna delays: all that registers hold, at both ends."""
+
+Errors = Callable[[float], Floats]
+"""Ranges less distances, in metres (n,), if some lengths are multiplied by a factor."""
+
+
+def other_unit(errors: Mapping[str, Errors]) -> tuple[str, str] | None:
+    """Return which lengths are in which other unit than metres, where that explains the ranges; else None.
+
+    `errors` are by the name of the lengths that are multiplied. What remains of errors beside a constant (antenna
+    delays) is compared: in another unit it must be less by more than the root of the unit's factor, that is nearer to
+    what the factor would make of it than to what it is. Distances that have nothing to do with the ranges come down to
+    the ranges' own spread, by the root of two at most.
+    """
+    plain = {name: _remaining(of(1.0)) for name, of in errors.items()}
+    best, found = 0.0, None
+    for name, of in errors.items():
+        for unit, factor in DISTANCE_UNITS.items():
+            if factor == 1.0 or not np.isfinite(plain[name]):
+                continue
+            remaining = max(_remaining(of(factor)), METRES_PER_TICK)
+            gain = np.log(plain[name] / remaining) if plain[name] > 0 else 0.0
+            if gain > max(best, -np.log(factor) / 2):
+                best, found = gain, (name, unit)
+    return found
+
+
+def _remaining(errors_m: Floats) -> float:
+    """Return the median size of errors beside a constant that antenna delays can make; NaN of few."""
+    finite = errors_m[np.isfinite(errors_m)]
+    if len(finite) < ENOUGH_ROWS:
+        return float("nan")
+    constant = np.clip(np.median(finite), -LONGEST_DELAY_M, LONGEST_DELAY_M)
+    return float(np.median(np.abs(finite - constant)))
+
+
+def doubted_metres(ranges: Floats) -> str:
+    """Return why numbers (n,) can be no ranges in metres; nothing where they can be."""
+    finite = ranges[np.isfinite(ranges)]
+    if len(finite) < ENOUGH_ROWS:
+        return ""
+    middle = float(np.median(np.abs(finite)))
+    if middle > FARTHEST_M:
+        return f"{middle:.6g} in the middle, farther than devices reach in metres"
+    # Noise of centimetres leaves no range a whole number of metres, those that repeat one number aside.
+    if len(np.unique(finite)) > ENOUGH_ROWS // 4 and np.array_equal(finite, np.rint(finite)):
+        return "whole numbers all, as no ranges in metres are"
+    return ""
+
+
+def doubted_dbm(powers: Floats) -> str:
+    """Return why numbers (n,) can be no received powers in dBm; nothing where they can be."""
+    finite = powers[np.isfinite(powers) & (powers != 0)]  # boards that cannot tell a power print 0
+    middle = float(np.median(finite)) if len(finite) else -1.0
+    # What may be sent is -41.3 dBm/MHz, -14 dBm in 500 MHz.
+    return f"{middle:+.4g} in the middle, and no received power is above 0 dBm" if middle > 0 else ""
+
+
+def check_units(tables: StagedTables, rows: Rows, reading: Reading | None) -> None:
+    """Raise `ImportTableError` where some rows of a table say that lengths or powers are in another unit.
+
+    What is wrong by itself is asked for unless the map says the unit; lengths that contradict each other are refused.
+    """
+    column_map = tables.column_map
+    where = {name: f"{tables.paths[0]}: column {column_map.header(name)!r}" for name in ("range_m", *POWERS)}
+    for name in POWERS:
+        if column_map.power_unit is None and (why := doubted_dbm(optional(rows, name))):
+            raise ImportTableError(
+                f'{where[name]}: its powers are {why}; say units.power in the map: "-dBm" where they lack their sign'
+            )
+    ranges, true = optional(rows, "range_m"), truth_m(rows)
+    if column_map.distance_unit is None and (why := doubted_metres(ranges)):
+        raise ImportTableError(f"{where['range_m']}: its ranges are {why}; say units.distance in the map")
+    if reading is None:
+        errors: dict[str, Errors] = {
+            "ranges": lambda f: f * ranges - true,
+            "true distances": lambda f: ranges - f * true,
+        }
+    else:
+        raw = raw_range(exchanges_of(rows, reading, 0))
+        errors = {"ranges": lambda f: raw - f * ranges, "true distances": lambda f: raw - f * true}
+    found = other_unit(errors)
+    if found:
+        beside = "its stamps" if reading else "the others"
+        raise ImportTableError(
+            f"{tables.paths[0]}: {found[0]} are in {found[1]} by {beside}, and in {column_map.distance_unit or 'm'} by "
+            "the map; units.distance says one unit for all ranges, true distances and positions"
+        )
