@@ -1,13 +1,11 @@
 """A recording as one MCAP file of JSON messages for Foxglove and PlotJuggler: poses, frames, ranges, readings, faults.
 
-The format is that of the MCAP specification, version 0: records of an opcode, a length and a content, little-endian.
-The file has no index; readers walk it from the beginning. Poses, frames and logs have the schemas that Foxglove knows.
+Poses, frames and logs have the schemas that Foxglove knows.
 """
 
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from heapq import merge
@@ -15,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import numpy as np
+from mcap.writer import Writer
 
 from uwblink.arrays import Floats
 from uwblink.errors import RecordingError
@@ -24,8 +23,6 @@ from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.pieces import READING_MB, distances_by_poses_m, pieces
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x0F
 WORLD: Final = "world"
 WARNING: Final = 3
 """The level of a foxglove.Log that faults have."""
@@ -51,42 +48,27 @@ def _messages(recording: Recording) -> Iterator[Message]:
 
 
 def _write(recording: Path, file: BinaryIO, messages: Iterator[Message]) -> int:
-    file.write(MAGIC)
-    _record(file, HEADER, _text("") + _text("uwbcal"))
-    for number, (name, layout) in enumerate(SCHEMAS.items(), start=1):
-        data = json.dumps(layout).encode()
-        _record(file, SCHEMA, struct.pack("<H", number) + _text(name) + _text("jsonschema") + _bytes(data))
+    writer = Writer(file)
+    writer.start(library="uwbcal")
+    schemas = {
+        name: writer.register_schema(name, "jsonschema", json.dumps(layout).encode())
+        for name, layout in SCHEMAS.items()
+    }
     channels: dict[str, int] = {}
     count = 0
     for time_ns, topic, schema, content in messages:
         if time_ns < 0:
             raise RecordingError(f"{recording}: has times before 1970, which MCAP cannot hold")
         if topic not in channels:
-            channels[topic] = len(channels) + 1
-            ids = struct.pack("<HH", channels[topic], list(SCHEMAS).index(schema) + 1)
-            _record(file, CHANNEL, ids + _text(topic) + _text("json") + struct.pack("<I", 0))
+            channels[topic] = writer.register_channel(topic, "json", schemas[schema])
         try:
             data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
         except ValueError as error:
             raise RecordingError(f"{recording}: {topic}: holds a number that is none, which JSON cannot say") from error
-        _record(file, MESSAGE, struct.pack("<HIQQ", channels[topic], count & 0xFFFFFFFF, time_ns, time_ns) + data)
+        writer.add_message(channels[topic], time_ns, data, time_ns, count & 0xFFFFFFFF)
         count += 1
-    _record(file, DATA_END, struct.pack("<I", 0))
-    _record(file, FOOTER, struct.pack("<QQI", 0, 0, 0))
-    file.write(MAGIC)
+    writer.finish()  # type: ignore[no-untyped-call]  # the library does not say what it returns
     return count
-
-
-def _record(file: BinaryIO, opcode: int, content: bytes) -> None:
-    file.write(struct.pack("<BQ", opcode, len(content)) + content)
-
-
-def _bytes(data: bytes) -> bytes:
-    return struct.pack("<I", len(data)) + data
-
-
-def _text(text: str) -> bytes:
-    return _bytes(text.encode())
 
 
 def _vector(x: float, y: float, z: float) -> dict[str, float]:
