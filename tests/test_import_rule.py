@@ -34,6 +34,7 @@ CONFINED = {
             "uwbsim/twins/fitting.py",
         }
     ),
+    "yaml": lambda path: path == "uwblink/importers/miluv_yaml.py",
     "mcap": lambda path: path in {"uwblink/importers/json_mcap.py", "uwblink/exporters/mcap.py"},
     "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/rosbag2.py"},
     "foxglove": lambda path: path == "uwblink/streaming/foxglove_server.py",

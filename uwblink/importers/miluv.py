@@ -94,5 +94,5 @@ def _start_ns(folder: Path) -> int:
     table = read_mapping(path)
     try:
         return int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"])
-    except (KeyError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ImportTableError(f"{path}: expected whole numbers timeshift_s and timeshift_ns") from error

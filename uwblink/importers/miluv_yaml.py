@@ -1,61 +1,47 @@
-"""The YAML files of the MILUV dataset: one level of plain values, or two levels down to vectors.
-
-They are that simple that YAML itself, with its tags and references, is not needed to read them.
-"""
+"""The YAML files of the MILUV dataset: plain values by name, and vectors by name and number."""
 
 from __future__ import annotations
 
-import re
+import reprlib
 from pathlib import Path
-from typing import Final
+from typing import Any
 
-from uwblink.errors import ImportTableError
+import yaml
+
+from uwblink.errors import ImportTableError, first_line
 from uwblink.text_files import read_text
 
 Vector = tuple[float, float, float]
 
-_LINE: Final = re.compile(
-    r"""^(?P<indent> *)["']?(?P<key>[^"':#]+)["']?\s*:\s*["']?(?P<value>[^"'#]*)["']?\s*(#.*)?$"""
-)
 
-
-def read_mapping(path: Path) -> dict[str, str]:
-    """Return keys and values of a file of `key: value` lines; raises `ImportTableError`."""
-    return {key: value for _, indent, key, value in _lines(path) if not indent and value}
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Return a YAML file whose top level is a mapping; raises `ImportTableError`."""
+    try:
+        table = yaml.safe_load(read_text(path, ImportTableError))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ImportTableError(f"{path}: not YAML ({first_line(error)})") from error
+    if not isinstance(table, dict):
+        raise ImportTableError(f"{path}: expected names and values, as in `name: value`")
+    return {str(name): value for name, value in table.items()}
 
 
 def read_vectors(path: Path) -> dict[str, dict[int, Vector]]:
-    """Return three numbers by name and number, from lines `name:` and below each `number: "[x, y, z]"`.
+    """Return vectors of three numbers by name and number; each is a list, or text such as "[1.0, 2.0, 3.0]".
 
-    Raises `ImportTableError` with the line.
+    Raises `ImportTableError`.
     """
     found: dict[str, dict[int, Vector]] = {}
-    group: dict[int, Vector] | None = None
-    for number, indent, key, value in _lines(path):
-        if not indent and not value:
-            group = found.setdefault(key, {})
-            continue
-        cells = value.strip("[]").split(",")
-        try:
-            x, y, z = (float(cell) for cell in cells)
-            if group is None or not indent:
-                raise ValueError
-            group[int(key)] = (x, y, z)
-        except ValueError as error:
-            raise ImportTableError(
-                f"{path}: row {number}: found {key[:20]}: {value[:40]!r}, expected a number and [x, y, z] below a name"
-            ) from error
-    return found
-
-
-def _lines(path: Path) -> list[tuple[int, int, str, str]]:
-    text = read_text(path, ImportTableError)
-    found = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        match = _LINE.fullmatch(line)
-        if match is None:
-            raise ImportTableError(f"{path}: row {number}: found {line[:60]!r}, expected key: value")
-        found.append((number, len(match["indent"]), match["key"].strip(), match["value"].strip()))
+    for name, group in read_mapping(path).items():
+        if not isinstance(group, dict):
+            raise ImportTableError(f"{path}: {name[:40]}: expected numbers, each with [x, y, z]")
+        found[name] = {}
+        for number, value in group.items():
+            cells = value.strip("[] ").split(",") if isinstance(value, str) else value
+            try:
+                x, y, z = (float(cell) for cell in cells)
+                found[name][int(number)] = (x, y, z)
+            except (TypeError, ValueError) as error:
+                raise ImportTableError(
+                    f"{path}: {name[:40]}: {str(number)[:20]}: found {reprlib.repr(value)[:40]}, expected [x, y, z]"
+                ) from error
     return found

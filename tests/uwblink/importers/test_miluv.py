@@ -201,7 +201,7 @@ def broken(folder, name):
         ("no constellation fits", "choose one of 0, 1"),
         ("a column is missing", "column 'rx3_raw' is missing"),
         ("no robots", "no folder in it holds uwb_range.csv"),
-        ("a vector of two", "row 2: found 10: '[1, 2]'"),
+        ("a vector of two", "tags.yaml: ifo001: 10: found '[1, 2]'"),
         ("a time that is none", "timeshift_s and timeshift_ns"),
     ],
 )
