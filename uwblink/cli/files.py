@@ -109,6 +109,7 @@ def poses(
     topic: Annotated[
         list[str] | None, typer.Option(help="BODY=TOPIC of a bag, as often as needed; else found by their names.")
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the poses that the recording has.")] = False,
 ) -> None:
     """Add motion-capture truth to a recording of boards."""
     from uwblink.importers import add_poses
@@ -116,7 +117,7 @@ def poses(
     files = _files(source)
     topics = _pairs("topic", topic) if topic else None
     with waiting("adding poses"):
-        found = add_poses(recording, files, offset=offset, tags_from=tags, body=body, topics=topics)
+        found = add_poses(recording, files, offset=offset, tags_from=tags, body=body, topics=topics, force=force)
     typer.echo(
         f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
         f"{found.covered} of {found.exchanges} exchanges have a true distance"

@@ -1,5 +1,6 @@
 """Motion-capture poses from files, and the offset of their clock."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from uwblink.importers.motion_capture import add_poses
 from uwblink.importers.pose_columns import poses_of_table
 from uwblink.importers.poses import _READERS, _as_poses, _at_once, read_poses
 from uwblink.importers.table import Table
+from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
+from uwblink.twr import STAMPS
 from uwbsim.boards.live_poses import LivePoses
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate
@@ -109,8 +112,6 @@ def flight(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flight")
     scenario = load(TEST1, ["run.duration_s=20"])
     simulated = simulate(scenario)
-    from dataclasses import replace
-
     e = simulated.exchanges
     nothing = replace(
         simulated.poses,
@@ -155,7 +156,7 @@ def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, tmp_pat
         (("--from", flight / "p.csv", "--offset", "500000"), "no exchange lies within"),
         (("--from", flight / "p.csv", "--tags", tmp_path / "no.toml"), "no such file"),
     ):
-        done = run(*words)
+        done = run(*words, "--force")
         assert done.returncode == 2
         assert fragment in done.stderr
         assert done.stderr.count("\n") == 1
@@ -177,3 +178,69 @@ def test_a_file_that_grows_while_it_is_read_gives_what_was_there(tmp_path, monke
     poses = poses_of_table(path, None)
     assert poses.time_ns.tolist() == [k * 10**9 for k in range(200)]
     assert poses.position_m[:, 0].tolist() == list(map(float, range(200)))
+
+
+@pytest.fixture
+def copied(flight, tmp_path):
+    path = tmp_path / "f.uwb"
+    path.write_bytes((flight / "f.uwb").read_bytes())
+    return path
+
+
+def scaled(path, factor, output):
+    """A table of poses with its positions multiplied."""
+    head, *lines = path.read_text().splitlines()
+    places = [head.split(",").index(name) for name in "xyz"]
+    rows = [line.split(",") for line in lines]
+    for row in rows:
+        for k in places:
+            row[k] = repr(float(row[k]) * factor)
+    output.write_text("\n".join([head, *map(",".join, rows)]) + "\n")
+    return output
+
+
+def test_poses_that_are_there_stay_unless_they_are_to_be_replaced(flight, copied):
+    def run(*words):
+        return processes.run("uwblink", "poses", copied, "--from", flight / "p.csv", *words)
+
+    assert run("--offset", "-3.21").returncode == 0
+    done = run("--offset", "-3.1")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "--force" in done.stderr
+    with Recording.open(copied) as recording:
+        assert recording.meta()["poses_offset_s"] == pytest.approx(-3.21)
+    assert run("--offset", "-3.1", "--force").returncode == 0
+    with Recording.open(copied) as recording:
+        assert recording.meta()["poses_offset_s"] == pytest.approx(-3.1)
+
+
+@pytest.mark.parametrize("offset", ["-3.21", "auto"])
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0), ("ft", 1 / 0.3048)])
+def test_poses_in_other_units_are_refused(flight, copied, tmp_path, unit, factor, offset):
+    other = scaled(flight / "p.csv", factor, tmp_path / "p.csv")
+    before = copied.read_bytes()
+    done = processes.run("uwblink", "poses", copied, "--from", other, "--offset", offset)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    # The wrong time leaves only what is far beyond all delays to tell the unit by.
+    assert "p.csv" in done.stderr
+    assert offset == "auto" or f"positions are in {unit}" in done.stderr
+    assert copied.read_bytes() == before
+
+
+def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_path):
+    with Recording.open(copied) as recording:
+        tags, held = recording.tags(), recording.exchanges()
+    arms = [[1000 * x for x in tag.lever_arm_m] for tag in tags]
+    heads = [f'[[tags]]\nid = {tag.tag}\nbody = "{tag.body}"' for tag in tags]
+    tables = [f"{head}\nlever_arm_m = {arm}" for head, arm in zip(heads, arms, strict=True)]
+    (tmp_path / "tags.toml").write_text("\n".join(tables) + "\n")
+    words = ("--from", flight / "p.csv", "--offset", "-3.21")
+    done = processes.run("uwblink", "poses", copied, *words, "--tags", tmp_path / "tags.toml")
+    assert done.returncode == 2
+    assert "lever arms are in mm" in done.stderr
+    none = np.zeros(len(held), dtype=np.int64)
+    bare = replace(held, range_m=1000 * held.range_m, **dict.fromkeys(STAMPS, none))
+    Contents(exchanges=bare, tags=tags).save(tmp_path / "mm.uwb")
+    done = processes.run("uwblink", "poses", tmp_path / "mm.uwb", *words)
+    assert done.returncode == 2
+    assert "ranges are in mm" in done.stderr
