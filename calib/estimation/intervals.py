@@ -35,7 +35,8 @@ def intervals(
 ) -> Intervals:
     """Return the covariance of the parameters of the design at an optimum.
 
-    `inverse` (D, D) is that of information and penalty, `prior` (D, D) the penalty as the covariance of its own pull,
+    `inverse` (D, D) is that of information and penalty, `prior` (D, D) the covariance of the penalty's pull, which is
+    the penalty itself only where the slopes of ranges are those of a likelihood, and ranges independent;
     `delays` (tags, m) turns parameters into delays, which the first `rank` stand for. Errors of delays and of curves
     may last differently.
     """
@@ -51,8 +52,10 @@ def intervals(
         factors.append(persistence(pulls[:, rank:], blocks, CURVE_SERIES))
     widths = [np.sqrt(each.factor) * each.quantile95 / NORMAL95 for each in factors]
     width = np.repeat(widths, [rank, columns - rank] if rank and columns > rank else [columns])
-    # What is fitted is fitted to these ranges: their slopes are smaller than those of others would be.
-    used = float(scores.size - np.sum(inverse * prior))
+    # Slopes at the optimum are smaller than at the truth: with information I and penalty P, the squares of so many
+    # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the parameters that the ranges determine over
+    # their number. Of n ranges n less that many are left (HC1 of MacKinnon and White 1985, for a penalised fit).
+    used = float(np.sum(inverse * scores.information()))
     fresh = len(blocks.number) / max(len(blocks.number) - used, 0.2 * len(blocks.number))
     covariance = fresh * (pulls.T @ pulls) * width[:, None] * width + reach @ prior @ reach.T
     lasting = lasting if rank else factors[-1]

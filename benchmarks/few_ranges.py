@@ -1,0 +1,48 @@
+"""Intervals of few ranges over seeds: how far delays are off beside what was promised; a table of accuracy.md.
+
+`python -m benchmarks.few_ranges` prints it. The worlds are those of `benchmarks.worlds`, ten ranges a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+import calib
+from benchmarks.worlds import FIRST_REPORTED, Recipe, make
+
+SEEDS: Final = 100
+PER_SECOND: Final = 10.0
+LASTING: Final[Mapping[str, Any]] = {"lasts_s": 1.0, "share": (0.0, 0.4)}
+
+
+def main() -> None:
+    """Print a row a world: delays are compared about their mean."""
+    print("| ranges | tags | reflections | rms (promised), ps | inside 95 % | z-scores, rms |\n" + "|---" * 6 + "|")
+    for count, tags in ((110, 3), (150, 4), (300, 4), (300, 6)):
+        for name, more in (("each range on its own", {}), ("last 1 s, share by pair", LASTING)):
+            recipe = Recipe(tags=tags, seconds=count / PER_SECOND, per_second=PER_SECOND, **more)
+            errors, stds = np.array([_one(recipe, FIRST_REPORTED + seed) for seed in range(SEEDS)]).swapaxes(0, 1)
+            scores, rms = errors / stds, [1e3 * np.sqrt(np.mean(some**2)) for some in (errors, stds)]
+            inside = 100 * np.mean(np.abs(scores) < 1.96)
+            print(
+                f"| {count} | {tags} | {name} | {rms[0]:.0f} ({rms[1]:.0f}) | {inside:.0f} % "
+                f"| {np.sqrt(np.mean(scores**2)):.2f} |"
+            )
+
+
+def _one(recipe: Recipe, seed: int) -> tuple[Any, Any]:
+    """Return errors of delays about their mean, and their printed standard errors, in ns."""
+    world = make(recipe, seed)
+    found = calib.fit(world.ranges).calibration
+    centre = np.eye(recipe.tags) - 1 / recipe.tags
+    error = centre @ [found.delays_ns[tag] - known for tag, known in world.delays_ns.items()]
+    if found.uncertainty is None:
+        raise RuntimeError("a fit without intervals")
+    return error, np.sqrt(np.diag(centre @ np.array(found.uncertainty.delays_ns2) @ centre))
+
+
+if __name__ == "__main__":
+    main()
