@@ -84,7 +84,9 @@ NEVER = {"pickle", "pandas", "pyarrow"}
 
 def violations(package: str, path: str, source: str) -> list[str]:
     names = {name.split(".")[0] for name in imports(source)}
-    wrong = names & (FORBIDDEN[package] | NEVER)
+    # A twin reads a calibration through calib's door.
+    forbidden = FORBIDDEN[package] - ({"calib"} if path == "uwbsim/twins/calibration_file.py" else set())
+    wrong = names & (forbidden | NEVER)
     wrong |= {lib for lib, allowed in CONFINED.items() if lib in names and not allowed(path)}
     return [f"{path} imports {name}" for name in sorted(wrong)]
 

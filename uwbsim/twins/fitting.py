@@ -46,6 +46,7 @@ class Twin:
     cannot tell and so keeps its default, one sentence each. `compare` simulates it beside the recording, `save` writes
     it as a file.
 
+    >>> import calib
     >>> import uwbsim
     >>> still = [{"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0)]
     >>> flight = uwbsim.simulate(
@@ -56,9 +57,7 @@ class Twin:
     ...         "tags": [{"id": 1, "body": "a"}, {"id": 2, "body": "b"}],
     ...     }
     ... )
-    >>> curve = {"knots": [0, 0, 2, 2], "coefficients": [0, 0], "degree": 1, "range": [0, 2]}
-    >>> known = {"schema_version": 1, "delays_ns": {"1": 0, "2": 0}, "alpha_dbm": -82, "lift": "mean-of-lifted"}
-    >>> found = uwbsim.twin(flight, known | {"bias_curve": curve, "speed_of_light": 299702547})
+    >>> found = uwbsim.twin(flight, calib.fit(calib.sample_flight()).calibration)
     >>> [one.name for one in found.compare(seeds=1)][:2]
     ['reply dt32', 'first-path power at target']
     """
@@ -128,10 +127,11 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     """Fit a scenario to a recording, with what a calibration knows of the devices as their truth.
 
     `recording` is a file (.uwb) or what one holds in memory (`uwblink.Contents`, a simulated flight); `calibration` its
-    file (.json), its JSON as nested tables, or an object with `to_json`. The recording needs poses, first-path powers
+    file (.json), its JSON as nested tables, or a `calib.Calibration`. The recording needs poses, first-path powers
     and some hundred exchanges. Raises `ScenarioError` where these lack or the calibration does not know all tags, and
     what `Recording.open` raises.
 
+    >>> import calib
     >>> import uwbsim
     >>> still = [{"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0)]
     >>> flight = uwbsim.simulate(
@@ -142,9 +142,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     ...         "tags": [{"id": 1, "body": "a", "skew_ppm": 3.0}, {"id": 2, "body": "b"}],
     ...     }
     ... )
-    >>> curve = {"knots": [0, 0, 2, 2], "coefficients": [0, 0], "degree": 1, "range": [0, 2]}
-    >>> known = {"schema_version": 1, "delays_ns": {"1": 0, "2": 0}, "alpha_dbm": -82, "lift": "mean-of-lifted"}
-    >>> found = uwbsim.twin(flight, known | {"bias_curve": curve, "speed_of_light": 299702547})
+    >>> found = uwbsim.twin(flight, calib.fit(calib.sample_flight()).calibration)
     >>> one, two = found.scenario.tags
     >>> round(one.skew_ppm - two.skew_ppm, 1)
     3.0

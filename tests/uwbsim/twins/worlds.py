@@ -1,5 +1,7 @@
 """Flights to make twins of, and the calibrations that know their devices."""
 
+from typing import Any
+
 import uwbsim
 
 LINE = {"knots": [0.0, 0.0, 2.0, 2.0], "coefficients": [0.0, 0.0], "degree": 1}
@@ -38,13 +40,19 @@ def world(duration_s=60.0, seed=5, rate_hz=150.0, radio=None, **more):
 def known(scenario):
     """What a calibration that found everything says, as its JSON."""
     planted = uwbsim.load(scenario).planted()
-    curve = planted["bias_curve"] or LINE
+    curve: dict[str, Any] = planted["bias_curve"] or LINE
+    shape = curve | {"range": [curve["knots"][0], curve["knots"][-1]]}
     return {
         "schema_version": 3,
         "delays_ns": planted["delays_ns"],
+        "delays_std_ns": dict.fromkeys(planted["delays_ns"], 0.0),
+        "loss": "cauchy",
+        "scale_ns": 0.1,
         "lift": "mean-of-lifted",
         "power_at": "reception",
         "alpha_dbm": -82.0,
         "speed_of_light": 299_702_547.0,
-        "bias_curve": curve | {"range": [curve["knots"][0], curve["knots"][-1]]},
+        "bias_curve": shape,
+        "sigma_curve": shape | {"coefficients": [0.05] * len(curve["coefficients"])},
+        "provenance": {},
     }
