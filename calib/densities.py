@@ -1,12 +1,13 @@
 """How likely errors of ranges are, direct and reflected, and what noise is in them: one place for all who weigh them.
 
-A direct range has normal noise, a reflected one a detour besides: a least one, and an exponential one beyond it.
+A direct range has normal noise, a reflected one a detour besides: a least one, and beyond it an exponential one, of one
+of two kinds with means of their own.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,50 +19,125 @@ ROOT_2PI: Final = float(np.sqrt(2 * np.pi))
 FARTHEST: Final = 30.0
 """Sigmas beyond which the noise in a detour no longer depends on the error."""
 
+LONG_FACTOR: Final = 4.0
+"""Mean of the second kind of detour over that of the first, where it is fitted.
+
+It is no parameter: where all detours are of one kind, its slope is zero at 1 for every range, so that nothing would say
+how far to step. Where kinds differ by another factor, the least detour, the mean and the share make up for it.
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LongDetours:
+    """The second kind of exponential detour: `share` of the reflections, `factor` times as long as the first kind.
+
+    With a share of 0 or a factor of 1 there is one kind.
+    """
+
+    share: float = 0.0
+    factor: float = 1.0
+
+    @property
+    def mean(self) -> float:
+        """Return the mean detour of both kinds over that of the first."""
+        return 1 - self.share + self.share * self.factor
+
+    @property
+    def square(self) -> float:
+        """Return the mean square of the detours of both kinds over twice the square of their mean; 1 for one kind."""
+        return (1 - self.share + self.share * self.factor**2) / self.mean**2
+
+    @property
+    def longest(self) -> float:
+        """Return the mean of the longer kind over that of both."""
+        return max(self.factor, 1.0) / self.mean if self.share else 1.0
+
+    def kinds(self, detour_m: Floats | float) -> list[tuple[float, Any]]:
+        """Return share and mean of each kind, where the mean detour of both is `detour_m`."""
+        first = detour_m / self.mean
+        if not self.share:
+            return [(1.0, first)]
+        return [(1 - self.share, first), (self.share, first * self.factor)]
+
+
+ONE_KIND: Final = LongDetours()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kind:
+    """Reflected ranges of one kind: their `density` times the kind's share, 1/m, and the noise in them.
+
+    That noise is normal, cut off above: with v = (e - least)/sigma, `ratio` = sigma/detour and u = v - ratio its mean
+    is sigma (ratio - h(u)), and its variance sigma^2 (1 - u h - h^2), where the hazard h is phi/Phi.
+    """
+
+    density: Floats
+    detour_m: Floats | float
+    noise_m: Floats
+    noise_var: Floats
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Densities:
-    """Densities of errors (n,), in 1/m, were they `direct` or `reflected`, and the noise in reflected ones.
-
-    That noise is normal, cut off above: with v = (e - least)/sigma, `ratio` = sigma/detour and `u` = v - ratio its mean
-    is sigma (ratio - h(u)), and its variance sigma^2 (1 - u h - h^2), where the `hazard` h is phi/Phi.
-    """
+    """Densities of errors (n,), in 1/m, were they `direct` or `reflected`, and the reflected ones of each kind."""
 
     direct: Floats
     reflected: Floats
     sigma_m: Floats
-    ratio: Floats
-    u: Floats
-    hazard: Floats
+    kinds: tuple[Kind, ...]
 
     def noise_m(self) -> Floats:
         """Return the mean of the noise in reflected ranges."""
-        return np.asarray(self.sigma_m * (self.ratio - self.hazard))
+        first, *others = self.kinds
+        return first.noise_m + sum(self._part(kind) * (kind.noise_m - first.noise_m) for kind in others)
 
     def noise_var(self) -> Floats:
         """Return the variance of the noise in reflected ranges, in sigmas squared."""
-        return np.asarray(np.maximum(1 - self.hazard * (self.u + self.hazard), 0.0))
+        first, *others = self.kinds
+        found = first.noise_var
+        for kind in others:
+            part, apart = self._part(kind), (kind.noise_m - first.noise_m) / self.sigma_m
+            found = found + part * (kind.noise_var - first.noise_var + (1 - part) * apart * apart)
+        return found
+
+    def _part(self, kind: Kind) -> Floats:
+        """Return how likely reflected ranges are of a kind, 0 where no kind reaches."""
+        return np.asarray(kind.density / (self.reflected + np.finfo(float).tiny))
 
 
-def densities(error_m: Floats, sigma_m: Floats, least_m: float, detour_m: Floats | float) -> Densities:
-    """Return the densities of errors (n,) under noise `sigma_m`, a least detour and an exponential one of such a mean.
+def densities(
+    error_m: Floats, sigma_m: Floats, least_m: float, detour_m: Floats | float, long: LongDetours = ONE_KIND
+) -> Densities:
+    """Return the densities of errors (n,) under noise `sigma_m`, a least detour and exponential ones of such a mean.
 
-    That of reflected ones is exp(-v^2/2) erfcx(-u/sqrt 2) / (2 detour), which does not cancel; where it overflows, far
-    beyond the noise, it is the exponential's own.
+    That of a kind is exp(-v^2/2) erfcx(-u/sqrt 2) / (2 detour), which does not cancel; where it overflows, far beyond
+    the noise, it is the exponential's own.
     """
     inverse = 1 / sigma_m
-    z, v, ratio = error_m * inverse, (error_m - least_m) * inverse, sigma_m / detour_m
-    u = v - ratio
-    scaled = erfcx(np.minimum(u, FARTHEST) * (-1 / ROOT_2))
-    reflected = np.exp(-0.5 * v * v) * scaled * (0.5 / detour_m)
-    far = u > FARTHEST
-    if np.any(far):
-        reflected = np.where(far, np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)) / detour_m, reflected)
+    z, v = error_m * inverse, (error_m - least_m) * inverse
+    normal = np.exp(-0.5 * v * v)
+    kinds = tuple(_kind(v, normal, sigma_m, share, mean_m) for share, mean_m in long.kinds(detour_m))
+    reflected = kinds[0].density if len(kinds) == 1 else kinds[0].density + kinds[1].density
     return Densities(
-        direct=np.exp(-0.5 * z * z) * (inverse / ROOT_2PI),
-        reflected=reflected,
-        sigma_m=sigma_m,
-        ratio=ratio,
-        u=u,
-        hazard=(2 / ROOT_2PI) / scaled,
+        direct=np.exp(-0.5 * z * z) * (inverse / ROOT_2PI), reflected=reflected, sigma_m=sigma_m, kinds=kinds
+    )
+
+
+def _kind(v: Floats, normal: Floats, sigma_m: Floats, share: float, detour_m: Any) -> Kind:
+    """Return reflected ranges of a kind at errors `v` (n,) beyond the least detour, in sigmas."""
+    ratio = sigma_m / detour_m
+    u = v - ratio
+    far = u > FARTHEST
+    some = bool(far.any())
+    scaled = erfcx((np.minimum(u, FARTHEST) if some else u) * (-1 / ROOT_2))
+    density = normal * scaled
+    density *= 0.5 * share / detour_m
+    if some:
+        density = np.where(far, np.exp(np.minimum(ratio * (0.5 * ratio - v), 50.0)) * (share / detour_m), density)
+    hazard = (2 / ROOT_2PI) / scaled
+    return Kind(
+        density=density,
+        detour_m=detour_m,
+        noise_m=np.asarray(sigma_m * (ratio - hazard)),
+        noise_var=np.maximum(1 - hazard * (u + hazard), 0.0),
     )

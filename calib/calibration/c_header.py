@@ -111,7 +111,8 @@ static inline int uwb_errors(double fpp1_dbm, double fpp2_dbm, int initiator, in
     *mean_error_m = (1.0 - UWB_OUTLIER_SHARE) * *tail_share * (UWB_LEAST_M + detour);
     square = (1.0 - UWB_OUTLIER_SHARE) *
                  (noise * noise +
-                  *tail_share * (UWB_LEAST_M * UWB_LEAST_M + 2.0 * UWB_LEAST_M * detour + 2.0 * detour * detour)) +
+                  *tail_share *
+                      (UWB_LEAST_M * UWB_LEAST_M + 2.0 * UWB_LEAST_M * detour + UWB_DETOUR_SQUARE * detour * detour)) +
              UWB_OUTLIER_SHARE * UWB_OUTLIER_M * UWB_OUTLIER_M - *mean_error_m * *mean_error_m;
     /* Where the curve of bias is held constant, a range may be off by what it would go on by. */
     away = lifted < UWB_LOWEST    ? (UWB_LOWEST - lifted) * UWB_SLOPE_BELOW
@@ -159,6 +160,7 @@ def _error_tables(model: ErrorModel, bias: PowerCurve) -> list[str]:
     odds = np.array(model.tail_share) / (1 - np.array(model.tail_share))
     numbers = {
         "LEAST_M": model.least_m,
+        "DETOUR_SQUARE": 2 * model.long.square,
         "OUTLIER_SHARE": model.outlier_share,
         "OUTLIER_M": model.outlier_m,
         "ERROR_SCALE": model.scale,

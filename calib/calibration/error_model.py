@@ -1,8 +1,9 @@
 """What the errors of corrected ranges are made of, by pair and power: core, reflections, outliers.
 
-An error is noise about `location_m`; with a tail share noise plus a detour, a least one and an exponential one; rarely
-an outlier. Noise and share are stated at some lifted powers, in logarithms and log odds straight between them, and each
-pair has factors on noise, odds and detour; a pair that was not there when the fit was made has what is common.
+An error is noise about `location_m`; with a tail share noise plus a detour, a least one and an exponential one, which
+is of one of two kinds; rarely an outlier. Noise and share are stated at some lifted powers, in logarithms and log odds
+straight between them, and each pair has factors on noise, odds and detour; a pair that was not there when the fit was
+made has what is common.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from calib.calibration.json_format import METRES, POSITIVE, SHARE, STD_M, Reader, is_tag
 from calib.calibration.power_curves import Curve
-from calib.densities import ROOT_2PI, densities
+from calib.densities import ROOT_2PI, LongDetours, densities
 from calib.errors import BadInputError
 from calib.tails import log_normal_below, normal_below
 from uwblink.arrays import Floats, Ints
@@ -54,7 +55,9 @@ class ErrorModel:
 
     `noise_m` and `tail_share` are those at `lifted` powers, for a pair that is not among `pairs` (named
     "smaller-larger"). `levels` are shares of errors and the model's levels that these were found below while fitting:
-    what makes quantiles hold where the shape does not. `scale` does so for the total standard deviation.
+    what makes quantiles hold where the shape does not. `scale` does so for the total standard deviation. `detour_m` is
+    the mean of both kinds of exponential detour; `long_share` of the reflections are `long_factor` times as long as the
+    others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0.
     """
 
     lifted: tuple[float, ...]
@@ -67,7 +70,18 @@ class ErrorModel:
     location_m: float = 0.0
     scale: float = 1.0
     levels: tuple[tuple[float, float], ...] = ()
+    long_share: float = 0.0
+    long_factor: float = 1.0
     pairs: dict[str, PairErrors] = field(default_factory=dict)
+
+    @property
+    def long(self) -> LongDetours:
+        """Return the second kind of detour."""
+        return LongDetours(share=self.long_share, factor=self.long_factor)
+
+    def square_m2(self, detour_m: Any) -> Any:
+        """Return the mean square of detours whose exponential part has such a mean."""
+        return self.least_m**2 + 2 * self.least_m * detour_m + 2 * self.long.square * detour_m**2
 
     def shapes(self, lifted: Floats, initiator: Ints, target: Ints) -> ErrorShapes:
         """Return the shape of the errors of ranges (n,) at lifted powers between two tags, whoever initiated."""
@@ -91,7 +105,7 @@ class ErrorModel:
     def total_m(self, shapes: ErrorShapes) -> Floats:
         """Return the standard deviation of the errors (n,) about their mean, reflections included."""
         inside, share = 1 - self.outlier_share, shapes.tail_share
-        detour = self.least_m**2 + 2 * self.least_m * shapes.detour_m + 2 * shapes.detour_m**2
+        detour = self.square_m2(shapes.detour_m)
         square = inside * (shapes.noise_m**2 + share * detour) + self.outlier_share * self.outlier_m**2
         return np.asarray(self.scale * np.sqrt(square - (self.mean_m(shapes) - self.location_m) ** 2))
 
@@ -99,10 +113,13 @@ class ErrorModel:
         """Return the model's share of errors below some (n,)."""
         error = error_m - self.location_m
         noise, share = shapes.noise_m, shapes.tail_share
-        away, ratio = (error - self.least_m) / noise, noise / shapes.detour_m
-        reflected = normal_below(away) - np.exp(
-            np.minimum(ratio * (0.5 * ratio - away) + log_normal_below(away - ratio), 0.0)
-        )
+        away = (error - self.least_m) / noise
+        reflected = normal_below(away)
+        for part, detour in self.long.kinds(shapes.detour_m):
+            ratio = noise / detour
+            reflected = reflected - part * np.exp(
+                np.minimum(ratio * (0.5 * ratio - away) + log_normal_below(away - ratio), 0.0)
+            )
         inside = (1 - share) * normal_below(error / noise) + share * reflected
         wild = normal_below(error / max(self.outlier_m, 1e-9))
         return np.asarray((1 - self.outlier_share) * inside + self.outlier_share * wild)
@@ -130,7 +147,7 @@ class ErrorModel:
     def tail_given(self, error_m: Floats, shapes: ErrorShapes) -> tuple[Floats, Floats]:
         """Return the probabilities (n,) that ranges with known errors were reflected, and that they are outliers."""
         error, inside = error_m - self.location_m, 1 - self.outlier_share
-        found = densities(error, shapes.noise_m, self.least_m, shapes.detour_m)
+        found = densities(error, shapes.noise_m, self.least_m, shapes.detour_m, self.long)
         core = inside * (1 - shapes.tail_share) * found.direct
         tail = inside * shapes.tail_share * found.reflected
         wide = max(self.outlier_m, 1e-9)
@@ -149,7 +166,7 @@ class ErrorModel:
         )
         reach = FARTHEST_SIGMAS * (shapes.noise_m + self.outlier_m)
         low = np.broadcast_to(self.location_m - reach, (len(pair), len(levels))).copy()
-        high = low + 2 * reach + self.least_m + FARTHEST_MEANS * shapes.detour_m
+        high = low + 2 * reach + self.least_m + FARTHEST_MEANS * self.long.longest * shapes.detour_m
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
             above = self.below(middle, shapes) > levels
@@ -205,6 +222,7 @@ class ErrorsAtOnce:
         slopes = bias_curve.beyond(np.array([self._low - 1, self._high + 1]))
         self._below, self._above = slopes.tolist()
         share = np.array(model.tail_share)
+        self._square_m2 = model.square_m2
         self._nodes = list(model.lifted)
         self._rows = list(zip(np.log(model.noise_m).tolist(), np.log(share / (1 - share)).tolist(), strict=True))
         self._pairs = {}
@@ -219,9 +237,9 @@ class ErrorsAtOnce:
         noise, odds, detour = self._pairs.get((initiator, target), (0.0, 0.0, model.detour_m))
         one, two = self._at(lifted)
         noise, share = math.exp(noise + one), 1 / (1 + math.exp(-odds - two))
-        inside, least = 1 - model.outlier_share, model.least_m
-        square = noise * noise + share * (least * least + 2 * least * detour + 2 * detour * detour)
-        mean = inside * share * (least + detour)
+        inside = 1 - model.outlier_share
+        square = noise * noise + share * self._square_m2(detour)
+        mean = inside * share * (model.least_m + detour)
         total = model.scale**2 * (inside * square + model.outlier_share * model.outlier_m**2 - mean * mean)
         away = self._below * max(self._low - lifted, 0.0) + self._above * max(lifted - self._high, 0.0)
         return math.sqrt(total + away * away), share
@@ -257,8 +275,16 @@ def read_errors(read: Reader) -> ErrorModel:
         location_m=read.number("location_m", METRES),
         scale=read.number("scale", POSITIVE),
         levels=read.couples("levels", SHARE),
+        **_long(read),
         pairs={name: _pair(pairs.inside(name)) for name in names},
     )
+
+
+def _long(read: Reader) -> dict[str, float]:
+    """Return the second kind of detour, which calibrations of uwbcal up to 0.2.0 do not have."""
+    if not read.has("long_share"):
+        return {}
+    return {"long_share": read.number("long_share", SHARE), "long_factor": read.number("long_factor", POSITIVE)}
 
 
 def _is_pair(name: str) -> bool:

@@ -37,8 +37,11 @@ FEWEST_JUDGED: Final = 200
 LEVELS: Final = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
 """Shares of errors at which the model's quantiles are put right."""
 
-BEYOND_MEANS: Final = 6.0
-"""Errors longer than so many mean detours, of which an exponential leaves 0.2 %, are no part of the total sigma."""
+BEYOND_MEANS: Final = 8.0
+"""Errors longer than so many means of the longer detours are no part of the total sigma.
+
+An exponential leaves 0.03 % of its values beyond, which carry 1.4 % of their mean square.
+"""
 
 LEAST_SPREAD_M: Final = 1e-6
 """Errors without any spread have no distribution."""
@@ -76,6 +79,8 @@ def error_model(problem: Problem, residual_m: Floats, mixture: PairMixture | Non
         outlier_share=wild.share,
         outlier_m=wild.rms_m,
         location_m=location,
+        long_share=mixture.long.share,
+        long_factor=mixture.long.factor,
         pairs={
             name: PairErrors(noise=float(noise), odds=float(np.exp(odds - known.common_odds)), detour=float(detour))
             for name, noise, odds, detour in zip(names, mixture.noise, known.odds, known.detour, strict=True)
@@ -142,7 +147,7 @@ def _of_pairs(mixture: PairMixture, blocks: TimeBlocks, pair: Ints) -> _PairsPre
     share_var, any_share_var = np.minimum(share_var, WIDEST_ODDS), min(any_share_var, WIDEST_ODDS)
     mean_var, any_mean_var = np.minimum(mean_var, WIDEST_DETOUR), min(any_mean_var, WIDEST_DETOUR)
     middle = float(np.mean(mixture.of("cell_share")))
-    common = float(np.exp(mixture.of("mean")[0] + any_mean + any_mean_var / 2))
+    common = mixture.mean_m * float(np.exp(any_mean + any_mean_var / 2))
     return _PairsPredicted(
         odds=_expected_odds(share + middle, share_var),
         common_odds=float(_expected_odds(np.array(any_share + middle), np.array(any_share_var))),
@@ -195,7 +200,7 @@ class _Outliers:
 
 def _outliers(mixture: PairMixture, error_m: Floats) -> _Outliers:
     slope, always = mixture.slope("outliers"), 1 / (1 + np.exp(-mixture.of("outliers")[0]))
-    reach = BEYOND_MEANS * float(mixture.tail_mean_m.max())
+    reach = BEYOND_MEANS * mixture.long.longest * float(mixture.tail_mean_m.max())
     total, square = 0.0, 0.0
     for rows in spans(len(error_m)):
         some = error_m[rows]
@@ -217,7 +222,7 @@ def _put_right(model: ErrorModel, problem: Problem, residual_m: Floats) -> Error
     shapes = model.shapes(lifted, first, second)
     level = np.quantile(model.below(error, shapes), LEVELS)
     away = error - model.mean_m(shapes)
-    reach = BEYOND_MEANS * (model.least_m + shapes.detour_m)
+    reach = BEYOND_MEANS * (model.least_m + model.long.longest * shapes.detour_m)
     within = np.abs(away) < reach
     z = away[within] / model.total_m(shapes)[within]
     return replace(

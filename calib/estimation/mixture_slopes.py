@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from calib.densities import LONG_FACTOR, LongDetours
 from calib.estimation.design import Design, as_design
 from calib.estimation.problem import CELLS
 from calib.estimation.reflections import Shape, expected
@@ -15,28 +16,41 @@ from calib.estimation.scores import Scores, Sort, Summing, Sums
 from calib.long_columns import ROWS_AT_ONCE, empty, let_go, picked, put
 from uwblink.arrays import Floats, Ints
 
-SLOPES: Final = ("noise", "share", "mean", "least", "outliers")
+SLOPES: Final = ("noise", "share", "pair_mean", "mean", "least", "outliers", "long_share")
 """What a range has slopes by beside those of the design, in their order."""
+
+OUTLIERS_OVER_M: Final = 10.0
+"""Outliers are anywhere within a room, at least: over the span of a few errors they would pass for long detours."""
+
+COMMON: Final = ("mean", "least", "outliers", "long_share")
+"""Parameters that all ranges share, in their order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Which parameters stand where: those of the design, then logarithms and log odds of the rest."""
+    """Which parameters stand where: those of the design, then logarithms and log odds of the rest.
+
+    `mean` is the mean of the first kind of detour beyond `shortest_m`, the least that it may be.
+    """
 
     columns: int
     pairs: int
     cells: int = CELLS
+    shortest_m: float = 0.0
 
     def counts(self) -> dict[str, int]:
         """Return how many there are of each sort."""
-        common = {"design": self.columns, "mean": 1, "least": 1, "outliers": 1}
-        return common | {
-            "cell_noise": self.cells,
-            "cell_share": self.cells,
-            "pair_share": self.pairs,
-            "pair_noise": self.pairs,
-            "pair_mean": self.pairs,
-        }
+        return (
+            {"design": self.columns}
+            | dict.fromkeys(COMMON, 1)
+            | {
+                "cell_noise": self.cells,
+                "cell_share": self.cells,
+                "pair_share": self.pairs,
+                "pair_noise": self.pairs,
+                "pair_mean": self.pairs,
+            }
+        )
 
     def slices(self) -> dict[str, slice]:
         """Return where each sort stands."""
@@ -64,7 +78,7 @@ class Errors:
     def of(cls, error: Floats, matrix: Design | Floats, place: Ints, pairs: int) -> Errors:
         """Return errors (n,) whose places (n,) are known, in the order in which they are given."""
         design = as_design(matrix).blocked(place)
-        density = 1 / (float(np.ptp(error)) + 1e-9)
+        density = 1 / max(float(np.ptp(error)), OUTLIERS_OVER_M)
         return cls(
             error=design.kept(error),
             design=design,
@@ -112,7 +126,8 @@ def _pieces(errors: Errors, layout: Layout, theta: Floats) -> Iterator[tuple[sli
     part = {name: theta[rows] for name, rows in layout.slices().items()}
     sigma = np.exp(part["pair_noise"][:, None] + part["cell_noise"]).ravel()[errors.place]
     share = 1 / (1 + np.exp(-part["pair_share"][:, None] - part["cell_share"])).ravel()[errors.place]
-    mean = np.exp(part["mean"][0] + part["pair_mean"])[errors.place // layout.cells]
+    long, above = long_detours(part["long_share"]), float(np.exp(part["mean"][0]))
+    mean = (long.mean * (layout.shortest_m + above) * np.exp(part["pair_mean"]))[errors.place // layout.cells]
     design, counts = errors.design, errors.design.counts
     for blocks, rows in design.passing():
         shape = Shape(
@@ -122,24 +137,38 @@ def _pieces(errors: Errors, layout: Layout, theta: Floats) -> Iterator[tuple[sli
             least_m=float(np.exp(part["least"][0])),
             outlier_share=float(1 / (1 + np.exp(-part["outliers"][0]))),
             outlier_density=errors.density,
+            long=long,
         )
-        yield blocks, rows, _slopes(errors.error[rows] + design.piece_times(part["design"], blocks, rows), shape)
+        residual = errors.error[rows] + design.piece_times(part["design"], blocks, rows)
+        yield blocks, rows, _slopes(residual, shape, above / (layout.shortest_m + above))
 
 
-def _slopes(residual: Floats, shape: Shape) -> _Piece:
-    """Return the slopes of the log likelihood at residuals (n,)."""
-    found = expected(residual, shape)
-    z, noise = residual / shape.sigma_m, found.noise_m / shape.sigma_m
-    core, tail = found.core, found.tail
-    both, tail_noise = core + tail, tail * noise
+def long_detours(log_odds: Floats) -> LongDetours:
+    """Return the second kind of detour from its log odds (1,)."""
+    return LongDetours(share=float(1 / (1 + np.exp(-log_odds[0]))), factor=LONG_FACTOR)
+
+
+def _slopes(residual: Floats, shape: Shape, moved: float) -> _Piece:
+    """Return the slopes of the log likelihood at residuals (n,); means of detours are `moved` so much by their own."""
+    found, sigma, long = expected(residual, shape), shape.sigma_m, shape.long
+    z, core, tail = residual / sigma, found.core, found.tail
+    both, tail_noise = core + tail, found.tail_noise_m / sigma
+    noise, mean = core * (z * z - 1), np.zeros_like(z)
+    beyond = residual - shape.least_m
+    for share, kind in zip(found.tails, found.kinds, strict=True):
+        part = kind.noise_m / sigma
+        noise += share * (part * part + kind.noise_var - 1)
+        mean += share * ((beyond - kind.noise_m) / kind.detour_m - 1)
     return _Piece(
-        score=-(core * z + tail_noise) / shape.sigma_m,
+        score=-(core * z + tail_noise) / sigma,
         slopes=(
-            core * (z * z - 1) + tail * (noise * noise + found.noise_var - 1),
+            noise,
             tail - shape.tail_share * both,
-            tail * ((residual - shape.least_m - found.noise_m) / shape.mean_m - 1),
-            tail_noise * (shape.least_m / shape.sigma_m),
+            mean,
+            moved * mean,
+            tail_noise * (shape.least_m / sigma),
             (1 - shape.outlier_share) - both,
+            found.tails[1] - long.share * tail,
         ),
         log_density=found.log_density,
     )
@@ -179,10 +208,10 @@ def scores_at(errors: Errors, layout: Layout, theta: Floats) -> tuple[Scores, Su
 
 def _sorts(layout: Layout) -> tuple[Sort, ...]:
     """Return the sorts of parameters in the layout's order."""
-    noise, share, mean, least, outliers = range(len(SLOPES))
+    noise, share, mean = (SLOPES.index(name) for name in ("noise", "share", "pair_mean"))
     pair, cell = np.divmod(np.arange(layout.pairs * layout.cells), layout.cells)
     return (
-        *(Sort(slope=slope) for slope in (mean, least, outliers)),
+        *(Sort(slope=SLOPES.index(name)) for name in COMMON),
         *(Sort(slope=slope, whose=cell, count=layout.cells) for slope in (noise, share)),
         *(Sort(slope=slope, whose=pair, count=layout.pairs) for slope in (share, noise, mean)),
     )

@@ -22,6 +22,18 @@ MEAN_VARIANCE: Final = 1.0
 LEAST_VARIANCE: Final = 2.0
 """How far from their guesses the steps of share, the mean detour and the least detour may be, in logarithms squared."""
 
+FIRST: Final = 4.0
+SHORTEST: Final = 3.0
+"""Mean of the first kind of detour at the start, and the least that it may have, in spreads of the residuals.
+
+With a second kind to explain reflections, the first would otherwise explain a core that is not normal: in a fit without
+a curve, whose errors follow power, it moves delays by 0.14 ns where the least mean is 1.8 spreads, and not from 2.5 on.
+"""
+
+LONG_ODDS: Final = float(np.log(1 / 3))
+LONG_VARIANCE: Final = 1.0
+"""Log odds of the second kind of detour, and their variance: two in three between 11 and 48 % of the reflections."""
+
 OUTLIERS: Final = -6.0
 
 OUTLIER_VARIANCE: Final = 9.0
@@ -53,17 +65,19 @@ class Prior:
         return found
 
 
-def begin(errors: Errors, layout: Layout, start: Floats, ridge: Floats) -> tuple[Floats, Prior]:
-    """Return first parameters, from robust spreads of the residuals, and what is known beforehand."""
-    where = layout.slices()
+def begin(errors: Errors, start: Floats, ridge: Floats) -> tuple[Layout, Floats, Prior]:
+    """Return which parameters there are, first ones, from robust spreads of residuals, and what is known beforehand."""
     fitted = errors.design.times(start)
     residual = computed(len(fitted), lambda rows: errors.error[rows] + fitted[rows])
     spread = _spread(residual)
+    layout = Layout(columns=errors.design.shape[1], pairs=errors.pairs, shortest_m=SHORTEST * spread)
+    where = layout.slices()
     theta = np.zeros(where["pair_mean"].stop)
     theta[where["design"]] = start
-    theta[where["mean"]] = np.log(4 * spread)
+    theta[where["mean"]] = np.log((FIRST - SHORTEST) * spread)
     theta[where["least"]] = np.log(0.5 * spread)
     theta[where["outliers"]] = OUTLIERS
+    theta[where["long_share"]] = LONG_ODDS
     cells = errors.parts(errors.place % layout.cells, layout.cells, residual)
     theta[where["cell_noise"]] = np.log([0.9 * _spread(part) for part in cells])
     noise, odds = [], []
@@ -76,16 +90,14 @@ def begin(errors: Errors, layout: Layout, start: Floats, ridge: Floats) -> tuple
     precision, centre = np.zeros((len(theta),) * 2), np.zeros(len(theta))
     precision[where["design"], where["design"]] = ridge
     known = {"mean": MEAN_VARIANCE, "least": LEAST_VARIANCE, "outliers": OUTLIER_VARIANCE, "cell_share": CELL_VARIANCE}
+    known["long_share"] = LONG_VARIANCE
     for name, variance in known.items():
         _set(precision, where[name], 1 / variance)
-    centre[: where["cell_noise"].start][-3:] = theta[where["mean"].start : where["cell_noise"].start]
+    common = slice(where["mean"].start, where["cell_noise"].start)
+    centre[common] = theta[common]
     _set(precision, where["cell_noise"], 1e-6)
-    return theta, between_pairs(
-        theta,
-        Prior(columns=layout.columns, precision=precision, centre=centre, variances={}),
-        layout,
-        None,
-    )
+    prior = Prior(columns=layout.columns, precision=precision, centre=centre, variances={})
+    return layout, theta, between_pairs(theta, prior, layout, None)
 
 
 def _spread(values: Floats, otherwise: float = 1e-3) -> float:

@@ -15,7 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.mixture_slopes import SLOPES, Errors, Layout, scores_at, slopes_at, sums_at
+from calib.densities import LongDetours
+from calib.estimation.mixture_slopes import SLOPES, Errors, Layout, long_detours, scores_at, slopes_at, sums_at
 from calib.estimation.mixture_start import SPREADS, Prior, begin, between_pairs
 from calib.estimation.scores import Scores, inverse_of
 from uwblink.arrays import Floats
@@ -86,8 +87,17 @@ class PairMixture:
     @property
     def tail_mean_m(self) -> Floats:
         """Mean detour of each pair's reflected ranges."""
-        exponential = np.exp(self.of("mean")[0] + self.of("pair_mean"))
-        return np.asarray(np.exp(self.of("least")[0]) + exponential)
+        return np.asarray(np.exp(self.of("least")[0]) + self.mean_m * np.exp(self.of("pair_mean")))
+
+    @property
+    def mean_m(self) -> float:
+        """Mean of the exponential detours of both kinds, without the factors of pairs."""
+        return self.long.mean * (self.layout.shortest_m + float(np.exp(self.of("mean")[0])))
+
+    @property
+    def long(self) -> LongDetours:
+        """Return the second kind of detour."""
+        return long_detours(self.of("long_share"))
 
     @property
     def noise(self) -> Floats:
@@ -130,8 +140,7 @@ def foot_of(errors: Errors, start: Floats, ridge: Floats) -> Foot:
 
     `ridge` (m, m) is the inverse covariance of what is known of them beforehand, in 1/m^2.
     """
-    layout = Layout(columns=errors.design.shape[1], pairs=errors.pairs)
-    theta, prior = begin(errors, layout, start, ridge)
+    layout, theta, prior = begin(errors, start, ridge)
     return Foot(layout=layout, samples=list(_levels(errors)), parameters=theta, prior=prior)
 
 

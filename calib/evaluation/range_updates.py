@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.densities import ROOT_2PI, densities
+from calib.densities import ONE_KIND, ROOT_2PI, LongDetours, densities
 from uwblink.arrays import Bools, Floats
 
 
@@ -21,7 +21,7 @@ class RangeErrors:
     """What the errors of a range are made of: reflected with `share`, by a least detour and an exponential one.
 
     Metres and shares of 1. `outlier` are of any size, about `outlier_m`. Of several ranges, `share` and `detour_m` are
-    columns (n,).
+    columns (n,). `detour_m` is the mean of both kinds of exponential detour, `long` says how they divide.
     """
 
     share: Floats | float
@@ -29,6 +29,7 @@ class RangeErrors:
     detour_m: Floats | float
     outlier: float
     outlier_m: float
+    long: LongDetours = ONE_KIND
 
     def times(self, count: int) -> RangeErrors:
         """Return those of so many ranges, all alike."""
@@ -71,7 +72,7 @@ def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> H
     The noise in a reflected range is normal, cut off above (`calib.densities`, docs/theory.md). An outlier says
     nothing.
     """
-    found = densities(innovation_m, np.sqrt(variance_m2), errors.least_m, errors.detour_m)
+    found = densities(innovation_m, np.sqrt(variance_m2), errors.least_m, errors.detour_m, errors.long)
     inside = 1 - errors.outlier
     core = found.direct * (inside * (1 - errors.share))
     tail = found.reflected * (inside * errors.share)

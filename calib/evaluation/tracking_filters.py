@@ -64,6 +64,7 @@ def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Rang
         detour_m=shapes.detour_m,
         outlier=max(model.outlier_share, LEAST_OUTLIERS),
         outlier_m=max(model.outlier_m, LEAST_OUTLIER_M),
+        long=model.long,
     )
     return np.hypot(shapes.noise_m, calibration.bias_curve.beyond(lifted)), errors
 

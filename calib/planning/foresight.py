@@ -69,7 +69,7 @@ class Errors:
         )
         found = expected(error, shape)
         weight = np.exp(found.log_density)
-        slope = (found.core * error + found.tail * found.noise_m) / self.noise_m**2
+        slope = (found.core * error + found.tail_noise_m) / self.noise_m**2
         return float(weight @ slope**2 / weight.sum())
 
 

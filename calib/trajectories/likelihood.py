@@ -33,9 +33,10 @@ def loss_of(mixture: PairMixture) -> Reflecting:
         Shape(
             sigma_m=sigma[place],
             tail_share=share[place],
-            mean_m=np.exp(mixture.of("mean")[0] + mixture.of("pair_mean")).repeat(CELLS)[place],
+            mean_m=(mixture.mean_m * np.exp(mixture.of("pair_mean"))).repeat(CELLS)[place],
             least_m=float(np.exp(mixture.of("least")[0])),
             outlier_share=float(1 / (1 + np.exp(-mixture.of("outliers")[0]))),
             outlier_density=1 / OUTLIERS_OVER_M,
+            long=mixture.long,
         )
     )

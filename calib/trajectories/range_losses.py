@@ -66,7 +66,7 @@ class Reflecting:
     def slopes(self, residual: Floats) -> tuple[Floats, Floats]:
         """Return slopes and curvatures."""
         found, sigma = expected(residual, self.shape), self.shape.sigma_m
-        slope = (found.core * residual + found.tail * found.noise_m) / sigma**2
+        slope = (found.core * residual + found.tail_noise_m) / sigma**2
         return slope, (found.core + REFLECTED * found.tail) / sigma**2 + 1e-6
 
     def known(self, residual: Floats) -> float:

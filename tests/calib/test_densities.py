@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import expon, exponnorm, norm
 
-from calib.densities import densities
+from calib.densities import LongDetours, densities
 
 SIGMA, LEAST, DETOUR = 0.08, 0.1, 0.3
 
@@ -18,6 +18,27 @@ def test_densities_are_those_of_scipy():
     np.testing.assert_allclose(
         found.reflected, exponnorm.pdf(e, DETOUR / SIGMA, loc=LEAST, scale=SIGMA), rtol=1e-9, atol=1e-300
     )
+
+
+def test_two_kinds_of_detour_are_two_exponentials():
+    e, long = np.linspace(-0.6, 12, 500), LongDetours(share=0.3, factor=4.0)
+    found = densities(e, np.full(500, SIGMA), LEAST, DETOUR, long)
+    first = DETOUR / (0.7 + 0.3 * 4)
+    parts = [(0.7, first), (0.3, 4 * first)]
+    expected = sum(share * exponnorm.pdf(e, mean / SIGMA, loc=LEAST, scale=SIGMA) for share, mean in parts)
+    np.testing.assert_allclose(found.reflected, expected, rtol=1e-9, atol=1e-300)
+    assert sum(share * mean for share, mean in parts) == pytest.approx(DETOUR)
+    assert long.square * DETOUR**2 == pytest.approx(sum(share * mean**2 for share, mean in parts))
+    # Mean and variance of the noise: the density's slope and curvature say them (Tweedie's formula).
+    step = 1e-4
+    logs = [
+        np.log(densities(e[:200] + k * step, np.full(200, SIGMA), LEAST, DETOUR, long).reflected) for k in (-1, 0, 1)
+    ]
+    np.testing.assert_allclose(
+        found.noise_m()[:200], -(SIGMA**2) * (logs[2] - logs[0]) / (2 * step), rtol=1e-4, atol=1e-7
+    )
+    bend = (logs[2] - 2 * logs[1] + logs[0]) / step**2
+    np.testing.assert_allclose(found.noise_var()[:200], 1 + SIGMA**2 * bend, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("error", [-0.3, -0.05, 0.1, 0.2, 0.6, 2.0, 6.0])

@@ -40,6 +40,28 @@ def drawn(lifted, first, second, seed=0):
     return error + 0.02, reflected, wild
 
 
+TWO_KINDS = replace(MODEL, long_share=0.4, long_factor=4.0)
+
+
+@pytest.mark.parametrize("pair", [(1, 2), (3, 7)])
+def test_two_kinds_of_detour_have_the_spread_and_the_quantiles_of_draws(pair):
+    rng, known = np.random.default_rng(3), pair == (1, 2)
+    error, reflected, wild = drawn(0.5, *pair)
+    shapes = TWO_KINDS.shapes(np.full(1, 0.5), *(np.full(1, tag) for tag in pair))
+    error = rng.normal(0, shapes.noise_m[0], COUNT)
+    mean = 0.3 * (0.5 if known else 1) / (0.6 + 0.4 * 4)
+    detour = 0.05 + rng.exponential(np.where(rng.random(COUNT) < 0.4, 4 * mean, mean))
+    error = 0.02 + np.where(wild, rng.normal(0, 0.9, COUNT), error + detour * reflected)
+    assert TWO_KINDS.mean_m(shapes)[0] == pytest.approx(error.mean(), abs=4 * error.std() / np.sqrt(COUNT))
+    assert TWO_KINDS.total_m(shapes)[0] == pytest.approx(error.std(), rel=0.015)
+    shares = [0.025, 0.5, 0.9, 0.975, 0.995]
+    found = TWO_KINDS.quantiles(shares, np.full(1, 0.5), *(np.full(1, tag) for tag in pair))[0]
+    np.testing.assert_allclose([np.mean(error < q) for q in found], shares, atol=0.002)
+    near = np.abs(error - 0.3) < 0.01
+    tail, _ = TWO_KINDS.tail_given(np.full(1, 0.3), shapes)
+    assert tail[0] == pytest.approx(np.mean(reflected[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near)))
+
+
 @pytest.mark.parametrize(("lifted", "first", "second"), [(0.1, 1, 2), (0.7, 2, 1), (0.7, 1, 3), (4.0, 7, 3)])
 def test_mean_spread_quantiles_and_shares_are_those_of_draws(lifted, first, second):
     error, reflected, wild = drawn(lifted, first, second)
