@@ -19,7 +19,7 @@ from uwblink.output import check_output
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import SHAPES, Arrangement, Tag
 
-FILE_MB: Final = 200
+FILE_MB: Final = 64
 """Of the file so much is kept in memory; without a limit all of it would be, and a recording of hours is long."""
 
 

@@ -8,7 +8,7 @@ from typing import Final
 from uwblink.boards.connection import FENCE, CommandOutcome, Connection
 from uwblink.boards.ports import Ports, Transport, serial_number
 from uwblink.errors import PortError
-from uwblink.wire.codec import Event
+from uwblink.wire.codec import LONGEST_LINE, Event
 from uwblink.wire.messages import GetId, Message, SetPassive, Skipped
 
 REOPEN_S: Final = 0.2
@@ -63,7 +63,8 @@ class Station:
                 self._damage, self._damaged_s = self._damage + event.data, now_s
             elif self._damage:
                 text = self._end_of_damage()
-        if self._damage and (self._damage.endswith(b"\r\n") or now_s - self._damaged_s > DAMAGE_ENDS_S):
+        over = self._damage.endswith(b"\r\n") or len(self._damage) > LONGEST_LINE
+        if self._damage and (over or now_s - self._damaged_s > DAMAGE_ENDS_S):
             text = self._end_of_damage()
         return text
 

@@ -17,6 +17,7 @@ from typing import Final, Self
 import numpy as np
 
 from uwblink.boards.listeners import Heard, Listener
+from uwblink.database import log_of
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow
@@ -27,6 +28,10 @@ from uwblink.wire.messages import Cir, Overheard, RangeReport
 
 FLUSH_S: Final = 0.1
 LONGEST_BACKLOG_S: Final = 20.0
+LONG_LOG: Final = 8 * 2**20
+"""Half of the bytes at which DuckDB puts its log into the file within a commit, which takes a second on a busy machine.
+"""
+
 STOPPED_S: Final = 2.0
 """A loop that does not ask for so long was stopped with its process (Ctrl-Z, a suspended computer)."""
 
@@ -88,6 +93,7 @@ class RecordingWriter(Listener):
         self._file = _identity(recording.path)
         self._error: RecordingError | None = None
         self._snapshots = SnapshotMaker(recording.path, recording.snapshot)
+        self._shortening: threading.Thread | None = None
         self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
         self._thread.start()
 
@@ -170,13 +176,35 @@ class RecordingWriter(Listener):
             self._written_s, self._stopped_s = time.monotonic(), 0.0
             if not self._error:
                 self._snapshots.look()
+                self._shorten_log()
         self._snapshots.close()
+        if self._shortening:
+            self._shortening.join()
+
+    def _shorten_log(self) -> None:
+        """Have a long log put into the file by another thread, while this one goes on committing."""
+        if self._shortening and self._shortening.is_alive():
+            return
+        if _bytes(log_of(self._recording.path)) > LONG_LOG:
+            self._shortening = threading.Thread(target=self._put_log_away, name="uwblink log", daemon=True)
+            self._shortening.start()
+
+    def _put_log_away(self) -> None:
+        with suppress(RecordingError):  # what is wrong with the disk, the next commit tells
+            self._recording.shorten_log()
 
     def _check_file(self) -> None:
         """Raise `RecordingError` where the file has no name any more: what is written to it then is lost."""
         path = self._recording.path
         if _identity(path) != self._file:
             raise RecordingError(f"{path}: was removed or replaced while it was being recorded; what it held is lost")
+
+
+def _bytes(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

@@ -163,6 +163,10 @@ class Recording(TableWriters, TableReaders):
         """Write everything committed so far to a new file, while others go on appending; raises `RecordingError`."""
         self._store.copy_to(Path(place))
 
+    def shorten_log(self) -> None:
+        """Put the log beside the file into the file, while others go on appending; raises `RecordingError`."""
+        self._store.shorten_log()
+
     def show(self) -> Summary:
         """Return what the recording holds, as a summary that prints itself."""
         from uwblink.recording.summary import summarize

@@ -6,6 +6,7 @@ locked, and are looked over (`uwblink.recording.intake`) before anything in them
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -43,6 +44,7 @@ class Store:
         It may be one that `writes`; where that fails, the file of one that `vanishes` is removed by its owner.
         """
         self._db, self._second = connection, connection.cursor()
+        self._second_lock = threading.Lock()
         self.path, self.writes, self.vanishes = path, writes, vanishes
         self._longest_read_s = longest_read_s(size)
         self._columns: dict[str, set[str]] | None = None
@@ -139,19 +141,30 @@ class Store:
                 f"some of it in {log_of(self.path).name} beside it: keep the two together"
             ) from error
 
+    def shorten_log(self) -> None:
+        """Put what is in the log into the file, while others go on writing; raises `RecordingError`."""
+        import duckdb
+
+        try:
+            with self._second_lock:
+                self._second.execute("CHECKPOINT")
+        except duckdb.Error as error:
+            raise self._unwritable(error) from error
+
     def copy_to(self, place: Path) -> None:
         """Write what is committed to a new file, on a connection of its own; raises `RecordingError`."""
         import duckdb
 
         target = str(place).replace("'", "''")
         try:
-            (source,) = self._second.execute("SELECT current_database()").fetchone() or ("",)
-            named = source.replace('"', '""')
-            self._second.execute(f"ATTACH '{target}' AS uwblink_snapshot")
-            try:
-                self._second.execute(f'COPY FROM DATABASE "{named}" TO uwblink_snapshot')
-            finally:
-                self._second.execute("DETACH uwblink_snapshot")
+            with self._second_lock:
+                (source,) = self._second.execute("SELECT current_database()").fetchone() or ("",)
+                named = source.replace('"', '""')
+                self._second.execute(f"ATTACH '{target}' AS uwblink_snapshot")
+                try:
+                    self._second.execute(f'COPY FROM DATABASE "{named}" TO uwblink_snapshot')
+                finally:
+                    self._second.execute("DETACH uwblink_snapshot")
         except duckdb.Error as error:
             place.unlink(missing_ok=True)
             raise RecordingError(f"{place}: cannot be written ({first_line(error)})") from error

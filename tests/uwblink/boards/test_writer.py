@@ -1,9 +1,12 @@
 """The writer of a live recording: what cannot be written is known at the start, or within a second."""
 
+import threading
 import time
+from pathlib import Path
 
 import pytest
 
+from uwblink.boards import writer as writing
 from uwblink.boards.writer import RecordingWriter
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
@@ -61,6 +64,49 @@ def test_a_conversion_that_fails_is_no_full_disk(live, monkeypatch):
     with pytest.raises(RecordingError, match="Conversion Error") as caught:
         RecordingWriter(live)
     assert "disk" not in str(caught.value)
+
+
+def size(path):
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
+
+
+def until(true):
+    """Wait for something that another thread does."""
+    end_s = time.monotonic() + 60.0
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
+def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypatch):
+    """DuckDB does that within a commit where nobody did it before, and what comes meanwhile is not in the file."""
+    begun, over = threading.Event(), threading.Event()
+    monkeypatch.setattr(writing, "LONG_LOG", 20_000)
+    monkeypatch.setattr(Recording, "shorten_log", lambda _: begun.set() or over.wait(60))
+    log, written = Path(f"{live.path}.wal"), []
+    with RecordingWriter(live) as writer:
+        writer.on_bytes(1, "port", "in", bytes(30_000))
+        assert begun.wait(60)
+        for k in range(3):
+            before = size(log)
+            writer.on_bytes(2 + k, "port", "in", bytes(100))
+            until(lambda least=before: size(log) > least)
+            written.append(k)
+        over.set()
+    assert written == [0, 1, 2]
+
+
+def test_a_log_stays_short_and_everything_is_in_the_file(live, monkeypatch):
+    monkeypatch.setattr(writing, "LONG_LOG", 20_000)
+    log, before = Path(f"{live.path}.wal"), live.path.stat().st_size
+    with RecordingWriter(live) as writer:
+        writer.on_bytes(1, "port", "in", bytes(range(256)) * 100)
+        until(lambda: size(live.path) > before and size(log) < 20_000)
+        writer.on_bytes(2, "port", "in", b"later")
+    assert [frame.data for frame in live.frames()] == [bytes(range(256)) * 100, b"later"]
 
 
 @pytest.mark.parametrize("error", [MemoryError("no more"), RuntimeError("a bug"), RecordingError("disk full")])
