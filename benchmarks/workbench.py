@@ -129,7 +129,7 @@ def sweep(workers: str, seeds: str = "120") -> str:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
-        path.write_text(SWEEP.format(scenario=TEST1, seeds=seeds))
+        path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=seeds))
         plan = load_design(path)
         start = time.perf_counter()
         run_sweep(plan, Path(folder) / "out", workers=int(workers))
@@ -145,7 +145,7 @@ def calibrations(workers: str, seeds: int = 40) -> str:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
-        path.write_text(CALIBRATIONS.format(scenario=TEST1, seeds=seeds))
+        path.write_text(CALIBRATIONS.format(scenario="icra2023/test1", seeds=seeds))
         plan, before = load_design(path), _processor_time()
         run_sweep(plan, Path(folder) / "out", workers=int(workers))
         each = (_processor_time() - before) / seeds
@@ -173,7 +173,7 @@ def dask() -> str:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
-        path.write_text(SWEEP.format(scenario=TEST1, seeds=40))
+        path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=40))
         plan = load_design(path)
         _, once = run_chunk([_task(plan, 0)])
         _, once = run_chunk([_task(plan, 1)])
@@ -198,7 +198,7 @@ def memory(seeds: str) -> str:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
-        path.write_text(SWEEP.format(scenario=TEST1, seeds=int(seeds) // 2).replace("200_000", "20_000"))
+        path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=int(seeds) // 2).replace("200_000", "20_000"))
         run_sweep(load_design(path), Path(folder) / "out", workers=1)
     return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f}"
 

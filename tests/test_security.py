@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import json
 import operator
 import os
 import shutil
@@ -126,6 +127,73 @@ def test_the_store_of_a_sweep_is_no_link_to_another_file(place):
     store.symlink_to(place / "elsewhere.duckdb")
     ended = run("uwbsim", "sweep", place / "plan.toml", "-o", place / "results", "--resume", "--workers", 1)
     assert refused(ended, store)
+
+
+# Files that scenarios and sweeps name.
+
+LINKS = {
+    "antenna": "radio.antenna={{file={name}}}",
+    "slots": "ranging.plan={{file={name}}}",
+    "flight": "bodies.0.motion={{model='recorded', file={name}}}",
+    "recording": "bodies.0.motion={{model='recorded', file={name}, body='a'}}",
+    "temperature": "bodies.0.temperature_c={{model='table', file={name}}}",
+    "delay": "tags.0.group_delay={{model='table', file={name}}}",
+}
+
+
+def linked(place, name, text="a\n1\n"):
+    """Put a file that a scenario may not read where `name` says; returns its name as the scenario has it."""
+    (place / "s").mkdir(exist_ok=True)
+    (place / "s" / "s.toml").write_text((place / "s.toml").read_text())
+    inside = place / "s" / "in.csv"
+    if name == "pipe":
+        os.mkfifo(inside)
+    elif name == "large":
+        inside.touch()
+        os.truncate(inside, 100_000_000)
+    elif name in ("/dev/zero", "../secret.txt"):
+        inside.symlink_to(name)
+    elif name == "folder":
+        inside.mkdir()
+    else:
+        return {"outside": "../secret.txt", "absolute": str(place / "secret.txt"), "NUL": "in\0.csv"}[name]
+    return inside.name
+
+
+@pytest.mark.parametrize("key", LINKS)
+@pytest.mark.parametrize(
+    "name", ["outside", "absolute", "NUL", "pipe", "large", "/dev/zero", "../secret.txt", "folder"]
+)
+def test_a_scenario_reaches_no_file_that_nobody_named(place, key, name):
+    text = LINKS[key].format(name=json.dumps(linked(place, name)))
+    with pytest.raises(uwbsim.UwbsimError) as caught:
+        uwbsim.load(place / "s" / "s.toml", [text])
+    assert SECRET not in str(caught.value)
+    assert ".file: found" in str(caught.value)
+
+
+def test_an_allowed_folder_holds_files_of_scenarios(place):
+    (place / "other").mkdir()
+    (place / "other" / "slots.csv").write_text("time_s,initiator,target\n0,1,2\n0.1,2,3\n")
+    linked(place, "outside")
+    words = ["s/s.toml", "--set", "ranging.plan={file='../other/slots.csv'}"]
+    assert refused(run("uwbsim", "validate", *words, folder=place), "ranging.plan.file", "--allow-files")
+    done = run("uwbsim", "validate", *words, "--allow-files", "other", folder=place)
+    assert done.status == 0, done
+    loaded = uwbsim.load(place / "s" / "s.toml", {"ranging.plan": {"file": "../other/slots.csv"}},
+                         allow_files=[place / "other"])  # fmt: skip
+    assert loaded.ranging.plan.model_dump()["slots"] == ((0.0, 1, 2), (0.1, 2, 3))
+
+
+def test_a_sweep_reaches_no_scenario_that_nobody_named(place):
+    (place / "s").mkdir()
+    plan = place / "s" / "plan.toml"
+    for name in ("../s.toml", str(place / "s.toml"), "/dev/zero"):
+        plan.write_text(f"sweep = {{ scenario = '{name}', protocols = ['ds'], ranges = 10 }}\n")
+        assert refused(run("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1), plan, "sweep.scenario")
+    plan.write_text("sweep = { scenario = '../s.toml', protocols = ['ds'], ranges = 10 }\n")
+    words = ["sweep", plan, "-o", place / "out", "--workers", 1, "--allow-files", place]
+    assert run("uwbsim", *words).status == 0
 
 
 # What lies beside a file of a stranger.

@@ -22,7 +22,7 @@ def test_the_wheel_has_the_scenarios_and_what_they_name(archives):
     known = {f"uwbsim/scenarios/{name}.toml" for name in shipped_scenarios()}
     assert len(known) > 15
     assert known <= set(names)
-    assert "uwbsim/scenarios/antennas/monopole.csv" in names
+    assert "uwbsim/scenarios/bench/monopole.csv" in names
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"uwbsim", "uwblink", "calib"}
 

@@ -11,6 +11,7 @@ from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
 from uwblink.importers.motion_capture import add_poses
+from uwblink.recording.file import Recording
 from uwblink.recording.tags import load_tags
 from uwbsim.boards.server import extended
 from uwbsim.scenario.loading import load
@@ -65,3 +66,10 @@ def test_served_boards_calibrate_like_simulated_ones(tmp_path):
     # Six scores within three and a half sigma: one run in 400 would fail by chance, and the seeds are fixed.
     assert np.abs(score).max() < 3.5
     assert np.abs(apart[0] - apart[1]).max() == pytest.approx(0, abs=0.12)
+
+
+def test_a_flight_in_which_nothing_is_received_goes_through_the_wire(tmp_path):
+    short = ["--set", "run.duration_s=1", "--set", "radio.sensitivity_dbm=0"]
+    run("uwbsim", "run", TRAIN, "-o", tmp_path / "f.uwb", "--through-wire", *short)
+    with Recording.open(tmp_path / "f.uwb") as recording:
+        assert recording.count("exchanges") == 0 < recording.count("faults")

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -60,12 +59,9 @@ def files(folder):
 
 
 def test_a_sweep_says_that_what_was_done_is_kept_and_goes_on_with_it(tmp_path):
-    plan = ROOT / "docs" / "examples" / "sweep.toml"
-    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
-    (tmp_path / "docs" / "examples").mkdir(parents=True)
-    text = plan.read_text()
-    (tmp_path / "docs" / "examples" / "sweep.toml").write_text(re.sub(r"(?m)^seeds = .*$", "seeds = 400", text))
-    plan, results = tmp_path / "docs" / "examples" / "sweep.toml", tmp_path / "results"
+    text = (ROOT / "docs" / "examples" / "sweep.toml").read_text()
+    plan, results = tmp_path / "sweep.toml", tmp_path / "results"
+    plan.write_text(re.sub(r"(?m)^seeds = .*$", "seeds = 400", text))
     process = started("uwbsim", "sweep", str(plan), "-o", str(results), "--workers", "1")
     wait_for(lambda: (results / "results.duckdb.wal").exists() or len(files(results)) > 0, process)
     out, _ = ended(process)
@@ -102,6 +98,43 @@ def test_an_import_that_is_interrupted_is_one_line_and_leaves_nothing(tmp_path):
     # On a quick machine it may have been done before.
     assert (process.returncode, err) in ((130, "interrupted\n"), (0, ""))
     assert files(tmp_path) == (["t.csv"] if process.returncode else ["t.csv", "t.uwb"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("uwbsim", "run", "icra2023/test1", "-o", "f.uwb", "--set", "run.duration_s=100"),
+        ("uwblink", "export", "../long.uwb", "--to", "csv", "-o", "f"),
+        ("calib", "apply", "../long.uwb", "-c", "../c.json", "-o", "f.uwb"),
+    ],
+)
+def test_a_writer_that_is_ended_leaves_nothing(long, tmp_path, words, number):
+    """Ended as soon as it has begun to write, which a poll of its folder sees."""
+    folder = long.parent / f"{tmp_path.name}"
+    folder.mkdir()
+    process = subprocess.Popen(
+        [str(BIN / words[0]), *words[1:]], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    while not any(folder.iterdir()):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.002)
+    _, err = ended(process, number)
+    assert (process.returncode, err) == (130, "interrupted\n")
+    assert list(folder.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """A recording that takes a second to write, and a calibration of its tags."""
+    import calib
+    import uwblink
+
+    folder = tmp_path_factory.mktemp("long")
+    flight = calib.sample_flight(300_000)
+    uwblink.Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags).save(folder / "long.uwb")
+    calib.fit(calib.sample_flight(2000)).calibration.save(folder / "c.json")
+    return folder / "long.uwb"
 
 
 def wait_for(ready, process):

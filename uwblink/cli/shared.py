@@ -32,6 +32,9 @@ BESIDE: Final = ("numpy", "scipy", "duckdb", "pydantic", "simpy", "matplotlib")
 
 _PARAMETER: Final = re.compile(r"`([a-z_]+)`")
 
+SECOND: Final = 2
+"""The interrupt that is not taken."""
+
 MISTAKE: Final = 2
 """Exit status of a command that cannot do what it was told."""
 
@@ -119,18 +122,20 @@ def one_line(text: str) -> str:
 
 @contextmanager
 def _noted_interrupts() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C interrupt as ever, and remember that it did."""
+    """Let Ctrl-C and a polite kill interrupt, and remember that one did; both leave nothing half written behind."""
     asked: list[int] = []
 
     def note(number: int, frame: Any) -> None:
         asked.append(number)
-        signal.default_int_handler(number, frame)
+        if len(asked) != SECOND:  # which would interrupt the tidying up; a third ends what hangs
+            signal.default_int_handler(number, frame)
 
-    before = signal.signal(signal.SIGINT, note)
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(asked)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def with_flags(text: str, flags: Flags = FLAGS) -> str:

@@ -25,6 +25,10 @@ ScenarioFile = Annotated[
     Path, typer.Argument(help="Scenario file (.toml), or the name of one that comes along.", autocompletion=shipped)
 ]
 Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one value.")]
+AllowFiles = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="DIR", help="Folder of files that a scenario may name, beside its own; as often as needed."),
+]
 AsJson = shared.AsJson
 Force = shared.Force
 

@@ -11,7 +11,7 @@ import typer
 from uwblink.cli.guide import add
 from uwblink.cli.shared import interrupts, print_json
 from uwblink.cli.waiting import waiting
-from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress, shipped
+from uwbsim.cli.arguments import AllowFiles, AsJson, Force, Overrides, ScenarioFile, progress, shipped
 
 PANEL: Final = "Scenarios"
 
@@ -38,6 +38,7 @@ def run(
     output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
     seed: Annotated[int | None, typer.Option(min=0, help="Seed instead of the file's.")] = None,
     overrides: Overrides = None,
+    allow_files: AllowFiles = None,
     wire: Annotated[
         bool, typer.Option("--through-wire", help="Encode and decode every report, and record the bytes.")
     ] = False,
@@ -52,7 +53,7 @@ def run(
     from uwblink.output import check_output
 
     check_output(output, force=force, recording=True)
-    loaded = uwbsim.load(scenario, overrides or (), seed)
+    loaded = uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ())
     with progress(loaded.run.name) as report:
         simulated = uwbsim.simulate(loaded, report, contention=contention)
     if wire:
@@ -104,6 +105,7 @@ def serve(
     poses: Annotated[Path | None, typer.Option(help="Motion capture to write as it goes (.csv), in host time.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
     overrides: Overrides = None,
+    allow_files: AllowFiles = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the poses if they exist.")] = False,
 ) -> None:
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
@@ -113,7 +115,7 @@ def serve(
 
     if poses:
         check_output(poses, force=force)
-    loaded = uwbsim.load(scenario, overrides or ())
+    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
     server = uwbsim.Server(extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True))
     try:
@@ -135,6 +137,7 @@ def show(
     scenario: ScenarioFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Page (.html) or picture (.png, .svg, .pdf).")],
     overrides: Overrides = None,
+    allow_files: AllowFiles = None,
     force: Force = False,
 ) -> None:
     """Draw the room, the flights, and one exchange of each protocol."""
@@ -143,19 +146,20 @@ def show(
 
     check_output(output, force=force)
     with waiting("drawing"):
-        uwbsim.show(uwbsim.load(scenario, overrides or ()), output, force=force)
+        uwbsim.show(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), output, force=force)
     typer.echo(f"{output}")
 
 
 def validate(
     scenario: ScenarioFile,
     overrides: Overrides = None,
+    allow_files: AllowFiles = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what a scenario will do, without running it."""
     import uwbsim
 
-    found = uwbsim.preview(uwbsim.load(scenario, overrides or ()))
+    found = uwbsim.preview(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()))
     typer.echo(json.dumps(found.to_dict(), indent=1) if as_json else str(found))
 
 

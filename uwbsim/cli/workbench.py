@@ -12,7 +12,7 @@ import typer
 from uwblink.cli.guide import add, choice, several
 from uwblink.cli.shared import INTERRUPTED, interrupts
 from uwblink.cli.waiting import waiting
-from uwbsim.cli.arguments import AsJson, Force, Overrides, ScenarioFile, progress
+from uwbsim.cli.arguments import AllowFiles, AsJson, Force, Overrides, ScenarioFile, progress
 
 if TYPE_CHECKING:
     import uwbsim
@@ -54,6 +54,7 @@ def compare(
     protocols: Protocols = "all",
     count: Annotated[int, typer.Option("-n", "--ranges", help="Ranges with each protocol.")] = 1_000_000,
     overrides: Overrides = None,
+    allow_files: AllowFiles = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -64,7 +65,7 @@ def compare(
     from uwbsim.protocols import chosen
 
     rows = chosen(_names(protocols))
-    loaded = uwbsim.load(scenario, overrides or ())
+    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     check_folder(output, FILES, force=force)
     with progress(loaded.run.name) as report:
         found = uwbsim.compare(loaded, rows, count, report)
@@ -175,6 +176,7 @@ def optimum(
         Path | None, typer.Option("-o", "--output", help="Folder for pictures of the curves (.png).")
     ] = None,
     overrides: Overrides = None,
+    allow_files: AllowFiles = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -183,7 +185,7 @@ def optimum(
     from uwbsim.protocols import chosen
 
     rows = chosen(_names(protocols))
-    loaded = uwbsim.load(scenario, overrides or ())
+    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
     if output:
         from uwblink.output import check_folder
         from uwbsim.pages import optimum_file, write_optima
@@ -210,11 +212,12 @@ def sweep(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; all cores if not given.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler that runs already.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a killed sweep ended.")] = False,
+    allow_files: AllowFiles = None,
 ) -> None:
     """Run a scenario many times with other settings and seeds; killed and resumed it repeats nothing."""
     import uwbsim
 
-    loaded = uwbsim.load_design(plan)
+    loaded = uwbsim.load_design(plan, allow_files=allow_files or ())
     with interrupts() as stop, progress(loaded.name, eta=True) as report:
 
         def go_on(share: float) -> None:

@@ -1,70 +1,107 @@
 """Files that a scenario names: antenna tables, trajectories, plans. Their contents take the place of their names.
 
-Names are relative to the scenario's folder.
+Names are relative to the scenario's folder, and lead to regular files in it or below, whatever links stand there: who
+runs the scenario of a stranger has named no other file.
 """
 
 from __future__ import annotations
 
 import csv
 import math
+import os
+from collections.abc import Callable, Iterable
+from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from uwblink.errors import UwblinkError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Poses
+from uwblink.recording.schema import SUFFIX, Poses
 from uwbsim.errors import ScenarioError
 
-MOST_POSES = 200_000
+MOST_POSES: Final = 200_000
+MOST_BYTES: Final = 64_000_000
+"""Of a linked file of text: twice what `MOST_POSES` take, at eight numbers of twenty digits."""
+
+MOST_ROWS: Final = 1_000_000
+"""Of a linked table: nearly three hours of slots at 100 Hz; in memory they take 0.2 GB."""
+
+Folders = Iterable[str | os.PathLike[str]]
+Find = Callable[[str, Any], Path]
+"""Returns the file that a key of a scenario names."""
 
 
-def fill_in(table: dict[str, Any], scenario: Path) -> None:
-    """Read what a scenario's table names, in place; raises `ScenarioError`. What is not a table is left alone."""
+def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> None:
+    """Read what a scenario's table names, in place; raises `ScenarioError`. What is not a table is left alone.
+
+    Files lie in the scenario's folder, in one of `folders`, or below one of these.
+    """
+    find = partial(_found, scenario, tuple(folders))
     radio = table.get("radio")
     if isinstance(radio, dict) and isinstance(radio.get("antenna"), dict) and "file" in radio["antenna"]:
-        radio["antenna"] = _antenna(_found(scenario, "radio.antenna.file", radio["antenna"]["file"]))
-    _fill_in_group_delay(scenario, "radio", radio)
+        radio["antenna"] = _antenna(find("radio.antenna.file", radio["antenna"]["file"]))
+    _fill_in_group_delay(find, "radio", radio)
     ranging = table.get("ranging")
     if isinstance(ranging, dict) and isinstance(ranging.get("plan"), dict) and "file" in ranging["plan"]:
         plan = ranging["plan"]
-        plan["slots"] = _plan(_found(scenario, "ranging.plan.file", plan["file"]))
+        plan["slots"] = _plan(find("ranging.plan.file", plan["file"]))
     bodies = table.get("bodies")
     for k, body in enumerate(bodies if isinstance(bodies, list) else []):
         motion = body.get("motion") if isinstance(body, dict) else None
         if isinstance(motion, dict) and motion.get("model") == "recorded" and "file" in motion:
-            path = _found(scenario, f"bodies[{k}].motion.file", motion["file"])
+            path = find(f"bodies[{k}].motion.file", motion["file"])
             motion |= _trajectory(path, motion.get("body"), _duration(table))
     for name in ("bodies", "tags"):
         listed = table.get(name)
         for k, one in enumerate(listed if isinstance(listed, list) else []):
-            _fill_in_profiles(scenario, f"{name}[{k}]", one)
-            _fill_in_group_delay(scenario, f"{name}[{k}]", one)
+            _fill_in_profiles(find, f"{name}[{k}]", one)
+            _fill_in_group_delay(find, f"{name}[{k}]", one)
 
 
-def _fill_in_profiles(scenario: Path, where: str, one: Any) -> None:
+def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path:
+    """Return a file that another file names; raises `ScenarioError`, which begins with `where`.
+
+    It is a regular file of text in the folder `beside` or one of `folders`, or below, or a recording there.
+    """
+    try:
+        place = path.resolve()
+        inside = any(place.is_relative_to(Path(folder).resolve()) for folder in (beside, *folders))
+    except (OSError, RuntimeError, ValueError) as error:  # a circle of links, a NUL
+        raise ScenarioError(f"{where}, but there is no such file beside the scenario") from error
+    if not inside:
+        # Whether there is such a file is nobody's business either.
+        raise ScenarioError(f"{where}, which is not below the folder of that; `allow_files` names other folders")
+    if not place.exists():
+        raise ScenarioError(f"{where}, but there is no such file beside the scenario")
+    if not place.is_file():
+        raise ScenarioError(f"{where}, which is no regular file")
+    if place.suffix != SUFFIX and (size := place.stat().st_size) > MOST_BYTES:
+        raise ScenarioError(f"{where}, which has {size} bytes; at most {MOST_BYTES} are read")
+    return path
+
+
+def _fill_in_profiles(find: Find, where: str, one: Any) -> None:
     """Read what the temperature and the supply voltage of a body or tag name."""
     for key in ("temperature_c", "supply_v"):
         profile = one.get(key) if isinstance(one, dict) else None
         if isinstance(profile, dict) and profile.get("model") == "table" and "file" in profile:
-            rows = _rows(_found(scenario, f"{where}.{key}.file", profile["file"]), ("time_s", key))
+            rows = _rows(find(f"{where}.{key}.file", profile["file"]), ("time_s", key))
             profile |= {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
 
 
-def _fill_in_group_delay(scenario: Path, where: str, one: Any) -> None:
+def _fill_in_group_delay(find: Find, where: str, one: Any) -> None:
     delay = one.get("group_delay") if isinstance(one, dict) else None
     if isinstance(delay, dict) and delay.get("model") == "table" and "file" in delay:
-        delay |= _grid(_found(scenario, f"{where}.group_delay.file", delay["file"]), "delay_cm")
+        delay |= _grid(find(f"{where}.group_delay.file", delay["file"]), "delay_cm")
 
 
-def _found(scenario: Path, key: str, name: Any) -> Path:
+def _found(scenario: Path, folders: tuple[str | os.PathLike[str], ...], key: str, name: Any) -> Path:
     if not isinstance(name, str):
         raise ScenarioError(f"{scenario}: {key}: found {name!r}, expected the name of a file")
-    path = scenario.parent / name
-    if not path.exists():
-        raise ScenarioError(f"{scenario}: {key}: found {name!r}, but there is no such file beside the scenario")
-    return path
+    return check_linked(scenario.parent / name, f"{scenario}: {key}: found {name!r}", scenario.parent, folders)
 
 
 def _duration(table: dict[str, Any]) -> float:
@@ -81,7 +118,10 @@ def _rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
             missing = [c for c in columns if c not in (reader.fieldnames or [])]
             if missing:
                 raise ScenarioError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}")
-            return [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in reader]
+            rows = [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in islice(reader, MOST_ROWS)]
+            if next(reader, None) is not None:
+                raise ScenarioError(f"{path}: more than {MOST_ROWS} rows, which is the most that is read")
+            return rows
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ScenarioError(f"{path}: cannot be read as a table ({error})") from error
 

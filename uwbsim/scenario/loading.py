@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from uwblink.text_files import read_text
 from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
-from uwbsim.scenario.linked_files import fill_in
+from uwbsim.scenario.linked_files import Folders, fill_in
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.shipped import found, nearest
 
@@ -29,14 +29,15 @@ Source = str | os.PathLike[str] | Mapping[str, Any]
 Overrides = Sequence[str] | Mapping[str, Any]
 
 
-def load(source: Source, overrides: Overrides = (), seed: int | None = None) -> Scenario:
+def load(source: Source, overrides: Overrides = (), seed: int | None = None, *, allow_files: Folders = ()) -> Scenario:
     """Read and validate a scenario from a file, from TOML text of more than one line, or from nested tables.
 
     A name of `shipped_scenarios`, as icra2023/train, does for a file where there is none of that name.
 
     `overrides` change single values: a mapping of key paths to values, or words `key.path=value` with TOML values;
-    `seed` replaces `run.seed`. Files that a scenario names lie beside its file, or in the working folder where it has
-    none. Raises `ScenarioError`, one line that says where, what was found and what is allowed.
+    `seed` replaces `run.seed`. Files that a scenario names lie in the folder of its file or below, or in the
+    working folder where it has none; `allow_files` are other folders in which they may lie. Raises `ScenarioError`, one
+    line that says where, what was found and what is allowed.
 
     >>> import uwbsim
     >>> scenario = uwbsim.load(
@@ -61,7 +62,7 @@ def load(source: Source, overrides: Overrides = (), seed: int | None = None) -> 
         _override(table, key, value)
     if seed is not None:
         _override(table, "run.seed", seed)
-    fill_in(table, where)
+    fill_in(table, where, allow_files)
     try:
         return Scenario.model_validate(table)
     except ValidationError as error:

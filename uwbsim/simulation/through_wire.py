@@ -65,7 +65,7 @@ def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
     decoders = {f"board {i}": ColumnDecoder(int(i)) for i in np.unique(simulated.exchanges.initiator)}
     for frame in frames:
         decoders[frame.board].feed(frame.data, frame.time_ns)
-    parts = [d.exchanges() for d in decoders.values()]
+    parts = [d.exchanges() for d in decoders.values()] or [simulated.exchanges]  # nothing was received
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
     order = np.argsort(columns["time_ns"], kind="stable")
     exchanges = replace(parts[0], **{name: column[order] for name, column in columns.items()})

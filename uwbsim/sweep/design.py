@@ -18,6 +18,7 @@ from uwblink.text_files import read_text, require_regular
 from uwblink.toml import FileKey
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
+from uwbsim.scenario.linked_files import Folders, check_linked
 from uwbsim.scenario.loading import load
 from uwbsim.scenario.shipped import SUFFIX, shipped_scenarios
 
@@ -84,6 +85,7 @@ class SweepDesign:
     axes: dict[str, list[Any]]
     rows: list[dict[str, Any]] | None
     fingerprint: str
+    allow_files: tuple[str | os.PathLike[str], ...] = ()
 
     @property
     def points(self) -> int:
@@ -105,8 +107,11 @@ class SweepDesign:
         return Run(number, values, self.seeds[seed])
 
 
-def load_design(path: str | os.PathLike[str]) -> SweepDesign:
+def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> SweepDesign:
     """Read what a sweep varies (.toml); nothing is run yet, and runs are made when they are asked for by number.
+
+    Its scenario, where it is none that comes along, lies in the folder of the file or below, and the files that the
+    scenario names in that of the scenario; `allow_files` are other folders in which they may lie.
 
     Raises `ScenarioError` that says where, what, and the near key where one is misspelt.
 
@@ -127,7 +132,7 @@ def load_design(path: str | os.PathLike[str]) -> SweepDesign:
     >>> design.total, design.run(5).values, design.run(5).seed
     (6, {'radio.rx_noise_ps': 200.0}, 2)
     """
-    path = Path(path)
+    path, folders = Path(path), tuple(allow_files)
     table, text = _parse(path)
     unknown = sorted(set(table) - {"sweep", "vary", "list"})
     if unknown:
@@ -136,7 +141,7 @@ def load_design(path: str | os.PathLike[str]) -> SweepDesign:
     if not isinstance(head, dict):
         raise ScenarioError(f"{path}: sweep: missing table [sweep]")
     _known_keys(path, head)
-    scenario = _scenario(path, head)
+    scenario = _scenario(path, head, folders)
     design = _word(path, head, "design", DESIGNS, "grid")
     kind = _word(path, head, "kind", KINDS, "compare")
     protocols = head.get("protocols", list(PROTOCOLS) if kind == "compare" else ["ds"])
@@ -156,6 +161,7 @@ def load_design(path: str | os.PathLike[str]) -> SweepDesign:
         axes=axes,
         rows=rows,
         fingerprint=_fingerprint(text, scenario),
+        allow_files=folders,
     )
     if plan.total > MOST_RUNS:
         raise ScenarioError(f"{path}: {plan.total} runs are too many, at most {MOST_RUNS}")
@@ -190,12 +196,15 @@ def _known_keys(path: Path, head: Mapping[str, Any]) -> None:
             raise ScenarioError(f"{path}: sweep.{key}: unknown key; {hint}")
 
 
-def _scenario(path: Path, head: Mapping[str, Any]) -> Path:
+def _scenario(path: Path, head: Mapping[str, Any], folders: Folders) -> Path:
     name = head.get("scenario")
     if not isinstance(name, str):
         raise ScenarioError(f"{path}: sweep.scenario: missing, expected a scenario file, relative to this one")
     beside = path.parent / name
-    return beside if beside.exists() else shipped_scenarios().get(name.removesuffix(SUFFIX), beside)
+    shipped = shipped_scenarios().get(name.removesuffix(SUFFIX))
+    if shipped is not None and not beside.exists():
+        return shipped
+    return check_linked(beside, f"{path}: sweep.scenario: found {name!r}", path.parent, folders)
 
 
 def _word(path: Path, head: Mapping[str, Any], key: str, allowed: Sequence[str], default: str) -> str:
@@ -271,13 +280,13 @@ def _fingerprint(text: str, scenario: Path) -> str:
 
 def _check_keys(plan: SweepDesign) -> None:
     """Load the scenario with one value of each key, so that a key which is not there is found before anything runs."""
-    load(plan.scenario)
+    load(plan.scenario, allow_files=plan.allow_files)
     first = {key: listed[0] for key, listed in plan.axes.items()}
     for row in reversed(plan.rows or []):
         first |= row
     for key, value in first.items():
         try:
-            load(plan.scenario, [f"{key}={toml_value(value)}"])
+            load(plan.scenario, [f"{key}={toml_value(value)}"], allow_files=plan.allow_files)
         except UnknownKeyError as error:
             raise ScenarioError(f"{plan.path}: vary: {error}") from error
         except ScenarioError:

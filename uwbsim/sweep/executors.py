@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
+from multiprocessing.connection import Connection
+from threading import Thread
 from typing import Any, Final, Protocol
 
 from uwbsim.errors import ParameterError, UwbsimError
@@ -24,6 +27,10 @@ THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 class ClusterLostError(UwbsimError, ConnectionError):
     """The scheduler of a cluster went away while it worked."""
+
+
+class WorkersLostError(UwbsimError):
+    """Processes that end as they begin."""
 
 
 class Workers(Protocol):
@@ -69,34 +76,46 @@ class InProcess:
 
 
 class Processes:
-    """Processes of this machine; when one dies the pool is made anew, and its chunks come back as lost."""
+    """Processes of this machine; when one dies the pool is made anew, and its chunks come back as lost.
+
+    They end with this process, however that ends: each waits for the end of a pipe that this process holds.
+    """
 
     def __init__(self, size: int, extensions: Extensions) -> None:
         """Start `size` processes; raises `ParameterError` for extensions that they could not import."""
         extensions.check()
         self.size, self._extensions = size, extensions
-        self._pool = self._new()
         self._running: dict[Any, Chunk] = {}
+        self._start()
 
-    def _new(self) -> Any:
+    def _start(self) -> None:
         import multiprocessing
         from concurrent.futures import ProcessPoolExecutor
-
-        with _one_thread_each():
-            pool = ProcessPoolExecutor(self.size, multiprocessing.get_context("spawn"))
-            # Processes inherit the environment when they start, which they do at the first task.
-            list(pool.map(abs, range(self.size)))
-        return pool
-
-    def submit(self, chunk: Chunk) -> None:
-        """Take on a chunk."""
         from concurrent.futures.process import BrokenProcessPool
 
+        context = multiprocessing.get_context("spawn")
+        held, self._held = context.Pipe(duplex=False)
+        self._pool = ProcessPoolExecutor(self.size, context, initializer=_end_with, initargs=(held,))
         try:
-            future = self._pool.submit(run_chunk, chunk, self._extensions)
-        except BrokenProcessPool:
-            self._pool = self._new()
-            future = self._pool.submit(run_chunk, chunk, self._extensions)
+            with _inherited():
+                list(self._pool.map(abs, range(self.size)))
+        except BrokenProcessPool as error:
+            self.close()
+            raise WorkersLostError(
+                "`workers`: a process ended as it began: is there memory for so many, and does the script begin its "
+                "work below `if __name__ == '__main__':`? With 1 the work is done in this process"
+            ) from error
+
+    def submit(self, chunk: Chunk) -> None:
+        """Take on a chunk; raises `WorkersLostError` where processes cannot be started."""
+        from concurrent.futures.process import BrokenProcessPool
+
+        with _inherited():  # a process may be started for it
+            try:
+                future = self._pool.submit(run_chunk, chunk, self._extensions)
+            except BrokenProcessPool:
+                self._start()
+                future = self._pool.submit(run_chunk, chunk, self._extensions)
         self._running[future] = chunk
 
     def finished(self) -> Sequence[Done]:
@@ -115,9 +134,11 @@ class Processes:
         return found
 
     def close(self) -> None:
-        """End the processes; those that still have a chunk are not waited for."""
-        # A pool that is not waited for may find its own pipe closed when the interpreter ends, and says so.
-        self._pool.shutdown(wait=not self._running, cancel_futures=True)
+        """End the processes, those that still have a chunk at once."""
+        if self._running:
+            self._held.close()
+        self._pool.shutdown(cancel_futures=True)
+        self._held.close()
 
 
 class Cluster:
@@ -184,14 +205,31 @@ def _cores() -> int:
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
+def _end_with(held: Connection) -> None:
+    """Have this process end when the other end of a pipe is closed: by its holder, or by that one's end."""
+
+    def wait_for_end() -> None:
+        with suppress(EOFError, OSError):
+            held.recv_bytes()
+        os._exit(1)
+
+    Thread(target=wait_for_end, daemon=True).start()
+
+
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Keep libraries of linear algebra from starting threads of their own in every process."""
+def _inherited() -> Iterator[None]:
+    """Have processes that are started begin with one thread each in linear algebra, and without Ctrl-C.
+
+    A terminal sends that to all of them, and it is this process that answers.
+    """
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]) if hasattr(signal, "pthread_sigmask") else set()
     try:
         yield
     finally:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]

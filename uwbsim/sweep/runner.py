@@ -193,7 +193,8 @@ def _task(plan: SweepDesign, number: int) -> Task:
         name=plan.scenario.stem,
     )
     try:
-        return replace(task, scenario=load(plan.scenario, run.settings(), run.seed).model_dump_json())
+        scenario = load(plan.scenario, run.settings(), run.seed, allow_files=plan.allow_files)
+        return replace(task, scenario=scenario.model_dump_json())
     except ScenarioError as error:
         # Where the file lies is no part of a result.
         return replace(task, error=str(error).removeprefix(f"{plan.scenario}: "))

@@ -107,7 +107,7 @@ def judged(flight):
 def test_a_sweep_draws_what_came_out(tmp_path, more):
     plan = tmp_path / "plan.toml"
     plan.write_text(PLAN.format(scenario=BENCH.as_posix(), more=more))
-    design = uwbsim.load_design(plan)
+    design = uwbsim.load_design(plan, allow_files=[BENCH.parent])
     uwbsim.run_sweep(design, tmp_path / "out", workers=1, evaluate=judged)
     page = write_sweep_page(design, tmp_path / "out").read_text()
     assert re.findall("<figcaption>(.*?)</figcaption>", page) == ["spread (cm)."]
@@ -120,7 +120,7 @@ def test_a_sweep_says_what_its_figures_are(tmp_path):
     plan = tmp_path / "plan.toml"
     head = f"sweep = {{ scenario = '{BENCH.as_posix()}', protocols = ['ds'], ranges = 50, seeds = 1 }}"
     plan.write_text(f"{head}\n[vary]\n'radio.rx_noise_ps' = [50.0, 200.0]\n")
-    design = uwbsim.load_design(plan)
+    design = uwbsim.load_design(plan, allow_files=[BENCH.parent])
     uwbsim.run_sweep(design, tmp_path / "out", workers=1)
     page = write_sweep_page(design, tmp_path / "out").read_text()
     captions = re.findall("<figcaption>(.*?)</figcaption>", page)

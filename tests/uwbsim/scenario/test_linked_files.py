@@ -23,8 +23,7 @@ NOISELESS = ROOT / "scenarios" / "noiseless.toml"
 def changed(tmp_path, old, new):
     folder = tmp_path / "nlos_office"
     folder.mkdir()
-    (tmp_path / "antennas").mkdir()
-    (tmp_path / "antennas" / "monopole.csv").write_text((ROOT / "scenarios/antennas/monopole.csv").read_text())
+    (folder / "monopole.csv").write_text((OFFICE.parent / "monopole.csv").read_text())
     text = OFFICE.read_text()
     assert old in text
     (folder / "office.toml").write_text(text.replace(old, new, 1))
@@ -71,7 +70,7 @@ def test_worlds_that_cannot_be(tmp_path, old, new, fragments):
 
 def test_an_antenna_table_with_a_hole_is_named(tmp_path):
     scenario = changed(tmp_path, "reflection_loss_db = 9.0", "reflection_loss_db = 9.0")
-    table = tmp_path / "antennas" / "monopole.csv"
+    table = tmp_path / "nlos_office" / "monopole.csv"
     lines = table.read_text().splitlines()
     table.write_text("\n".join(lines[:20] + lines[21:]))
     with pytest.raises(ScenarioError, match="a hole in the antenna table: no gain at azimuth -150, elevation"):

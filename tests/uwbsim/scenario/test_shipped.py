@@ -53,11 +53,11 @@ def test_copies_run_on_their_own(tmp_path):
     written = copy_scenarios(["nlos_office"], tmp_path / "mine")
     assert {path.relative_to(tmp_path).as_posix() for path in written} == {
         "mine/nlos_office/office.toml",
-        "mine/antennas/monopole.csv",
+        "mine/nlos_office/monopole.csv",
     }
     assert uwbsim.load(written[0]) == uwbsim.load("nlos_office/office")
     everything = copy_scenarios([], tmp_path / "all")
-    assert len(everything) == len(shipped_scenarios()) + 1
+    assert len(everything) == len(shipped_scenarios()) + 2
     with pytest.raises(uwbsim.ScenarioError, match="nonsense: no such scenario; known are anchors"):
         copy_scenarios(["icra2023", "nonsense"], tmp_path / "none")
     assert not (tmp_path / "none").exists()

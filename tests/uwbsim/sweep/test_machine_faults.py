@@ -1,11 +1,14 @@
 """Sweeps while their machines misbehave: a damaged store, two sweeps on one folder, a scheduler that goes away."""
 
+import contextlib
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import threading
+import time
+from pathlib import Path
 
 import duckdb
 import pytest
@@ -157,3 +160,64 @@ def test_results_that_are_none_are_no_rows(tmp_path):
         with pytest.raises(TableError, match="damaged"):
             store._db.execute("UPDATE results SET document = 'x'")
             list(store.rows())
+
+
+ENDLESS = "sweep = { scenario = 'noiseless', protocols = ['ds'], ranges = 20000, seeds = 100000 }\n"
+
+
+def session(leader):
+    """The processes of a session that still run."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            pid, rest = stat.parent.name, stat.read_text().rsplit(")", 1)[1].split()
+            if int(rest[3]) == leader and rest[0] != "Z":
+                found.append(int(pid))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_workers_say_nothing_and_end_with_their_sweep(tmp_path, number):
+    (tmp_path / "p.toml").write_text(ENDLESS)
+    words = [str(Path(sys.executable).parent / "uwbsim"), "sweep", "p.toml", "-o", "out", "--workers", "2"]
+    out = tmp_path / "words"
+    with out.open("w") as stream:
+        process = subprocess.Popen(words, cwd=tmp_path, stdout=stream, stderr=stream, start_new_session=True)
+    try:
+        wait_until(lambda: (tmp_path / "out" / "results.duckdb").exists() and len(session(process.pid)) > 2, process)
+        # As a terminal does it: Ctrl-C goes to all of them.
+        (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
+        assert process.wait(60) == (130 if number == signal.SIGINT else -number)
+        for _ in range(200):
+            if not session(process.pid):
+                break
+            time.sleep(0.05)
+        assert session(process.pid) == []
+    finally:
+        for left in session(process.pid):
+            os.kill(left, signal.SIGKILL)
+    if number == signal.SIGINT:  # of a kill Python's own tracker of resources may tell
+        (said,) = out.read_text().splitlines()
+        assert "--resume" in said
+
+
+def wait_until(ready, process):
+    for _ in range(1200):
+        if ready():
+            return
+        assert process.poll() is None
+        time.sleep(0.05)
+    raise AssertionError("nothing happened for a minute")
+
+
+def test_a_worker_that_dies_as_it_begins_is_one_line(tmp_path):
+    """What is installed may end a process that imports it; memory that runs out does the same."""
+    (tmp_path / "p.toml").write_text(ENDLESS)
+    (tmp_path / "sitecustomize.py").write_text("import os, sys\nif '--multiprocessing-fork' in sys.argv: os._exit(9)\n")
+    env = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
+    words = [str(Path(sys.executable).parent / "uwbsim"), "sweep", "p.toml", "-o", "out", "--workers", "2"]
+    done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "--workers" in done.stderr
+    assert not (tmp_path / "out").exists()

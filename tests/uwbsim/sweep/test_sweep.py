@@ -25,7 +25,7 @@ from uwbsim.world.channel import CHANNEL_EFFECTS, register_channel_effect
 
 ROOT = Path(__file__).parents[3]
 BIN = Path(sys.executable).parent
-HEAD = f'[sweep]\nscenario = "{ROOT}/scenarios/icra2023/test1.toml"\nprotocols = ["ss-cfo", "ds"]\n'
+HEAD = '[sweep]\nscenario = "icra2023/test1"\nprotocols = ["ss-cfo", "ds"]\n'
 GRID = '[vary]\n"ranging.response_delay_uus" = [300, 1500]\n"radio.rx_noise_ps" = [0.0, 50.0, 100.0]\n'
 
 
