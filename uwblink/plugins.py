@@ -13,9 +13,10 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Final, Generic, Protocol, TypeVar
 
-from uwblink.errors import ArgumentError, PluginWarning
+from uwblink.errors import ArgumentError, PluginWarning, UwblinkError
 
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
 """What a row can be called: people type it, and it stands in files."""
@@ -70,6 +71,18 @@ class Registry(Mapping[str, Row], Generic[Row]):
     def known(self) -> list[Row]:
         """Return the rows so far, without looking for those of other distributions."""
         return list(self._rows.values())
+
+    @contextmanager
+    def calling(self, name: str, error: type[Exception]) -> Iterator[None]:
+        """Turn what a row of somebody else raises in the block into one line that names it; `error` makes it."""
+        try:
+            yield
+        except UwblinkError:
+            raise
+        except Exception as problem:
+            if name in self._own:
+                raise
+            raise error(f"{self._kind} {name!r}: failed with {_line(problem)}") from problem
 
     def __getitem__(self, name: str) -> Row:
         """Return a row by its name; raises `KeyError`."""

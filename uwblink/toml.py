@@ -64,7 +64,7 @@ class TomlReader:
     def choice(self, key: str, value: Any, allowed: Iterable[Any]) -> Any:
         """Return a value that is one of `allowed`; None among them stands for a key that is not there."""
         listed = list(allowed)
-        if isinstance(value, bool | list | dict) or value not in listed:
+        if not any(type(value) is type(one) and value == one for one in listed):
             names = ", ".join(str(a) for a in listed if a is not None)
             raise self.error(f"{self.path}: {key}: found {value!r}, allowed: {names}")
         return value

@@ -94,7 +94,8 @@ def export_recording(
     try:
         with place_beside(final) as partial:
             partial.mkdir()
-            written = EXPORTERS[to].write(Path(recording), partial)
+            with EXPORTERS.calling(to, RecordingError):
+                written = EXPORTERS[to].write(Path(recording), partial)
             take_name(partial, final)
     except OSError as error:
         if isinstance(error, UwblinkError):

@@ -185,7 +185,7 @@ def import_file(
     check_output(Path(output), force=force, recording=True)
     sources, row, explained = _chosen(source, importer, map_file)
     if row.open_all is not None:
-        with row.open_all(sources, explained, watch) as found:
+        with IMPORTERS.calling(row.name, ImportTableError), row.open_all(sources, explained, watch) as found:
             return Imported(*found.write(output, force=force))
     contents = _read(sources, row, explained)
     contents.save(output, force=force)
@@ -219,7 +219,8 @@ def _chosen(
 
 def _read(sources: list[Path], row: Importer, map_file: Path | None) -> Contents:
     several = row.read_all if len(sources) > 1 else None
-    contents = several(sources, map_file) if several else row.read(sources[0], map_file)
+    with IMPORTERS.calling(row.name, ImportTableError):
+        contents = several(sources, map_file) if several else row.read(sources[0], map_file)
     if not isinstance(contents, Contents):
         raise ArgumentError(f"importer {row.name!r}: returned {contents!r:.60}, expected Contents")
     return contents

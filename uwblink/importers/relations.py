@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.csv_dialect import CsvDialect
+from uwblink.importers.file_lines import LONGEST_LINE, MOST_CELLS
 
 if TYPE_CHECKING:
     import duckdb
-
-LONGEST_LINE: Final = 4_000_000
-"""Bytes; an impulse response in one cell takes 6,000."""
 
 LINES_LOOKED_AT: Final = 1000
 
@@ -62,6 +60,8 @@ def json_relation(path: Path) -> Relation:
     if not fields:
         raise ImportTableError(f"{path}: holds no JSON objects, one a line")
     count = len(fields)
+    if count > MOST_CELLS:
+        raise ImportTableError(f"{path}: its lines have more than {MOST_CELLS} fields")
     cells = ("json_extract_string(json, ?)",) * count
     source = "read_ndjson_objects(?, ignore_errors=true)"
     return Relation(source, tuple(fields), cells, (False,) * count, tuple(fields.values()))
@@ -92,6 +92,8 @@ def parquet_relation(db: duckdb.DuckDBPyConnection, path: Path) -> Relation:
         rows = db.execute("DESCRIBE SELECT * FROM read_parquet(?)", [str(path)]).fetchall()
     except duckdb.Error as error:
         raise ImportTableError(f"{path}: cannot be read as Parquet ({first_line(error)})") from error
+    if len(rows) > MOST_CELLS:
+        raise ImportTableError(f"{path}: has {len(rows)} columns, expected {MOST_CELLS} at most")
     cells = tuple(f"c{k}" for k in range(len(rows)))
     kinds = ("INT", "DOUBLE", "FLOAT", "DECIMAL")
     return Relation(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.csv_dialect import CsvDialect, detect
-from uwblink.importers.file_lines import check_file, lines_of
+from uwblink.importers.file_lines import check_file, check_lines, lines_of
 from uwblink.importers.relations import csv_relation, json_relation, parquet_relation
 from uwblink.importers.staging import Kept, Stage, confined
 
@@ -60,10 +60,12 @@ class Table:
             self._db = stage.db if stage else confined([path])
             self._relation = parquet_relation(self._db, path)
         elif ending.endswith((".jsonl", ".ndjson", ".json")):
+            check_lines(path)
             self._relation = json_relation(path)
             self._db = stage.db if stage else confined([path])
         else:
             self._dialect = detect(path, delimiter, decimal)
+            check_lines(path, self._dialect.delimiter)
             self._relation = csv_relation(self._dialect, self._rejects)
             self._db = stage.db if stage else confined([path])
         self.names = self._relation.names
@@ -191,6 +193,8 @@ class Table:
         return Cell(sql, () if key is None else (key,) * sql.count(self._relation.cells[place]))
 
     def _read(self, cells: list[Cell]) -> list[NDArray[Any]]:
+        if not cells:
+            return []
         chosen = ", ".join(f"{cell.sql} AS r{k}" for k, cell in enumerate(cells))
         keys = [key for cell in cells for key in cell.bound]
         query = f"SELECT {chosen} FROM {self._relation.source}"  # noqa: S608 - columns by place, r0, r1 ...
