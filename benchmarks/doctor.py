@@ -102,10 +102,16 @@ def tag_of(flight: Flight, rng: np.random.Generator) -> int:
 
 def pair_off(flight: Flight, rng: np.random.Generator) -> Flight:
     """Make the ranges of one pair 12 to 30 cm longer."""
+    return longer_pair(flight, rng, None)
+
+
+def longer_pair(flight: Flight, rng: np.random.Generator, metres: float | None) -> Flight:
+    """Make the ranges of one pair longer, by 12 to 30 cm where nothing is said."""
     e = flight.exchanges
     pairs = np.unique(np.sort(np.column_stack([e.initiator, e.target]), axis=1), axis=0)
     a, b = pairs[rng.integers(0, len(pairs))]
-    return longer(flight, np.where(of_tag(flight, a) & of_tag(flight, b), rng.uniform(0.12, 0.3), 0.0))
+    size = rng.uniform(0.12, 0.3) if metres is None else metres
+    return longer(flight, np.where(of_tag(flight, a) & of_tag(flight, b), size, 0.0))
 
 
 def swapped_roles(flight: Flight, rng: np.random.Generator) -> Flight:
@@ -202,6 +208,79 @@ def still(flight: Flight, rng: np.random.Generator) -> Flight:
     return changed(longer(flight, tape - known), truth_m=tape)
 
 
+def still_open(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Let nothing move, and a pair be 45 cm longer than the tape says."""
+    return longer_pair(still(flight, rng), rng, 0.45)
+
+
+def in_unit(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Write poses in mm, cm, inches or feet."""
+    many = float(rng.choice([1000.0, 100.0, 1 / 0.0254, 1 / 0.3048]))
+    return replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * many))
+
+
+def arms_in_mm(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Write lever arms in mm."""
+    return arms(flight, lambda tag: tuple(1000 * v for v in tag.lever_arm_m))
+
+
+def without_stamps(flight: Flight, rng: np.random.Generator, *, many: float) -> Flight:
+    """Keep ranges without stamps, in another unit."""
+    none = np.zeros(len(flight.exchanges), dtype=np.int64)
+    ranges = flight.exchanges.range_m * many
+    kept: dict[str, Any] = dict.fromkeys(STAMPS, none)
+    return as_read(changed(flight, range_m=ranges, **kept), rng, protocol="ss")
+
+
+def other_powers(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Write powers as losses, or as hundredths."""
+    e, factor = flight.exchanges, float(rng.choice([-1.0, 100.0, -100.0, 256.0]))
+    return changed(flight, fpp1_dbm=e.fpp1_dbm * factor, fpp2_dbm=e.fpp2_dbm * factor)
+
+
+def doubled(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Let a third of the exchanges stand twice, as where two robots log them."""
+    e = flight.exchanges
+    twice = np.sort(np.concatenate([np.arange(len(e)), np.flatnonzero(rng.random(len(e)) < 0.35)]))
+    return replace(flight, exchanges=e[twice])
+
+
+def exchanged_anchors(flight: Flight, rng: np.random.Generator, *, given: bool) -> Flight:
+    """Give two anchors each other's place, in the poses or in `given` true distances."""
+    a, b = (f"anchor{k}" for k in rng.permutation(4)[:2])
+    body = flight.poses.body
+    wrong = replace(flight, poses=replace(flight.poses, body=np.where(body == a, b, np.where(body == b, a, body))))
+    if not given:
+        return wrong
+    truth = calib.Ranges.from_exchanges(wrong.exchanges, poses=wrong.poses, tags=wrong.tags).truth_m
+    return replace(changed(wrong, truth_m=truth), poses=wrong.poses[:0])
+
+
+def noisy_powers(flight: Flight, rng: np.random.Generator) -> Flight:
+    """Let powers follow distance, but for the noise of readings, which leaves it 59 % of the variance."""
+    e = flight.exchanges
+    truth = calib.Ranges.from_exchanges(e, poses=flight.poses, tags=flight.tags).truth_m
+    shared = -82.0 - 20 * np.log10(truth / 3.5)
+    noise = np.std(shared) * np.sqrt(2 * (1 / 0.59 - 1)) * rng.standard_normal((2, len(e)))
+    return changed(flight, fpp1_dbm=shared + noise[0], fpp2_dbm=shared + noise[1])
+
+
+def other_anchor(flight: Flight, rng: np.random.Generator, *, plan: Plan, gap: bool) -> Flight | list[Flight]:
+    """Change an anchor's delay by 1.5 ns between two sessions: two recordings, or one with a day between."""
+    seed, tag = int(rng.integers(0, 2**31)), 100 + int(rng.integers(0, plan.anchors))
+    size = float(rng.choice([-1, 1])) * 1.5 * LIGHT * 1e-9 / 2
+    first, second = fly(plan, seed, 1), fly(plan, seed + 1, 1)
+    if not gap:
+        return [named(first, "first"), named(longer(second, np.where(of_tag(second, tag), size, 0.0)), "second")]
+    day = 86_400 * 10**9
+    late, late_poses = (
+        times > 1e9 * (1 + plan.seconds / 2) for times in (first.exchanges.time_ns, first.poses.time_ns)
+    )
+    both = longer(first, np.where(of_tag(first, tag) & late, size, 0.0))
+    both = changed(both, time_ns=both.exchanges.time_ns + np.where(late, day, 0))
+    return replace(both, poses=replace(both.poses, time_ns=both.poses.time_ns + np.where(late_poses, day, 0)))
+
+
 def as_read(flight: Flight, rng: np.random.Generator, **columns: Any) -> Flight:
     """Return a flight that was imported otherwise than it was recorded."""
     whole = {
@@ -236,6 +315,8 @@ ANCHORS: Final = Plan(anchors=4, tags_a_body=1)
 LASTING: Final = "reflections that last"
 SHORT: Final = Plan(seconds=2)
 ONE: Final = Plan(tags_a_body=1, bodies=5)
+RIG: Final = Plan(bodies=1, anchors=6)
+FEW: Final = "too few pairs"
 
 CLEAN: Final = (
     *(Case(name, plan, nothing, frozenset(), also)
@@ -299,6 +380,26 @@ FAULTS: Final = (
          names("anchor moved between recordings")),
     Case("a delay of 0.5 to 1.2 ns more in the second", ONE, partial(other_delay, plan=ONE),
          names("delay changed between recordings")),
+    Case("an anchor's delay 1.5 ns off in the second of two", ANCHORS, partial(other_anchor, plan=ANCHORS, gap=False),
+         names("delay changed between recordings")),
+    Case("the same, a rig of two tags", SHORT, partial(other_anchor, plan=RIG, gap=False),
+         names("delay changed between recordings"), names(FEW)),
+    Case("the same, one recording with a day's gap", SHORT, partial(other_anchor, plan=RIG, gap=True),
+         names("delay changed mid-flight"), names(FEW)),
+    Case("poses in mm, cm, inches or feet", BASE, in_unit, names("unit of the poses")),
+    Case("lever arms in mm", BASE, arms_in_mm, names("lever arm unit")),
+    Case("ranges without stamps in mm", BASE, partial(without_stamps, many=1000.0), names("unit of the ranges")),
+    Case("reported ranges in mm beside stamps", BASE, lambda f, _: changed(f, range_m=f.exchanges.range_m * 1000),
+         names("unit of the reported ranges")),
+    Case("powers as losses, or times 100 or 256", BASE, other_powers, names("unit of the powers")),
+    Case("a third of the rows twice", BASE, doubled, names("doubled exchanges")),
+    Case("two anchors exchanged in the poses", RIG, partial(exchanged_anchors, given=False),
+         names("anchor stands elsewhere"), names(FEW)),
+    Case("two anchors exchanged in the true distances", RIG, partial(exchanged_anchors, given=True),
+         names("ranges that do not follow the distances"), names(FEW)),
+    Case("nothing moves, and a pair is 45 cm long", BASE, still_open, names("pairs that do not close"),
+         names("static data")),
+    Case("power that follows distance, and noise", BASE, noisy_powers, names("power confounded with distance")),
 )  # fmt: skip
 
 

@@ -213,7 +213,7 @@ def doctor(
     if not findings:
         typer.echo(f"{', '.join(map(str, recordings))}: nothing found")
     for finding in findings:
-        typer.echo(f"{finding.fault} (confidence {finding.confidence:.2f})")
+        typer.echo(f"{finding.fault}" + (f" (p = {finding.p_value:.1g})" if finding.p_value else ""))
         typer.echo(f"  evidence: {finding.evidence}")
         typer.echo(f"  remedy:   {finding.remedy}")
     for name, some in skews.items():

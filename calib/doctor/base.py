@@ -17,12 +17,15 @@ PLAUSIBLE_M: Final = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A fault: its name, what shows it, what to do, and how sure the doctor is (0 to 1)."""
+    """A fault: its name, what shows it, what to do, and how likely sound data would show as much.
+
+    `p_value` is 0 where no chance is involved: numbers that contradict each other, or a design that leaves unknowns.
+    """
 
     fault: str
     evidence: str
     remedy: str
-    confidence: float
+    p_value: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +33,8 @@ class RecordingView:
     """A recording as the examinations see it; `truth_m` (n,) is NaN where nothing says it.
 
     Each exchange is there once; `reported_twice` were reported by both ends, and `contradictions` say how two reports
-    of one differ. `arrangements` are those that the recording marks.
+    of one differ; `doubled` rows repeated another one. It is `posed` where true distances come from poses.
+    `arrangements` are those that it marks.
     """
 
     name: str
@@ -42,6 +46,8 @@ class RecordingView:
     truth_m: Floats
     reported_twice: int = 0
     contradictions: tuple[str, ...] = ()
+    doubled: int = 0
+    posed: bool = False
     arrangements: tuple[Arrangement, ...] = ()
 
     @property
@@ -63,10 +69,21 @@ def chosen(view: RecordingView, rows: Bools) -> RecordingView:
 def spread_m(view: RecordingView, truth_m: Floats | None = None, raw_m: Floats | None = None) -> float:
     """Robust spread of errors after each pair's own median, metres; infinity where nothing is known."""
     error = (view.raw_m if raw_m is None else raw_m) - (view.truth_m if truth_m is None else truth_m)
+    left = less_pairs(view, error)
+    good = np.isfinite(left)
+    return robust_spread(left[good], 0.0) if good.any() else float("inf")
+
+
+def less_pairs(view: RecordingView, error_m: Floats) -> Floats:
+    """Return errors (n,) less the median of their pair, NaN for pairs with ten or fewer."""
     pair = pair_ids(view.exchanges)
-    good = np.isfinite(error)
-    parts = [v - np.median(v) for p in np.unique(pair[good]) if len(v := error[good & (pair == p)]) > 10]
-    return robust_spread(np.concatenate(parts), 0.0) if parts else float("inf")
+    left = np.full(len(error_m), np.nan)
+    good = np.isfinite(error_m)
+    for p in np.unique(pair[good]):
+        rows = good & (pair == p)
+        if np.count_nonzero(rows) > 10:
+            left[rows] = error_m[rows] - np.median(error_m[rows])
+    return left
 
 
 def pair_ids(e: Exchanges) -> Ints:

@@ -7,8 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.doctor.base import Finding, RecordingView, pair_ids
-from calib.doctor.levels import medians
+from calib.doctor.base import RecordingView, pair_ids
+from calib.doctor.checks import BUDGET, Seen, exceeds
+from calib.doctor.levels import DOF, OF_MEDIAN, medians
 from calib.estimation.limits import told
 from calib.estimation.plausibility import robust_slope
 from calib.single_sided import corrected, left_skew
@@ -23,19 +24,26 @@ FEWEST: Final = 100
 SPREAD_M: Final = 0.03
 """Skew must be expected to change ranges of a pair by more, for it to be seen in them."""
 
-ONE_WAY_M: Final = 0.1
+ONE_WAY_M: Final = 0.05
+"""By how much ranges of a sound pair may differ by who initiates: the powers of both ways are not quite alike."""
+
 FEWEST_PAIRS: Final = 4
 MORE_THAN_DELAYS_M: Final = 0.15
-EXPLAINED: Final = 0.3
 FEWEST_A_WAY: Final = 15
 NEAR: Final = 0.5
+"""A slope is that of a fault, of 1 or of 2, or none: halfway lies the edge."""
+
 BLIND: Final = "single-sided without carrier readings"
 LEFT: Final = "skew in single-sided ranges"
 WRONG_SIGN: Final = "carrier readings with the wrong sign"
 SCATTER_PPM: Final = 1.5
+"""What single readings of a sound board may scatter: a reply of 1.5 ms then adds a third of a metre to a range."""
+
+NORMAL: Final = 1e6
+"""Degrees of freedom of what many ranges tell."""
 
 
-def skew(view: RecordingView) -> Iterator[Finding]:
+def skew(view: RecordingView) -> Iterator[Seen]:
     """Errors that follow the carriers' readings: skew that was not taken out, or was with the wrong sign."""
     e = view.exchanges
     rows = np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e)
@@ -52,24 +60,35 @@ def skew(view: RecordingView) -> Iterator[Finding]:
     some, error = some[known], error[known]
     # A target's reply lasts longer by the clock of a faster initiator, and so does the range.
     expected = 0.5 * SPEED_OF_LIGHT * 1e-6 * some.skew2_ppm * intervals(some).dt32 * TICK_S
-    ways = _both_ways(some, [expected, error])
+    ways, variance = _both_ways(some, [expected, error])
     if len(ways) and np.max(np.abs(ways[:, 0])) > SPREAD_M:
         # Delays of a pair are the same both ways.
-        slope = float(np.sum(ways[:, 0] * ways[:, 1]) / np.sum(ways[:, 0] ** 2))
-        reach = float(np.max(np.abs(ways[:, 0])))
+        slope, std = _line(ways[:, 0], ways[:, 1], variance[:, 1])
+        reach, dof = float(np.max(np.abs(ways[:, 0]))), NORMAL
     else:
         found = _one_way(some, expected, error)
         if found is None:
             return
-        slope, reach = found
+        slope, std, dof, reach = found
+    p_value = exceeds(slope, std, dof, tolerance=NEAR)
     evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
     for at, fault, remedy in SLOPES[bool(taken.all())]:
         if abs(slope - at) < NEAR:
-            yield Finding(fault, evidence, remedy, 0.9)
+            yield Seen(fault, evidence, p_value, {"more": remedy})
 
 
-def _one_way(some: Exchanges, expected: Floats, error: Floats) -> tuple[float, float] | None:
-    """Return slope and reach where pairs range one way only: among pairs, as delays are smaller than skew, or within.
+def _line(x: Floats, y: Floats, variance: Floats) -> tuple[float, float]:
+    """Return the slope of y (n,) over x (n,) through the origin, and its standard error, by what is left if larger."""
+    square = float(np.sum(x**2 / variance))
+    slope = float(np.sum(x * y / variance)) / square
+    left = float(np.mean((y - slope * x) ** 2 / variance))
+    return slope, float(np.sqrt(max(left, 1.0) / square))
+
+
+def _one_way(some: Exchanges, expected: Floats, error: Floats) -> tuple[float, float, float, float] | None:
+    """Return slope, its error and degrees of freedom, and reach, where pairs range one way only.
+
+    Among pairs, as delays are smaller than skew, or within.
 
     None where skew is too small to be seen.
     """
@@ -79,37 +98,56 @@ def _one_way(some: Exchanges, expected: Floats, error: Floats) -> tuple[float, f
     spread = float(np.std(x))
     if len(x) >= FEWEST_PAIRS and spread > MORE_THAN_DELAYS_M:
         slope = float(x @ y / (x @ x))
-        if float(np.std(y - slope * x)) < EXPLAINED * max(spread, float(np.std(y))):
-            return slope, float(np.ptp(x))
+        dof = len(x) - 2
+        std = float(np.sqrt(np.sum((y - slope * x) ** 2) / dof / (x @ x)))
+        if exceeds(slope, std, dof, tolerance=NEAR) < BUDGET:
+            return slope, std, dof, float(np.ptp(x))
     x, y = _within(some, expected), _within(some, error)
     reach = float(np.ptp(np.percentile(x, (5, 95))))
-    return None if reach < SPREAD_M else (robust_slope(x, y), reach)
+    if reach < SPREAD_M:
+        return None
+    slope = robust_slope(x, y)
+    # Tukey's line rests on medians of thirds.
+    std = float(np.sqrt(2 * OF_MEDIAN * 3 / len(x))) * robust_spread(y - slope * x) / max(_between_thirds(x), 1e-9)
+    return slope, std, NORMAL, reach
 
 
-def _by_direction(some: Exchanges, error: Floats) -> Iterator[Finding]:
+def _between_thirds(x: Floats) -> float:
+    low, high = np.percentile(x, (100 / 6, 500 / 6))
+    return float(high - low)
+
+
+def _by_direction(some: Exchanges, error: Floats) -> Iterator[Seen]:
     """Where carriers were not read: skew makes ranges of a pair longer one way, and as much shorter the other way."""
-    ways = _both_ways(some, [error])
-    spread = robust_spread(_within(some, error))
-    if not len(ways):
-        return
-    worst = float(np.max(np.abs(ways[:, 0])))
-    if worst > max(ONE_WAY_M, spread):
-        yield Finding(
-            LEFT,
-            f"ranges of a pair differ by up to {100 * worst:.0f} cm by who initiates",
-            "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways",
-            0.9,
-        )
+    ways, variance = _both_ways(some, [error])
+    if len(ways):
+        std = np.sqrt(variance[:, 0])
+        worst = int(np.argmax(np.abs(ways[:, 0]) / std))
+        size = float(np.max(np.abs(ways[:, 0])))
+        told = f"ranges of a pair differ by up to {100 * size:.0f} cm by who initiates"
+        p_value = exceeds(float(ways[worst, 0]), float(std[worst]), DOF, tolerance=ONE_WAY_M, tried=len(ways))
+        remedy = "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"
+        yield Seen(LEFT, told, p_value, {"more": remedy})
 
 
-def _both_ways(some: Exchanges, columns: list[Floats]) -> Floats:
-    """Return by how much medians of columns (n,) differ between the two ways of each pair (pairs, columns)."""
-    pair, forth, found = pair_ids(some), some.initiator < some.target, []
+def _both_ways(some: Exchanges, columns: list[Floats]) -> tuple[Floats, Floats]:
+    """Return by how much medians of columns (n,) differ between the two ways of each pair, and their variances.
+
+    Both are (pairs, columns).
+    """
+    pair, forth = pair_ids(some), some.initiator < some.target
+    found, variance = list[list[float]](), list[list[float]]()
     for p in np.unique(pair):
         ways = [(pair == p) & (forth == way) for way in (True, False)]
         if min(np.count_nonzero(way) for way in ways) >= FEWEST_A_WAY:
             found.append([float(np.median(c[ways[0]]) - np.median(c[ways[1]])) for c in columns])
-    return np.array(found).reshape(len(found), len(columns))
+            variance.append([sum(OF_MEDIAN * _square(c[way]) / len(c[way]) for way in ways) for c in columns])
+    shape = len(found), len(columns)
+    return np.array(found).reshape(shape), np.array(variance).reshape(shape)
+
+
+def _square(values: Floats) -> float:
+    return max(robust_spread(values), 1e-4) ** 2
 
 
 def _within(some: Exchanges, values: Floats) -> Floats:
@@ -117,6 +155,37 @@ def _within(some: Exchanges, values: Floats) -> Floats:
     way = pair_ids(some) * 2 + (some.initiator < some.target)
     _, place = np.unique(way, return_inverse=True)
     return np.asarray(values - medians(values, place, int(place.max()) + 1)[place])
+
+
+def swapped_roles(view: RecordingView) -> Iterator[Seen]:
+    """The target's clock against the initiator's: from the third leg, and as the carriers say."""
+    e = view.exchanges
+    double = (e.protocol == "ds") & (e.tx3 != 0) & np.isfinite(e.skew1_ppm)
+    if np.count_nonzero(double) < 100:
+        return
+    spans = intervals(e[double])
+    with np.errstate(all="ignore"):
+        target_faster = (spans.dt53 / spans.dt64 - 1) * 1e6
+    told = e.skew1_ppm[double]
+    pairs = pair_ids(e[double])
+    first = e.initiator[double] < e.target[double]
+    groups = [
+        (float(np.median(target_faster[rows])), float(np.median(told[rows])), OF_MEDIAN * _square(told[rows]) / count)
+        for p in np.unique(pairs)
+        for way in (True, False)
+        if (count := np.count_nonzero(rows := (pairs == p) & (first == way))) > FEWEST_A_WAY
+    ]
+    if not groups:
+        return
+    stamps, readings, variance = np.array(groups).T
+    # The readings' own offset of a tenth of a ppm, which is no noise, hides no slope of 1.
+    slope, std = _line(stamps, readings, variance)
+    if slope < -NEAR:
+        yield Seen(
+            "swapped roles",
+            "the carriers say that the targets' clocks are slower where the stamps say faster, and the other way round",
+            exceeds(slope, std, NORMAL, tolerance=NEAR),
+        )
 
 
 SLOPES: Final = {
@@ -131,34 +200,28 @@ SLOPES: Final = {
 }
 
 
-def unread(view: RecordingView) -> Iterator[Finding]:
+def unread(view: RecordingView) -> Iterator[Seen]:
     """Single-sided ranges whose carriers were not read: nothing says what skew left in them."""
     left = left_skew(view.exchanges)
     if left is None or np.isfinite(left.told_m):
         return
-    yield Finding(
-        BLIND,
-        told(left),
-        "range in both directions of every pair, so that half of the skew's sign is the other way; or record the "
-        "carrier integrator, or use double-sided ranging",
-        0.6,
-    )
+    yield Seen(BLIND, told(left))
 
 
-def carriers(view: RecordingView) -> Iterator[Finding]:
+def carriers(view: RecordingView) -> Iterator[Seen]:
     """Carriers' readings that do not follow the clocks' ratios by the stamps."""
     if without_stamps(view.exchanges).all():
         return
     found = clock_skews(view.exchanges)
-    scatter = {one.pair: one.residual_ppm for one in found if one.residual_ppm is not None and one.count >= FEWEST}
-    wild = [pair for pair, residual in scatter.items() if residual > SCATTER_PPM]
-    if not scatter or len(wild) < max(1, len(scatter) // 2):
+    known = [(one.residual_ppm, one.count, one.pair) for one in found if one.residual_ppm and one.count >= FEWEST]
+    if not known:
         return
-    worst = max(wild, key=lambda pair: scatter[pair])
-    yield Finding(
-        "carrier readings that say little",
-        f"they scatter by {scatter[worst]:.1f} ppm about their median (pair {worst}), in {len(wild)} of {len(scatter)} "
-        "pairs",
-        "do not correct single-sided ranges with them; see to their unit and register",
-        0.7,
+    # That of most pairs: one board that scatters is not the unit of all.
+    scatter, count, pair = sorted(known)[(len(known) - 1) // 2]
+    # Of the logarithm of a median absolute deviation (efficiency 0.37).
+    std = float(1 / np.sqrt(2 * 0.37 * count))
+    p_value = exceeds(max(np.log(scatter / SCATTER_PPM), 0.0), std, NORMAL)
+    told = (
+        f"they scatter by {scatter:.1f} ppm about their median (pair {pair}), and as much or more in half of the pairs"
     )
+    yield Seen("carrier readings that say little", told, p_value)

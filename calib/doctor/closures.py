@@ -9,13 +9,25 @@ from typing import Final
 
 import numpy as np
 
-from calib.doctor.base import Finding, RecordingView
-from calib.doctor.levels import Levels, levels, variance_of_sum
+from calib.doctor.base import RecordingView
+from calib.doctor.checks import BUDGET, Seen, exceeds, positive, stretches
+from calib.doctor.levels import DOF, OF_MEDIAN, Levels, levels
+from calib.doctor.pairs import standing_still
 from uwblink.arrays import Floats
 
 OPEN: Final = "pairs that do not close"
-SURELY: Final = 7.0
-SMALLEST_M: Final = 0.04
+ASTRAY: Final = "ranges that do not follow the distances"
+LOUD_M: Final = 0.3
+"""Mean absolute error of a pair, about its median, that reflections may explain: half of the ranges by 60 cm."""
+
+NAMED: Final = 6
+TOLERANCE_M: Final = 0.04
+"""What lever arms by a ruler and phase centres of antennas do to a pair: 2 cm at either end."""
+
+CURVE_M: Final = 0.2
+"""How far the bias by power of a pair may lie from another's (published curves span so much); told from the pair's own
+only where each pair's power varies."""
+
 EXPLAINS: Final = 0.5
 """Share of the misfit that a pair must explain to be named."""
 
@@ -25,31 +37,51 @@ MOST: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class OpenPair:
-    """Pairs of which one is off by a constant, by how many metres, and how many standard errors that is."""
+    """Pairs of which one is off by a constant, by how many metres, and the p-value of that."""
 
     pairs: tuple[int, ...]
     offset_m: float
-    deviation: float
+    p_value: float
 
 
-def closures(view: RecordingView) -> Iterator[Finding]:
+def closures(view: RecordingView) -> Iterator[Seen]:
     """Pairs whose level the delays of their tags do not explain, with the worst closure around four tags."""
     known = levels(view)
     if known is None:
         return
-    for one in open_pairs(known):
+    for one in open_pairs(known, TOLERANCE_M + (CURVE_M if standing_still(view) is not None else 0.0)):
         names, way = " or ".join(known.named(pair) for pair in one.pairs), "long" if one.offset_m > 0 else "short"
-        yield Finding(
+        yield Seen(
             OPEN,
             f"ranges of pair {names} are {100 * abs(one.offset_m):.1f} cm too {way} for "
             f"the delays of their tags{_around(known, one.pairs[0])}",
-            "look for a wall or a body between these two, and at their lever arms; record the pair anew, or fit with "
-            "`constants` pair",
-            0.8,
+            one.p_value,
         )
 
 
-def open_pairs(known: Levels) -> list[OpenPair]:
+def astray(view: RecordingView) -> Iterator[Seen]:
+    """Pairs whose ranges and true distances have little to do with each other."""
+    known = levels(view)
+    if known is None:
+        return
+    told, least = [], 1.0
+    for pair in range(len(known.level)):
+        rest = np.minimum(np.abs(known.rest[known.pair == pair]), 10 * LOUD_M)
+        means = np.array([float(np.mean(rest[s])) for s in stretches(len(rest))])
+        p_value = positive(means - LOUD_M, tried=len(known.level))
+        if p_value < BUDGET:
+            told.append(f"{known.named(pair)} by {np.mean(means):.2f} m")
+            least = min(least, p_value)
+    if told:
+        more = f" and {len(told) - NAMED} pairs more" if len(told) > NAMED else ""
+        yield Seen(
+            ASTRAY,
+            f"ranges of pairs {', '.join(told[:NAMED])}{more} differ on average, each pair's median aside",
+            least,
+        )
+
+
+def open_pairs(known: Levels, tolerance_m: float = TOLERANCE_M) -> list[OpenPair]:
     """Return pairs that are off, the surest first, each beside those found before."""
     tags, place = np.unique(known.ends, return_inverse=True)
     place = place.reshape(known.ends.shape)
@@ -59,16 +91,12 @@ def open_pairs(known: Levels) -> list[OpenPair]:
     design[np.arange(count), place[:, 1]] += 1
     if count <= np.linalg.matrix_rank(design):
         return []
-    values = known.clipped
-    variance = np.array([
-        variance_of_sum(values[known.pair == p], known.time_s[known.pair == p]) / np.count_nonzero(known.pair == p)
-        for p in range(count)
-    ])  # fmt: skip
-    # Medians scatter more than means, and hardly a pair is known better than the least of many.
-    variance = 1.6 * np.maximum(variance, 0.5 * np.median(variance))
+    variance = known.variances(known.clipped) / np.bincount(known.pair)
+    # Hardly a pair is known better than the least of many.
+    variance = OF_MEDIAN * np.maximum(variance, 0.5 * np.median(variance))
     found, level, left = list[OpenPair](), known.level.copy(), design
     for _ in range(MOST):
-        one = _worst(left, level, variance)
+        one = _worst(left, level, variance, tolerance_m)
         if one is None:
             break
         found.append(one)
@@ -78,7 +106,7 @@ def open_pairs(known: Levels) -> list[OpenPair]:
     return found
 
 
-def _worst(design: Floats, level: Floats, variance: Floats) -> OpenPair | None:
+def _worst(design: Floats, level: Floats, variance: Floats, tolerance_m: float) -> OpenPair | None:
     """Return the pair whose own offset explains most, with those that would explain as much."""
     root = 1 / np.sqrt(variance)
     base = np.linalg.svd(design * root[:, None], full_matrices=False)
@@ -94,11 +122,13 @@ def _worst(design: Floats, level: Floats, variance: Floats) -> OpenPair | None:
     top = int(np.argmax(np.abs(deviation)))
     offset = float(residual[top] / free[top] / root[top])
     misfit = float(residual @ residual)
-    if abs(deviation[top]) < SURELY or abs(offset) < SMALLEST_M or deviation[top] ** 2 < EXPLAINS * misfit:
+    std = float(1 / (root[top] * np.sqrt(free[top])))
+    p_value = exceeds(offset, std, DOF, tolerance=tolerance_m, tried=len(level))
+    if p_value == 1 or deviation[top] ** 2 < EXPLAINS * misfit:
         return None
     close = np.flatnonzero(np.abs(deviation) > ALIKE * abs(deviation[top]))
     order = [top, *(int(k) for k in close if k != top)]
-    return OpenPair(tuple(order), offset, float(deviation[top]))
+    return OpenPair(tuple(order), offset, p_value)
 
 
 def _around(known: Levels, pair: int) -> str:

@@ -1,42 +1,31 @@
 """Names the fault in a recording, with the evidence and the remedy.
 
-Each examination looks for one fault. Those that suspect the truth (poses, lever arms, ids, clocks) work by trial: they
-undo the suspected fault, and if the ranges then agree much better with the distances, it was there. The unit of
-agreement is the robust spread of errors after each pair's own median, which neither delays nor a few outliers move.
+Each examination is a row of the table of checks (`calib.doctor.table`). Those that suspect the truth (poses, lever
+arms, ids, clocks) work by trial: they undo the suspected fault, and if the ranges then agree better with the distances,
+it was there; of several, the one that explains most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from calib.doctor import (
-    anchors,
-    clocks,
-    closures,
-    geometry,
-    pairs,
-    protocols,
-    radio,
-    reflected,
-    several,
-    steps,
-    surveys,
-    timestamps,
-)
+from calib.doctor import anchors, clocks, closures, pairs, radio, reflected, several, steps, surveys, timestamps, units
 from calib.doctor.base import Finding, RecordingView, chosen
+from calib.doctor.checks import Check, Seen
 from calib.doctor.long_recordings import Looked, looked_at
+from calib.doctor.table import BETWEEN, CHECKS, GEOMETRY, GROSS, LEVEL, RADIO, ROWS, STRUCTURE, SURVEYS, certain
 from calib.sources import Data, each, opened
 from uwblink.recording.distances import distances_m
-from uwblink.recording.target_reports import differences, single_reports
+from uwblink.recording.target_reports import differences, repeated_rows, single_reports
 from uwblink.twr import raw_range
 
 
 def examine(data: Data | Iterable[Data]) -> list[Finding]:
-    """Return what is wrong with a recording, the surest first: each fault with its evidence and what to do about it.
+    """Return what is wrong with a recording, the gravest first: each fault with its evidence and what to do about it.
 
     `data` is the path of a recording, an open `Recording`, or anything with `exchanges`, `poses` and `tags`, or several
     of those, which are then compared, too; ranges alone do not say enough. Recordings of arrangements without poses are
@@ -58,13 +47,27 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
         if view is not None and not {finding.fault for finding in found} & GROSS_FAULTS:
             views.append(view)
     if len(views) > 1:
-        between = list(several.compared(views))
+        between = _told(BETWEEN, several.compared(views, LEVEL))
         # What moved between two recordings is no fault of either one.
         moved = any(finding.fault == several.MOVED_ANCHOR for finding in between)
         findings = [one for one in findings if not (moved and one.fault == anchors.ELSEWHERE)] + between
     if views and len(views) == len(recordings) and all(view.standing for view in views):
-        findings += surveys.surveyed(recordings)
-    return sorted(findings, key=lambda f: -f.confidence)
+        findings += _told(SURVEYS, surveys.surveyed(recordings))
+    return sorted(findings, key=lambda finding: ORDER.index(finding.fault))
+
+
+def _told(check: Check, seen: Iterable[Seen]) -> list[Finding]:
+    """Return what a check has seen and sound data hardly show, with what to do."""
+    return [
+        Finding(one.fault, one.evidence, check.remedies[one.fault].format(**one.words), one.p_value)
+        for one in seen
+        if certain(one)
+    ]
+
+
+def _run(checks: Sequence[Check], view: RecordingView) -> Iterator[Finding]:
+    for check in checks:
+        yield from _told(check, check.look(view))
 
 
 def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
@@ -73,44 +76,50 @@ def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
         looked = looked_at(source)
         marked = tuple(getattr(source, "arrangements", ()))
     if not looked.count:
-        return [Finding("empty", "the recording holds no exchanges", "record or import some", 1.0)], None
+        return [Finding(EMPTY, "the recording holds no exchanges", "record or import some", 0.0)], None
     view = replace(_admitted(name, looked), arrangements=marked)
-    findings: list[Finding] = []
-    for examination in GROSS:
-        findings += examination(view)
-        if findings:
-            return findings, None
+    for check in GROSS:
+        if gross := _told(check, check.look(view)):
+            return gross, None
+    findings = list(_run(ROWS, view))
     bad = timestamps.impossible(view)
-    findings += timestamps.corrupted(view, bad)
     if bad.all():
-        return [*findings, *timestamps.with_itself(view)], None
-    whole, view = view, chosen(view, ~bad)
+        return findings, None
+    view = chosen(view, ~bad)
+    if units.POWER in {finding.fault for finding in findings}:
+        unknown = np.full(len(view.exchanges), np.nan)
+        view = replace(view, exchanges=replace(view.exchanges, fpp1_dbm=unknown, fpp2_dbm=unknown))
     # Only stamps that make sense can say something about poses, and only right poses something about radios.
-    suspected = [finding for examination in GEOMETRY for finding in examination(view)]
-    if not suspected:
-        suspected = [finding for examination in RADIO for finding in examination(view)]
-    findings += suspected
-    for always in STRUCTURE:
-        findings += always(whole if always in OF_ALL_ROWS else view)
+    findings += _best(view) or list(_run(RADIO, view))
+    findings += _run(STRUCTURE, view)
     found = {finding.fault for finding in findings}
-    # Where nothing moves, every pair has one distance and one power, and the one explains the other.
-    implied = {radio.CONFOUNDED, closures.OPEN} if pairs.STATIC in found else set[str]()
-    if anchors.ELSEWHERE in found:
-        implied |= {closures.OPEN}
-    if steps.MOVED in found or steps.DRIFTED in found or clocks.LEFT in found or clocks.WRONG_SIGN in found:
-        implied |= {closures.OPEN, reflected.MANY, reflected.LASTING}
+    implied = set[str]().union(*(follows for fault, follows in IMPLIED if fault in found))
     return [finding for finding in findings if finding.fault not in implied], view
+
+
+def _best(view: RecordingView) -> list[Finding]:
+    """Return the fault of poses and lever arms that explains most of the errors."""
+    seen = [(check, [one for one in check.look(view) if certain(one)]) for check in GEOMETRY]
+    check, best = max(seen, key=lambda one: sum(fault.gain for fault in one[1]))
+    return _told(check, best)
 
 
 def _admitted(name: str, looked: Looked) -> RecordingView:
     both, poses, tags = looked.exchanges, looked.poses, looked.tags
+    again = repeated_rows(both)
+    both = both[~again]
     reports = single_reports(both)
     e = reports.exchanges
     with np.errstate(all="ignore"):
         raw = raw_range(e)
-    truth = e.truth_m
-    if not np.isfinite(truth).any() and len(poses):
-        truth = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
+    truth, posed = e.truth_m, False
+    if len(poses):
+        by_poses = distances_m(poses, tags, e.initiator, e.target, e.time_ns)
+        given = np.isfinite(truth)
+        # Tables with places of antennas bring both, which are then the same.
+        apart = np.abs(truth - by_poses)[given & np.isfinite(by_poses)]
+        posed = not given.any() or (len(apart) > 0 and float(np.median(apart)) < SAME_M)
+        truth = by_poses if posed else truth
     told = tuple(", ".join(differences(both, a, b)) for a, b in reports.differing.tolist())
     return RecordingView(
         name=name,
@@ -122,26 +131,29 @@ def _admitted(name: str, looked: Looked) -> RecordingView:
         truth_m=truth,
         reported_twice=reports.repeated,
         contradictions=told,
+        posed=posed,
+        doubled=int(np.count_nonzero(again)),
     )
 
 
-Examination = Callable[[RecordingView], Iterator[Finding]]
-GROSS: Final[tuple[Examination, ...]] = (timestamps.single_as_double, timestamps.units, protocols.another)
-GROSS_FAULTS: Final = {"single-sided data taken for double-sided", "unit slip", "timestamp width", "another protocol"}
-GEOMETRY: Final[tuple[Examination, ...]] = (geometry.pose_clock, geometry.geometry, anchors.anchors)
-RADIO: Final[tuple[Examination, ...]] = (clocks.skew, steps.moved_delay, closures.closures, reflected.reflections)
-STRUCTURE: Final[tuple[Examination, ...]] = (
-    timestamps.swapped_roles,
-    timestamps.speed_of_light,
-    timestamps.contradicting,
-    timestamps.with_itself,
-    clocks.unread,
-    clocks.carriers,
-    pairs.pairs,
-    pairs.silent,
-    pairs.still,
-    radio.confounded,
-    radio.unpowered,
-    pairs.no_truth,
+EMPTY: Final = "empty"
+SAME_M: Final = 0.001
+"""Distances that are written down and those of the poses are the same if they differ by rounding."""
+
+ORDER: Final = (EMPTY, *(fault for check in CHECKS for fault in check.remedies))
+CHANGED: Final = {closures.OPEN, reflected.MANY, reflected.LASTING}
+IMPLIED: Final = (
+    # Where nothing moves, every pair has one distance and one power, and the one explains the other.
+    (pairs.STATIC, {radio.CONFOUNDED}),
+    (anchors.ELSEWHERE, {closures.OPEN}),
+    (steps.MOVED, CHANGED),
+    (steps.DRIFTED, CHANGED),
+    (closures.ASTRAY, {*CHANGED, steps.MOVED, steps.DRIFTED}),
+    (clocks.LEFT, {*CHANGED, closures.ASTRAY}),
+    (clocks.WRONG_SIGN, {*CHANGED, closures.ASTRAY}),
+    (units.POWER, {"no powers"}),
+    (units.REPORTED, {"corrupted exchanges"}),
 )
-OF_ALL_ROWS: Final = (timestamps.contradicting, timestamps.with_itself, pairs.silent)
+"""What follows from a fault and is not told beside it."""
+
+GROSS_FAULTS: Final = {fault for check in GROSS for fault in check.remedies}

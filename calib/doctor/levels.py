@@ -24,6 +24,15 @@ FEWEST: Final = 40
 """Ranges of a pair, below which nothing is said of it."""
 
 STRETCHES: Final = 16
+DOF: Final = 9
+"""Degrees of freedom of a variance from differences of neighbouring stretches: two thirds of fourteen (von Neumann)."""
+
+OF_MEDIAN: Final = np.pi / 2
+"""Variance of a median over that of a mean, of normal errors."""
+
+PAUSE_S: Final = 10.0
+"""Time without ranges counts for so long at most: what lies between two sessions says nothing of errors that last."""
+
 CLIP: Final = 2.5
 """Spreads beyond which an error counts no further: a reflection is not to move a mean."""
 
@@ -33,11 +42,13 @@ class Levels:
     """Ranges with a true distance (n,), in order of time, and the `level` of each pair (k,), metres.
 
     `rest` (n,) is what is left of each error, `ends` (k, 2) the tags of a pair, `pair` (n,) which one it is, `time_s`
-    (n,) counts from the first, `spread` is that of the rest. `rows` are those of the view.
+    (n,) counts from the first without pauses, `host_s` (n,) with them, `spread` is that of the rest. `rows` are those
+    of the view.
     """
 
     rows: Ints
     time_s: Floats
+    host_s: Floats
     pair: Ints
     ends: Ints
     level: Floats
@@ -51,6 +62,12 @@ class Levels:
     def pairs_of(self, tag: int) -> Ints:
         """Return the numbers of a tag's pairs."""
         return np.flatnonzero((self.ends == tag).any(axis=1))
+
+    def variances(self, values: Floats) -> Floats:
+        """Return the variance that a range of each pair (k,) adds to a sum of values (n,); see `variance_of_sum`."""
+        return np.array([
+            variance_of_sum(values[self.pair == p], self.time_s[self.pair == p]) for p in range(len(self.level))
+        ])  # fmt: skip
 
     @property
     def clipped(self) -> Floats:
@@ -77,11 +94,13 @@ def levels(view: RecordingView) -> Levels | None:
         common = medians(error - level[pair], step, len(common))
         common -= np.median(common)
     rest = error - level[pair] - common[step]
-    time_s = (e.time_ns[rows] - e.time_ns[rows[0]]) * 1e-9
+    host_s = (e.time_ns[rows] - e.time_ns[rows[0]]) * 1e-9
+    time_s = np.cumsum(np.minimum(np.diff(host_s, prepend=0.0), PAUSE_S))
     ends = np.column_stack([keys[kept] // 65_536, keys[kept] % 65_536])
     return Levels(
-        rows=rows, time_s=time_s, pair=pair, ends=ends, level=level, rest=rest, spread=max(robust_spread(rest), 1e-4)
-    )
+        rows=rows, time_s=time_s, host_s=host_s, pair=pair, ends=ends, level=level, rest=rest,
+        spread=max(robust_spread(rest), 1e-4),
+    )  # fmt: skip
 
 
 def _steps(lifted: Floats) -> Ints:

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.doctor.base import Finding, RecordingView, plausible_share
+from calib.doctor.base import RecordingView, plausible_share
+from calib.doctor.checks import Seen
 from uwblink.arrays import Bools
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.relative_clocks import target_faster_ppm
@@ -24,7 +25,7 @@ SKEW_PPM: Final = 100.0
 MOST: Final = 4000
 
 
-def another(view: RecordingView) -> Iterator[Finding]:
+def another(view: RecordingView) -> Iterator[Seen]:
     """Try every other protocol with as many messages, and every width of the counter."""
     e = view.exchanges[:: max(len(view.exchanges) // MOST, 1)]
     own = _share(e)
@@ -42,15 +43,14 @@ def another(view: RecordingView) -> Iterator[Finding]:
         return
     numbers = f"{100 * share:.1f} % of the ranges are possible, {100 * own:.1f} % as the recording has it"
     if name == said:
-        yield Finding("timestamp width", f"as {bits}-bit stamps {numbers}", f"import again with bits = {bits}", 0.95)
+        yield Seen("timestamp width", f"as {bits}-bit stamps {numbers}", words={"bits": bits})
         return
     alike = [n for n in PROTOCOLS if tried.get((n, bits), 0.0) > share - 0.01 and n != said]
     also = f" (or {' or '.join(n for n in alike if n != name)})" if len(alike) > 1 else ""
-    yield Finding(
+    yield Seen(
         "another protocol",
         f"read as {name}{also}{f' with {bits} bits' if wider else ''} {numbers} ({said})",
-        f'import again with protocol = "{name}"' + (f", bits = {bits}" if wider else ""),
-        0.95,
+        words={"settings": f'protocol = "{name}"' + (f", bits = {bits}" if wider else "")},
     )
 
 

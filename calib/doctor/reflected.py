@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 
 from calib.doctor.advice import advice_on_loss
-from calib.doctor.base import Finding, RecordingView
+from calib.doctor.base import RecordingView
+from calib.doctor.checks import BUDGET, Seen, exceeds, more_often, stretches
 from calib.doctor.levels import Levels, levels
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
@@ -22,8 +23,8 @@ BEYOND: Final = 3.0
 FEWEST: Final = 60
 FEWEST_SPELLS: Final = 2
 LEAST_SHARE: Final = 0.02
-STICKY: Final = 0.35
-"""By how much likelier a reflected range is after a reflected one, for reflections to last."""
+STICKY: Final = 0.25
+"""By how much likelier a reflected range may be after a reflected one in a sound recording: antennas turn slowly."""
 
 SHORTEST_S: Final = 0.8
 """What lasts shorter averages out."""
@@ -35,14 +36,15 @@ LONGEST: Final = 4.0
 """Reflections that last longer than such a part of a recording cannot be told from another level."""
 
 LEAST_STICKY: Final = 0.03
-MANY_SHARE: Final = 0.2
+MANY_SHARE: Final = 0.15
+"""Share of long ranges of a sound recording: among obstacles placed for it a MILUV flight has 12 %."""
+
 GAP: Final = 1
 """Direct ranges that do not end a spell."""
 
 NAMED: Final = 4
 FEWEST_IN_ALL: Final = 150
 FEWEST_OF_TAG: Final = 15
-SURELY: Final = 3.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,33 +57,45 @@ class Reflected:
     sticky: float
     spells: int
     life_s: float
+    p_value: float
 
 
-def reflections(view: RecordingView) -> Iterator[Finding]:
+def reflections(view: RecordingView) -> Iterator[Seen]:
     """Pairs whose reflections last, and recordings of which a large share is reflected."""
     known = levels(view)
     if known is None:
         yield from _of_tags(view)
         return
     found = [one for pair in range(len(known.level)) if (one := reflected(known, pair))]
-    lasting = [one for one in found if one.sticky > STICKY and one.spells >= FEWEST_SPELLS and one.life_s > SHORTEST_S]
+    lasting = [one for one in found if one.p_value < BUDGET and one.spells >= FEWEST_SPELLS and one.life_s > SHORTEST_S]
     if lasting:
         yield _of_lasting(view, known, lasting)
         return
+    if found:
+        yield from _many(view, known, found)
+
+
+def _many(view: RecordingView, known: Levels, found: list[Reflected]) -> Iterator[Seen]:
     counts = np.bincount(known.pair, minlength=len(known.level))
     share = float(np.sum([one.share * counts[one.pair] for one in found]) / counts.sum())
-    if share > MANY_SHARE:
+    long = np.zeros(len(known.rest))
+    for one in found:
+        rows = known.pair == one.pair
+        centre, spread = _core(known.rest[rows])
+        long[rows] = np.abs(known.rest[rows] - centre) > BEYOND * spread
+    parts = [float(np.mean(long[s])) for s in stretches(len(long))]
+    std = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if parts else np.inf
+    p_value = exceeds(share, std, len(parts) - 1, tolerance=MANY_SHARE)
+    if p_value < 1:
         detour = float(np.average([one.detour_m for one in found], weights=[one.share for one in found]))
-        yield Finding(
-            MANY,
+        told = (
             f"about {100 * share:.0f} % of the ranges are longer than noise explains, by {100 * detour:.0f} cm on "
-            "average",
-            f"move antennas away from bodies and walls{advice_on_loss(view)}",
-            0.75,
+            "average"
         )
+        yield Seen(MANY, told, p_value, {"more": f"move antennas away from bodies and walls{advice_on_loss(view)}"})
 
 
-def _of_tags(view: RecordingView) -> Iterator[Finding]:
+def _of_tags(view: RecordingView) -> Iterator[Seen]:
     """Where pairs have a few ranges each: the tags of whose ranges many more are reflected than of the others'."""
     e, good = view.exchanges, np.isfinite(view.error_m)
     if np.count_nonzero(good) < FEWEST_IN_ALL:
@@ -93,23 +107,24 @@ def _of_tags(view: RecordingView) -> Iterator[Finding]:
     centre, spread = _core(rest)
     long = rest > centre + BEYOND * spread
     share = float(np.mean(long))
-    told = []
+    told, p_value = [], more_often(int(np.count_nonzero(long)), len(long), MANY_SHARE)
     for k, tag in enumerate(tags.tolist()):
         mine = (place == k).any(axis=1)
         others = float(np.mean(long[~mine])) if (~mine).any() else share
         count = int(np.count_nonzero(mine))
-        scatter = np.sqrt(max(others * (1 - others), 0.01) / max(count, 1))
-        if count >= FEWEST_OF_TAG and np.mean(long[mine]) > others + SURELY * scatter:
+        p_tag = more_often(int(np.count_nonzero(long[mine])), count, max(others, LEAST_SHARE), tried=len(tags))
+        p_value = min(p_value, p_tag)
+        if count >= FEWEST_OF_TAG and p_tag < BUDGET:
             detour = float(np.mean(rest[mine & long])) - centre
             told.append(f"tag {tag}: {100 * np.mean(long[mine]):.0f} % of its ranges, by {100 * detour:.0f} cm")
-    if told or share > MANY_SHARE:
+    if long.any():
         detour = float(np.mean(rest[long])) - centre
-        yield Finding(
+        yield Seen(
             MANY,
             f"about {100 * share:.0f} % of the ranges are longer than noise explains, by {100 * detour:.0f} cm on "
             "average" + "".join(f"; {one}" for one in told),
-            "see what stands near these antennas; pairs have too few ranges to say more: record for longer",
-            0.7,
+            p_value,
+            {"more": "see what stands near these antennas; pairs have too few ranges to say more: record for longer"},
         )
 
 
@@ -128,7 +143,7 @@ def _less_tags(error: Floats, place: Ints, count: int) -> Floats:
     return np.asarray(rest)
 
 
-def _of_lasting(view: RecordingView, known: Levels, lasting: list[Reflected]) -> Finding:
+def _of_lasting(view: RecordingView, known: Levels, lasting: list[Reflected]) -> Seen:
     worst = sorted(lasting, key=lambda one: -one.share * one.detour_m)
     told = "; ".join(
         f"pair {known.named(one.pair)}: {100 * one.share:.0f} % of its ranges, by {100 * one.detour_m:.0f} cm, for "
@@ -136,13 +151,7 @@ def _of_lasting(view: RecordingView, known: Levels, lasting: list[Reflected]) ->
         for one in worst[:NAMED]
     )
     more = f"; and {len(worst) - NAMED} pairs more" if len(worst) > NAMED else ""
-    return Finding(
-        LASTING,
-        told + more,
-        "such ranges do not average out within a spell: record for many spells, move walls, bodies or antennas"
-        + advice_on_loss(view),
-        0.8,
-    )
+    return Seen(LASTING, told + more, min(one.p_value for one in lasting), {"advice": advice_on_loss(view)})
 
 
 def reflected(known: Levels, pair: int) -> Reflected | None:
@@ -166,6 +175,7 @@ def reflected(known: Levels, pair: int) -> Reflected | None:
         sticky=sticky,
         spells=_spells(long),
         life_s=_life_s(sticky, far, time_s, float(np.mean(long))),
+        p_value=_lasts(long, len(known.level)),
     )
 
 
@@ -173,6 +183,13 @@ def _sticky(long: Bools, lag: int) -> float:
     """Return by how much likelier a range is reflected some ranges after a reflected one, from 0 to 1."""
     after, plain = long[lag:][long[:-lag]], float(np.mean(long))
     return (float(np.mean(after)) - plain) / max(1 - plain, 1e-3) if len(after) else 0.0
+
+
+def _lasts(long: Bools, tried: int) -> float:
+    """Return the p-value of ranges that follow a reflected one and are reflected, too, one pair of many."""
+    plain = float(np.mean(long))
+    after = long[1:][long[:-1]]
+    return more_often(int(np.count_nonzero(after)), len(after), plain + STICKY * (1 - plain), tried=tried)
 
 
 def _life_s(sticky: float, far: float, time_s: Floats, share: float) -> float:

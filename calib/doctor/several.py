@@ -9,52 +9,55 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.doctor.anchors import displaced, standing
-from calib.doctor.base import Finding, RecordingView
-from calib.doctor.levels import levels, medians, variance_of_sum
-from calib.doctor.steps import AGREE, FEWEST_PAIRS, LARGEST_M, SURELY
+from calib.doctor.anchors import Displaced, displaced, place_m, standing
+from calib.doctor.base import RecordingView
+from calib.doctor.checks import Seen, exceeds
+from calib.doctor.levels import DOF, OF_MEDIAN, levels, variance_of_sum
+from calib.doctor.steps import AGREE, FEWEST_OTHERS, FEWEST_PAIRS, LARGEST_M, TOLERANCE_M
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 MOVED_ANCHOR: Final = "anchor moved between recordings"
 OTHER_DELAY: Final = "delay changed between recordings"
 APART_M: Final = 0.08
-SMALLEST_M: Final = 0.04
 FEWEST_COMMON: Final = 3
 
 
-def compared(views: Sequence[RecordingView]) -> Iterator[Finding]:
-    """Yield what differs between recordings, each compared with the one before it."""
-    moved = {view.name: {one.body: one.away_m for one in displaced(view)} for view in views}
+def compared(views: Sequence[RecordingView], level: float) -> Iterator[Seen]:
+    """Yield what differs between recordings, each compared with the one before it; `level` is that of a check."""
+    moved = {view.name: {one.body: one for one in displaced(view) if one.p_value < level} for view in views}
     for first, second in pairwise(views):
         bodies = _moved(first, second, moved)
-        for body, away in bodies.items():
-            yield Finding(
+        for body, (away, p_value) in bodies.items():
+            yield Seen(
                 MOVED_ANCHOR,
                 f"{body} stands {np.linalg.norm(away):.2f} m elsewhere ({away[0]:+.2f} {away[1]:+.2f} {away[2]:+.2f} m"
                 f") in {second.name} than in {first.name}, by its ranges and the places that the recordings give it",
-                f"measure the place of {body} anew, and fit recordings apart until then",
-                0.85,
+                p_value,
+                {"body": body},
             )
         known = {*bodies, *moved[first.name], *moved[second.name]}
         tags = {tag.tag for view in (first, second) for tag in view.tags if tag.body in known}
         yield from _other_delays(first, second, tags)
 
 
-def _moved(first: RecordingView, second: RecordingView, moved: dict[str, dict[str, Floats]]) -> dict[str, Floats]:
-    """Return the anchors of both recordings whose places differ, by how much."""
+def _moved(
+    first: RecordingView, second: RecordingView, moved: dict[str, dict[str, Displaced]]
+) -> dict[str, tuple[Floats, float]]:
+    """Return the anchors of both recordings whose places differ, by how much, and the p-value."""
     found = {}
     for body in sorted(set(standing(first)) & set(standing(second))):
         places = [
-            np.median(view.poses.position_m[view.poses.body == body], axis=0) + moved[view.name].get(body, np.zeros(3))
+            place_m(view, body) + (moved[view.name][body].away_m if body in moved[view.name] else np.zeros(3))
             for view in (first, second)
         ]
-        if np.linalg.norm(places[1] - places[0]) > APART_M and any(body in moved[v.name] for v in (first, second)):
-            found[body] = places[1] - places[0]
+        known = [moved[view.name][body].p_value for view in (first, second) if body in moved[view.name]]
+        if known and np.linalg.norm(places[1] - places[0]) > APART_M:
+            found[body] = places[1] - places[0], min(known)
     return found
 
 
-def _other_delays(first: RecordingView, second: RecordingView, but: set[int]) -> Iterator[Finding]:
+def _other_delays(first: RecordingView, second: RecordingView, but: set[int]) -> Iterator[Seen]:
     """Yield tags all of whose pairs read otherwise, beside what all tags of both recordings share."""
     change = _changes(first, second)
     tags = sorted({tag for ends in change for tag in ends} - but)
@@ -63,17 +66,18 @@ def _other_delays(first: RecordingView, second: RecordingView, but: set[int]) ->
     while len(tags) >= FEWEST_COMMON:
         known = {ends: value for ends, value in change.items() if set(ends) <= set(tags)}
         sizes = {tag: _of_tag(tag, known) for tag in tags}
-        sure = {tag: found for tag, found in sizes.items() if found is not None}
+        sure = {tag: found for tag, found in sizes.items() if found is not None and found[1] < 1}
         if not sure:
             return
-        tag = max(sure, key=lambda t: abs(sure[t][1]))
-        size, _ = sure[tag]
-        yield Finding(
+        tag = min(sure, key=lambda t: (sure[t][1], -abs(sure[t][0])))
+        size, p_value = sure[tag]
+        alike = "all its pairs alike" if sum(tag in ends for ends in known) > 1 else "its only pair"
+        yield Seen(
             OTHER_DELAY,
             f"ranges of tag {tag} are {100 * size:+.1f} cm longer in {second.name} than in {first.name} "
-            f"({2e9 * abs(size) / SPEED_OF_LIGHT:.2f} ns in its delay), all its pairs alike, others are not",
-            f"was the antenna of tag {tag} touched, or its board replaced? calibrate the recordings apart",
-            0.8,
+            f"({2e9 * abs(size) / SPEED_OF_LIGHT:.2f} ns in its delay), {alike}, others are not",
+            p_value,
+            {"tag": tag},
         )
         tags.remove(tag)
 
@@ -91,9 +95,10 @@ def _changes(first: RecordingView, second: RecordingView) -> dict[tuple[int, int
         parts = [parts[0] & ~late, parts[1] & late]
         if min(np.count_nonzero(part) for part in parts) < 20:
             continue
-        level = [medians(known.rest[part], np.zeros(np.count_nonzero(part), np.int64), 1)[0] for part in parts]
+        level = [np.median(known.rest[part]) for part in parts]
         variance = sum(
-            1.6 * variance_of_sum(known.clipped[part], known.time_s[part]) / np.count_nonzero(part) for part in parts
+            OF_MEDIAN * variance_of_sum(known.clipped[part], known.time_s[part]) / np.count_nonzero(part)
+            for part in parts
         )
         found[ends[0], ends[1]] = (float(level[1] - level[0]), float(variance))
     return found
@@ -118,17 +123,21 @@ def _joined(first: RecordingView, second: RecordingView) -> RecordingView:
 
 
 def _of_tag(tag: int, change: dict[tuple[int, int], tuple[float, float]]) -> tuple[float, float] | None:
-    """Return a tag's own change and how many standard errors it is, None where its or other pairs say otherwise."""
+    """Return a tag's own change and its p-value, None where its or other pairs say otherwise."""
     mine = np.array([value for ends, value in change.items() if tag in ends])
     rest = np.array([value for ends, value in change.items() if tag not in ends])
-    if len(mine) < FEWEST_PAIRS or not len(rest):
+    if len(mine) < FEWEST_PAIRS and not (len(mine) and len(rest) >= FEWEST_OTHERS):
+        return None
+    if not len(rest):
         return None
     base = float(np.median(rest[:, 0]))
     weight = 1 / mine[:, 1]
     size = float(np.average(mine[:, 0], weights=weight)) - base
-    sure = size * float(np.sqrt(weight.sum()))
     alike = np.all(np.abs(mine[:, 0] - base - size) < AGREE * abs(size))
     quiet = abs(float(np.median(np.abs(rest[:, 0] - base)))) < AGREE * abs(size)
-    if abs(sure) < SURELY or not SMALLEST_M < abs(size) < LARGEST_M or not (alike and quiet):
+    if abs(size) > LARGEST_M or not (alike and quiet):
         return None
-    return size, sure
+    # Either recording has a variance of its own; every tag was tried.
+    tried = len({tag for ends in change for tag in ends})
+    std = float(1 / np.sqrt(weight.sum()))
+    return size, exceeds(size, std, 2 * DOF * len(mine), tolerance=TOLERANCE_M, tried=tried)

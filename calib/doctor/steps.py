@@ -8,8 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.doctor.base import Finding, RecordingView
-from calib.doctor.levels import Levels, levels, variance_of_sum
+from calib.doctor.base import RecordingView
+from calib.doctor.checks import Seen, exceeds
+from calib.doctor.levels import DOF, Levels, levels
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -21,11 +22,13 @@ MARGIN: Final = 0.06
 """Part of a recording at either end in which no change is looked for."""
 
 FEWEST_PAIRS: Final = 2
-FEWEST: Final = 12
-SURELY: Final = 7.0
-"""Standard errors of a shift, at the best of many times and tags."""
+FEWEST_OTHERS: Final = 3
+"""Pairs of others that do not shift, which a tag with one pair needs, for that pair to be its own matter."""
 
-SMALLEST_M: Final = 0.03
+FEWEST: Final = 12
+TOLERANCE_M: Final = 0.02
+"""What temperature does to a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees."""
+
 LARGEST_M: Final = 0.75
 """Of 5 ns: no antenna and no voltage does more."""
 
@@ -42,16 +45,16 @@ MOST: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """By how much a tag's ranges shift, at what time, and how many standard errors that is."""
+    """By how much a tag's ranges shift, at what time, and the p-value of that at the best of many times and tags."""
 
     tag: int
     size_m: float
     time_s: float
-    deviation: float
+    p_value: float
     drifts: bool
 
 
-def moved_delay(view: RecordingView) -> Iterator[Finding]:
+def moved_delay(view: RecordingView) -> Iterator[Seen]:
     """Tags whose ranges all shift at one time."""
     known = levels(view)
     if known is None or known.time_s[-1] < SHORTEST_S:
@@ -59,35 +62,35 @@ def moved_delay(view: RecordingView) -> Iterator[Finding]:
     for shift in shifts(known):
         ps = f"{abs(shift.size_m) / SPEED_OF_LIGHT * 2e9:.2f} ns"
         if shift.drifts:
-            yield Finding(
+            yield Seen(
                 DRIFTED,
                 f"ranges of tag {shift.tag} drift by {100 * shift.size_m:+.1f} cm over the recording ({ps}), all its "
                 "pairs alike, others do not",
-                f"let tag {shift.tag} warm up, see to its supply; calibrate short parts apart",
-                0.75,
+                shift.p_value,
+                {"tag": shift.tag},
             )
             continue
-        yield Finding(
+        after_s = known.host_s[np.searchsorted(known.time_s, shift.time_s)]
+        alike = "all its pairs alike" if len(known.pairs_of(shift.tag)) > 1 else "its only pair"
+        yield Seen(
             MOVED,
-            f"ranges of tag {shift.tag} shift by {100 * shift.size_m:+.1f} cm {shift.time_s:.0f} s after the start "
-            f"({ps} in its delay), all its pairs alike, others do not",
-            f"look for a loose antenna or another voltage on tag {shift.tag}; calibrate the two parts apart",
-            0.85,
+            f"ranges of tag {shift.tag} shift by {100 * shift.size_m:+.1f} cm {after_s:.0f} s after the start "
+            f"({ps} in its delay), {alike}, others do not",
+            shift.p_value,
+            {"tag": shift.tag},
         )
 
 
 def shifts(known: Levels) -> list[Shift]:
     """Return the tags that shift, the surest first, each after what was found before it is taken off."""
     values, found = known.clipped, list[Shift]()
-    variance = np.array([
-        variance_of_sum(values[known.pair == p], known.time_s[known.pair == p]) for p in range(len(known.level))
-    ])  # fmt: skip
+    variance = known.variances(values)
     for _ in range(MOST):
         some = [one for tag in np.unique(known.ends).tolist() if (one := _shift_of(known, values, variance, tag))]
         some = [one for one in some if one.tag not in {old.tag for old in found}]
         if not some:
             break
-        best = max(some, key=lambda one: abs(one.deviation))
+        best = min(some, key=lambda one: (one.p_value, -abs(one.size_m)))
         found.append(best)
         rows = np.isin(known.pair, known.pairs_of(best.tag))
         values = values - np.where(rows & (known.time_s >= best.time_s), best.size_m, 0.0)
@@ -106,34 +109,35 @@ class _Cut:
         return float(np.sum(self.size / self.variance) / np.sum(1 / self.variance))
 
     @property
-    def deviation(self) -> float:
-        return self.mean * float(np.sqrt(np.sum(1 / self.variance)))
+    def std(self) -> float:
+        return float(1 / np.sqrt(np.sum(1 / self.variance)))
 
 
 def _shift_of(known: Levels, values: Floats, variance: Floats, tag: int) -> Shift | None:
     mine = known.pairs_of(tag)
     others = np.setdiff1d(np.arange(len(known.level)), mine)
-    if len(mine) < FEWEST_PAIRS:
+    needed = FEWEST_PAIRS if len(mine) > 1 or len(others) < FEWEST_OTHERS else 1
+    cuts = np.linspace(MARGIN, 1 - MARGIN, CUTS) * known.time_s[-1]
+    found = [(cut, float(time)) for time in cuts if (cut := _cut(known, values, variance, mine, float(time)))]
+    found = [(cut, time) for cut, time in found if len(cut.size) >= needed]
+    if not found:
         return None
-    length = known.time_s[-1]
-    best: tuple[float, float, _Cut] | None = None
-    for time in np.linspace(MARGIN, 1 - MARGIN, CUTS) * length:
-        cut = _cut(known, values, variance, mine, float(time))
-        if cut is not None and len(cut.size) >= FEWEST_PAIRS and (best is None or abs(cut.deviation) > abs(best[0])):
-            best = cut.deviation, float(time), cut
-    if best is None or abs(best[0]) < SURELY:
+    cut, time = max(found, key=lambda one: abs(one[0].mean) / one[0].std)
+    # Every cut of every tag was tried.
+    tried = CUTS * len(np.unique(known.ends))
+    p_value = exceeds(cut.mean, cut.std, DOF * len(cut.size), tolerance=TOLERANCE_M, tried=tried)
+    if p_value == 1:
         return None
-    deviation, time, cut = best
     rest = _cut(known, values, variance, others, time) if len(others) else None
-    if not _agree(cut) or (rest is not None and abs(rest.mean) > OTHERS * abs(cut.mean)):
+    if not _agree(cut, needed) or (rest is not None and abs(rest.mean) > OTHERS * abs(cut.mean)):
         return None
     time = _sharpened(known, values, mine, time)
     size = _size(known, mine, time)
     rows = np.isin(known.pair, mine)
     drifts = _line(known.time_s[rows], values[rows]) > STEEPER * _step(known.time_s[rows], values[rows], time)
-    if not SMALLEST_M < abs(size) < LARGEST_M or not (drifts or _stays(known, values, mine, time)):
+    if abs(size) > LARGEST_M or not (drifts or _stays(known, values, mine, time)):
         return None
-    return Shift(tag=tag, size_m=size, time_s=time, deviation=deviation, drifts=drifts)
+    return Shift(tag=tag, size_m=size, time_s=time, p_value=p_value, drifts=drifts)
 
 
 def _cut(known: Levels, values: Floats, variance: Floats, pairs: Ints, time: float) -> _Cut | None:
@@ -149,13 +153,13 @@ def _cut(known: Levels, values: Floats, variance: Floats, pairs: Ints, time: flo
     return _Cut(after - before, variance[pairs][enough] * (1 / size[0][enough] + 1 / size[1][enough]))
 
 
-def _agree(cut: _Cut) -> bool:
+def _agree(cut: _Cut, needed: int) -> bool:
     """Return whether all pairs shift alike: an antenna does that to all, a wall only to some."""
     wrong = np.abs(cut.size - cut.mean)
     std = np.sqrt(cut.variance)
     alike = (wrong < AGREE * abs(cut.mean)) | (wrong < np.minimum(APART * std, abs(cut.mean)))
     sure = np.abs(cut.size) > 2 * std
-    return bool(alike.all() and np.count_nonzero(sure & (cut.size * cut.mean > 0)) >= FEWEST_PAIRS)
+    return bool(alike.all() and np.count_nonzero(sure & (cut.size * cut.mean > 0)) >= needed)
 
 
 def _sharpened(known: Levels, values: Floats, pairs: Ints, near: float) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from uwblink.arrays import Bools, Ints
 from uwblink.recording.blocks import ROWS_AT_ONCE
-from uwblink.twr import STAMPS, Exchanges
+from uwblink.twr import STAMPS, Exchanges, without_stamps
 
 if TYPE_CHECKING:
     from uwblink.recording.readers import TableReaders
@@ -59,6 +59,24 @@ def single_reports(exchanges: Exchanges) -> SingleReports:
     keep = np.ones(len(exchanges), dtype=bool)
     keep[second] = False
     return SingleReports(exchanges[keep], int(known.sum()), np.column_stack([first, second])[differs], second)
+
+
+def repeated_rows(exchanges: Exchanges) -> Bools:
+    """Return which exchanges (n,) say again what another row of their pair and reporter said: all stamps and readings.
+
+    Ranges without stamps say little, so that theirs must be of nearly one time, too.
+    """
+    e = exchanges
+    columns = [e.initiator, e.target, e.reporter, *(getattr(e, name) for name in COMPARED)]
+    keys = [np.nan_to_num(column, nan=-1e300) if column.dtype.kind == "f" else column for column in columns]
+    order = np.lexsort((e.time_ns, *reversed(keys)))
+    same = np.ones(max(len(e) - 1, 0), dtype=bool)
+    for key in keys:
+        same &= np.diff(key[order]) == 0
+    same &= ~without_stamps(e)[order][1:] | (np.diff(e.time_ns[order]) < APART_NS)
+    again = np.zeros(len(e), dtype=bool)
+    again[order[1:][same]] = True
+    return again
 
 
 def from_targets(exchanges: Exchanges) -> Bools:

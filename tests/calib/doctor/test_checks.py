@@ -1,0 +1,213 @@
+"""Every check shares one budget of false alarms, and what strangers brought is found, through the front doors."""
+
+import json
+import tarfile
+from collections import Counter
+from csv import DictReader, DictWriter
+from dataclasses import replace
+from io import TextIOWrapper
+
+import numpy as np
+import pytest
+
+import calib
+from benchmarks import doctor as planted
+from benchmarks.flights import Plan, fly
+from calib.doctor.checks import BUDGET
+from calib.doctor.table import CHECKS, LEVEL, rows
+from tests import processes
+from tests.shared_data import ROOT, shared
+from uwblink.importers import import_recording
+from uwblink.recording.file import Recording
+
+SHORT = Plan(seconds=40, per_second=80)
+RIG = replace(SHORT, bodies=1, anchors=6)
+RNG = np.random.default_rng
+
+
+def faults(*flights):
+    return [finding.fault for finding in calib.examine(flights if len(flights) > 1 else flights[0])]
+
+
+def only(flight, fault):
+    (found,) = [one for one in calib.examine(flight) if one.fault == fault]
+    return found
+
+
+def test_checks_that_involve_chance_share_one_budget_and_the_page_shows_them_all():
+    assert sum(not check.certain for check in CHECKS) * LEVEL == pytest.approx(BUDGET)
+    told = Counter(fault for check in CHECKS for fault in check.remedies)
+    assert max(told.values()) == 1
+    assert "\n".join(rows()) in (ROOT / "docs" / "doctor.md").read_text(encoding="utf-8")
+    for case in planted.FAULTS:
+        assert case.expected <= told.keys()
+
+
+def test_findings_have_p_values_below_their_share():
+    found = calib.examine(planted.stepped(fly(SHORT, 91), RNG(1)))
+    assert [one.fault for one in found] == ["delay changed mid-flight"]
+    assert 0 < found[0].p_value < LEVEL
+    assert calib.examine(planted.still(fly(SHORT, 91), RNG(1)))[0].p_value == 0
+
+
+@pytest.mark.parametrize(("many", "unit"), [(1000, "mm"), (100, "cm"), (1 / 0.0254, "in"), (1 / 0.3048, "ft")])
+def test_poses_in_another_unit_are_asked_about(many, unit):
+    flight = fly(SHORT, 92)
+    wrong = replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * many))
+    (found,) = calib.examine(wrong)
+    assert found.fault == "unit of the poses"
+    assert f'distance = "{unit}"' in found.remedy
+
+
+def test_lever_arms_in_mm_are_asked_about():
+    flight = fly(SHORT, 93)
+    found = only(planted.arms_in_mm(flight, RNG(0)), "lever arm unit")
+    assert "0.001" in found.remedy
+
+
+@pytest.mark.parametrize(("many", "unit"), [(1000.0, "mm"), (100.0, "cm")])
+def test_ranges_in_another_unit_are_asked_about(many, unit):
+    bare = planted.without_stamps(fly(SHORT, 94), RNG(0), many=many)
+    found = only(bare, "unit of the ranges")
+    assert f'distance = "{unit}"' in found.remedy
+    beside = fly(SHORT, 94)
+    beside = planted.changed(beside, range_m=beside.exchanges.range_m * many)
+    assert f'distance = "{unit}"' in only(beside, "unit of the reported ranges").remedy
+    assert faults(beside) == ["unit of the reported ranges"]
+
+
+def test_ranges_that_no_radio_measures_are_asked_about_without_any_truth():
+    bare = planted.without_stamps(fly(SHORT, 94), RNG(0), many=1000.0)
+    assert faults(replace(bare, poses=bare.poses[:0])) == ["unit of the ranges"]
+
+
+@pytest.mark.parametrize(("factor", "back"), [(-1, "-1"), (100, "0.01"), (256, "0.00390625")])
+def test_powers_that_are_no_dbm_are_asked_about_and_nothing_is_told_of_their_lack(factor, back):
+    flight = fly(SHORT, 95)
+    e = flight.exchanges
+    loud = planted.changed(flight, fpp1_dbm=e.fpp1_dbm * factor, fpp2_dbm=e.fpp2_dbm * factor)
+    (found,) = calib.examine(loud)
+    assert found.fault == "unit of the powers"
+    assert f"by {back}," in found.remedy
+
+
+@pytest.mark.parametrize("stamps", [True, False])
+def test_rows_that_stand_twice_are_counted(stamps):
+    flight = fly(SHORT, 96)
+    if not stamps:
+        flight = planted.without_stamps(flight, RNG(0), many=1.0)
+    e = flight.exchanges
+    twice = replace(flight, exchanges=e[np.sort(np.concatenate([np.arange(len(e)), np.arange(123)]))])
+    found = only(twice, "doubled exchanges")
+    assert found.evidence.startswith(f"123 of {len(e) + 123} rows")
+    assert "doubled exchanges" not in faults(flight)
+
+
+def test_anchors_that_were_exchanged_are_named_with_each_other():
+    flight = fly(replace(RIG, seconds=60), 97)
+    body = flight.poses.body
+    other = np.where(body == "anchor1", "anchor4", np.where(body == "anchor4", "anchor1", body))
+    found = [
+        one for one in calib.examine(replace(flight, poses=replace(flight.poses, body=other)))
+        if one.fault == "anchor stands elsewhere"
+    ]  # fmt: skip
+    assert [one.evidence.split()[2] for one in found] == ["anchor1", "anchor4"]
+    assert [one.evidence.split("there the recording has ")[1].split(":")[0] for one in found] == ["anchor4", "anchor1"]
+
+
+def test_what_does_not_close_is_told_where_nothing_moves():
+    open_ = planted.still_open(fly(SHORT, 98), RNG(3))
+    assert set(faults(open_)) == {"pairs that do not close", "static data"}
+    assert "45" in only(open_, "pairs that do not close").evidence
+    assert faults(planted.still(fly(SHORT, 98), RNG(3))) == ["static data"]
+
+
+def test_power_that_follows_distance_is_seen_through_noise():
+    assert faults(planted.noisy_powers(fly(SHORT, 99), RNG(3))) == ["power confounded with distance"]
+
+
+@pytest.mark.parametrize("gap", [True, False])
+def test_an_anchor_whose_delay_changed_between_sessions_is_named(gap):
+    made = planted.other_anchor(fly(SHORT, 1), RNG(4), plan=RIG, gap=gap)
+    rng = RNG(4)
+    rng.integers(0, 2**31)
+    anchor = 100 + rng.integers(0, RIG.anchors)
+    fault = "delay changed mid-flight" if gap else "delay changed between recordings"
+    (found,) = [one for one in calib.examine(made) if one.fault != "too few pairs"]
+    assert found.fault == fault
+    assert f"tag {anchor} " in found.evidence
+
+
+def test_the_command_asks_for_units_and_prints_p_values(tmp_path):
+    flight = planted.doubled(planted.stepped(fly(SHORT, 91), RNG(1)), RNG(2))
+    with Recording.create(tmp_path / "f.uwb") as recording:
+        recording.append_tags(flight.tags)
+        recording.append_poses(flight.poses)
+        recording.append_exchanges(flight.exchanges)
+    said = processes.run("calib", "doctor", tmp_path / "f.uwb", "--json")
+    found = {one["fault"]: one["p_value"] for one in json.loads(said.stdout)["findings"]}
+    assert found["doubled exchanges"] == 0
+    assert 0 < found["delay changed mid-flight"] < LEVEL
+    assert said.stderr == ""
+
+
+STARLOC = [
+    "time_s",
+    "from_id",
+    "to_id",
+    "tx1",
+    "rx1",
+    "tx2",
+    "rx2",
+    "tx3",
+    "rx3",
+    "fpp1",
+    "fpp2",
+    "skew1",
+    "skew2",
+    "range",
+]
+RADIOS = {11: 10, 7: 11, 4: 12, 10: 13, 5: 15, 6: 16, 12: 6, 9: 9}
+"""The marker of each radio, as the data's page says."""
+
+
+@pytest.fixture(scope="module")
+def starloc():
+    with tarfile.open(shared("starloc_loop-2d-fast.tar.xz")) as tar:
+
+        def table(name):
+            (path,) = [one for one in tar.getnames() if one.endswith(name)]
+            return list(DictReader(TextIOWrapper(tar.extractfile(path))))
+
+        markers = {int(row[""]): [row[k] for k in "xyz"] for row in table("uwb_markers_v1.csv")}
+        return table("loop-2d-fast_s1/uwb.csv"), markers
+
+
+@pytest.mark.parametrize(
+    ("marker_of", "wrong"),
+    [
+        (RADIOS, set()),
+        ({radio: radio for radio in RADIOS}, {"tag10", "tag11", "tag12"}),
+        (dict(zip(sorted(RADIOS), sorted(RADIOS.values()), strict=True)), {"tag4", "tag5", "tag6", "tag9", "tag11"}),
+    ],
+    ids=["right", "by number", "by order"],
+)
+def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wrong):
+    ranges, markers = starloc
+    names = [*STARLOC, *(f"{end}_{k}_m" for end in ("from", "to") for k in "xyz")]
+    with (tmp_path / "t.csv").open("w") as out:
+        table = DictWriter(out, ["range_m" if name == "range" else name for name in names])
+        table.writeheader()
+        for row in ranges:
+            here = [row[f"tag_pos_{k}"] for k in "xyz"]
+            there = markers.get(marker_of[int(float(row["to_id"]))], ["", "", ""])
+            cells = [*(row[name] for name in STARLOC), *here, *there]
+            table.writerow(dict(zip(table.fieldnames, cells, strict=True)))
+    (tmp_path / "m.toml").write_text('bits = 32\n[units]\nstamps = "ns"\n')
+    import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
+    found = calib.examine(tmp_path / "t.uwb")
+    assert {one.evidence.split()[2] for one in found if one.fault == "anchor stands elsewhere"} == wrong
+    assert {one.fault for one in found} == {
+        "too few pairs",
+        "anchor stands elsewhere" if wrong else "reflections that last",
+    }
