@@ -12,6 +12,7 @@ from scipy import special
 from calib.doctor.base import RecordingView, chosen
 from calib.doctor.checks import Seen, narrower
 from calib.doctor.levels import DOF, Levels, levels, variance_of_sum
+from calib.doctor.pairs import standing_still
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m
@@ -68,7 +69,8 @@ def anchors(view: RecordingView) -> Iterator[Seen]:
 
 def displaced(view: RecordingView) -> list[Displaced]:
     """Return the anchors that may stand elsewhere."""
-    known = levels(view) if view.posed else None
+    # Where nothing moves, each pair has a level that is its own.
+    known = levels(view) if view.posed and standing_still(view) is None else None
     if known is None:
         return []
     places = {body: place_m(view, body) for body in standing(view)}

@@ -80,6 +80,8 @@ def skew(view: RecordingView) -> Iterator[Seen]:
 def _line(x: Floats, y: Floats, variance: Floats) -> tuple[float, float]:
     """Return the slope of y (n,) over x (n,) through the origin, and its standard error, by what is left if larger."""
     square = float(np.sum(x**2 / variance))
+    if square == 0:
+        return 0.0, np.inf
     slope = float(np.sum(x * y / variance)) / square
     left = float(np.mean((y - slope * x) ** 2 / variance))
     return slope, float(np.sqrt(max(left, 1.0) / square))

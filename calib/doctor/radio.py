@@ -18,6 +18,9 @@ EXPLAINED: Final = 0.8
 """Share of the power's variance that distance may explain: beyond, what is fitted over power has more than five times
 the variance that it would have alone (variance inflation, Marquardt 1970)."""
 
+MOSTLY: Final = 0.5
+"""Share of the readings' variance, noise and all, below which it is not distance that powers are made of."""
+
 SHORTEST_M: Final = 0.5
 """Distances that vary less than this cannot explain a power."""
 
@@ -55,8 +58,9 @@ def confounded(view: RecordingView) -> Iterator[Seen]:
     for power in (lifted, np.log(lifted)):
         noise = _noise(view, power, rows)
         share = _explained(power[every], view.truth_m[every], noise)
-        shares.append(1 - (1 - share) * (alone - 1) / max(alone - GROUPS, 1))
-    if max(shares) > EXPLAINED:
+        if _explained(power[every], view.truth_m[every], 0.0) > MOSTLY:
+            shares.append(1 - (1 - share) * (alone - 1) / max(alone - GROUPS, 1))
+    if max(shares, default=0.0) > EXPLAINED:
         yield Seen(CONFOUNDED, f"distance explains {100 * max(shares):.0f} % of the power's variance")
 
 

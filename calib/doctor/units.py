@@ -75,9 +75,11 @@ def _unit(metres: Floats, others: Floats) -> str | None:
     # Distances that say nothing are best when they are divided by most.
     if left[best] < MUCH * min(robust_spread(metres - others), robust_spread(metres)):
         return best
-    same = np.median(metres) * LENGTHS[best] / np.median(others)
-    alone = robust_spread(metres) < STILL_M and abs(np.log(max(same, 1e-9))) < np.log(2)
-    return best if alone and np.median(others) > PLAUSIBLE_M else None
+    # Of one distance, the unit that makes both alike.
+    if robust_spread(metres) > STILL_M or np.median(others) < PLAUSIBLE_M:
+        return None
+    apart = {name: abs(float(np.median(metres - others / many))) for name, many in LENGTHS.items()}
+    return min(apart, key=lambda name: apart[name])
 
 
 MUCH: Final = MATERIAL / 2
