@@ -37,6 +37,7 @@ import uwblink.cli
 import uwbsim
 import uwbsim.cli
 from tests.fuzz.mutations import WORDS, damage_recording
+from tests.fuzz.options import another_option
 from tests.fuzz.seeds import ALONE, KINDS, SELDOM, Kind, write_seeds
 
 MAINS: Final = {"uwblink": uwblink.cli.main, "uwbsim": uwbsim.cli.main, "calib": calib.cli.main}
@@ -50,6 +51,10 @@ USAGE: Final = ("Usage:", "─ Error ─")
 
 OPTIONS_SHARE: Final = 0.1
 """Share of cases in which an option is damaged and not the file."""
+
+
+ANOTHER_SHARE: Final = 0.5
+"""Share of these in which it is an option more."""
 
 
 class Outcome(NamedTuple):
@@ -79,9 +84,12 @@ def _filled(word: str, place: dict[str, str], seeds: Path) -> str:
     return head + str(seeds / rest.rstrip("}")) if brace else word
 
 
-def damage_options(words: list[str], rng: random.Random) -> list[str]:
-    """Change, drop or double one of a command's words after the first two."""
+def damage_options(words: list[str], seeds: Path, rng: random.Random) -> list[str]:
+    """Change, drop or double one of a command's words after the first two, or add an option that it has."""
     changed = list(words)
+    if rng.random() < ANOTHER_SHARE:
+        added = [_filled(word, {}, seeds) for word in another_option(words, rng)]
+        return [*changed, *(word.replace("\x00", "").encode("utf-8", "replace").decode() for word in added)]
     place = rng.randint(2, len(changed))
     hostile = rng.choice(WORDS).replace("\x00", "").encode("utf-8", "replace").decode()
     there = changed[place : place + 1]
@@ -99,7 +107,7 @@ def prepare(number: int, seeds: Path, place: Path) -> list[str]:
         shutil.copytree((seeds / kind.file).parent, damaged.parent)
     if kind.commands is ALONE or rng.random() < OPTIONS_SHARE:
         shutil.copyfile(seeds / kind.file, damaged)
-        return damage_options(words_of(kind, damaged, seeds, place / "out", rng), rng)
+        return damage_options(words_of(kind, damaged, seeds, place / "out", rng), seeds, rng)
     if kind.mutations:
         data = rng.choice(kind.mutations)((seeds / kind.file).read_bytes(), rng)
         damaged.write_bytes(b"" if data is None else data)

@@ -95,7 +95,8 @@ ALONE: Final = (
     "uwbsim schema",
     "uwbsim run {scenario.toml} -o {out} --set run.duration_s=0.5",
     "uwbsim validate {scenario.toml} --set radio.rx_noise_ps=10",
-    "uwbsim predict {scenario.toml} --protocols ss,ds --set ranging.rate_hz=10",
+    "uwbsim predict --protocol ss-cfo --skew-ppm 10 --reply-delay-us 300",
+    "uwbsim predict --protocol ds-alt --final-delay-us 900 --rx-noise-ps 100 --json",
     "uwbsim optimum {scenario.toml} --protocols ds --overhead-us 10 --json",
     "calib export {calibration.json} --to registers -o {out}",
     "calib fit {flight.uwb} -o {out} --fix 1=-0.36 --reference-power -82 --scale 0.1",
@@ -134,7 +135,12 @@ KINDS: Final = (
         "scenario.toml",
         20,
         TEXT,
-        ("uwbsim run {} -o {out}", "uwbsim validate {}", "uwbsim predict {}", "uwbsim predict {} --json"),
+        (
+            "uwbsim run {} -o {out}",
+            "uwbsim run {} -o {out} --through-wire",
+            "uwbsim validate {}",
+            "uwbsim validate {} --json",
+        ),
         ("uwbsim show {} -o {out}.html", "uwbsim compare {} -o {out} -n 200", "uwbsim optimum {} --protocols ds"),
     ),
     Kind("table.csv", 10, TEXT, ("uwblink import csv {} -o {out}", "uwblink import guess {} -o {out}")),
@@ -154,6 +160,8 @@ KINDS: Final = (
         ("calib survey {flight.uwb} --known {} -o {out}", "calib survey {flight.uwb} --known {} -o {out} --json"),
     ),
     Kind("groups.toml", 2, TEXT, ("calib fit {flight.uwb} -o {out} --loss cauchy --group {}",)),
+    Kind("faults.toml", 1, TEXT, ("uwbsim serve {scenario.toml} --faults {} --duration 0.01",)),
+    Kind("results/results.duckdb", 1, BINARY, ("uwbsim sweep {plan.toml} -o {folder} --resume --workers 1",)),
     Kind("plan.toml", 0.1, TEXT, ("uwbsim sweep {} -o {out} --workers 1",)),
     Kind("tags.toml", 3, TEXT, ("uwblink poses {live.uwb} --from ifo001={poses.tum} --tags {}",)),
     Kind("nothing", 8, (), ALONE),
@@ -165,10 +173,12 @@ def write_seeds(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in (
         ("map.toml", MAP), ("known.toml", KNOWN), ("groups.toml", GROUPS), ("plan.toml", PLAN), ("nothing", ""),
+        ("faults.toml", FAULTS),
     ):  # fmt: skip
         (folder / name).write_text(text)
     _write_flights(folder)
     _write_tables(folder)
+    uwbsim.run_sweep(uwbsim.load_design(folder / "plan.toml"), folder / "results", workers=1)
 
 
 def _write_flights(folder: Path) -> None:
@@ -252,6 +262,13 @@ seeds = 1
 
 [vary]
 "radio.rx_noise_ps" = [10.0, 100.0]
+"""
+
+FAULTS: Final = """[[faults]]
+kind = "unplug"
+tag = 1
+at_s = 0.001
+for_s = 0.002
 """
 
 MAP: Final = """protocol = "ds"
