@@ -177,14 +177,14 @@ class Ranges:
         let_go(self.initiator, self.target)
         return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
 
-    def usable(self, why_no_truth: str = "", *, need_power: bool = True) -> Ranges:
+    def usable(self, why_no_truth: str = "", why_no_power: str = "", *, need_power: bool = True) -> Ranges:
         """Leave out what is of a tag with itself, has no true distance, no power or impossible stamps, and count it.
 
         Without `need_power`, ranges without any stay. Raises `UnanswerableError` where nothing is left, with
-        `why_no_truth` where that is the reason.
+        `why_no_truth` or `why_no_power` where that is the reason.
         """
         found = usable_rows(self, need_power=need_power)
-        require_some(self.source, len(self), found.excluded, why_no_truth)
+        require_some(self.source, len(self), found.excluded, why_no_truth, why_no_power)
         if found.keep.all():
             return self
         return replace(self[found.keep], excluded=self.excluded | {r: n for r, n in found.excluded.items() if n})
@@ -219,7 +219,9 @@ def _good(ranges: Ranges, rows: slice, *, need_power: bool) -> Iterator[tuple[st
     yield "impossible stamps", np.isfinite(raw) & (np.abs(raw) < LONGEST_M)
 
 
-def require_some(source: str, count: int, excluded: Mapping[str, int], why_no_truth: str) -> None:
+def require_some(
+    source: str, count: int, excluded: Mapping[str, int], why_no_truth: str, why_no_power: str = ""
+) -> None:
     """Raise `UnanswerableError` where there are no ranges, or all of so many were left out, and say for what."""
     if not count:
         raise UnanswerableError(f"{source}: holds no exchanges")
@@ -230,7 +232,7 @@ def require_some(source: str, count: int, excluded: Mapping[str, int], why_no_tr
         "no true distance": why_no_truth
         or "it needs poses and lever arms (`uwblink poses`), or measured "
         "distances (gt_range_m of a table); without any see `calib survey`, or `calib fit --truth ranges`",
-        "no power": "a calibration without a curve needs none: `calib fit --delays-only` makes one",
+        "no power": why_no_power or "a calibration without a curve needs none: `calib fit --delays-only` makes one",
         "a tag with itself": "look at from_id and to_id of what was imported",
     }
     hint = f"; {hints[most]}" if most in hints else ""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calib.errors import BadInputError, UnanswerableError
 from calib.planted import check_planted
+from calib.range_columns import FAINTEST_DBM, LOUDEST_DBM
 from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
 from calib.recorded import FINGERPRINT, read_ranges
 from uwblink.recording.file import Recording
@@ -208,7 +209,7 @@ def _load(data: Data, need_power: bool) -> Ranges:
         planted = _planted(source, name)
     ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, planted=planted, source=name)
     ranges = replace(ranges, recordings=((name, fingerprint(exchanges)),))
-    return ranges.usable(_why_no_truth(ranges, poses, tags), need_power=need_power)
+    return ranges.usable(_why_no_truth(ranges, poses, tags), _why_no_power(exchanges), need_power=need_power)
 
 
 def _recording(data: str | os.PathLike[str] | Recording) -> AbstractContextManager[Recording]:
@@ -234,6 +235,18 @@ def _planted(source: Source, name: str) -> Mapping[str, Any] | None:
         return None
     check_planted(found, name)
     return found
+
+
+def _why_no_power(exchanges: Exchanges) -> str:
+    """Say which powers cannot be received ones, where there are any: nothing is received at more than a milliwatt."""
+    given = np.concatenate([exchanges.fpp1_dbm, exchanges.fpp2_dbm])
+    given = given[np.isfinite(given) & (given != 0)]
+    if not len(given):
+        return ""
+    return (
+        f"its powers are {np.median(given):+.4g} dBm, received ones lie between {FAINTEST_DBM:.0f} and "
+        f"{LOUDEST_DBM:.0f} dBm; check their unit and sign"
+    )
 
 
 def _why_no_truth(ranges: Ranges, poses: Poses | None, tags: Sequence[Tag]) -> str:

@@ -27,7 +27,7 @@ from calib.estimation.known_delays import imported, std_taken_over, taken_over
 from calib.estimation.limits import limits
 from calib.estimation.losses import MIXTURE
 from calib.estimation.pairs import pairs_of
-from calib.estimation.plausibility import implausible, one_way, refuse_impossible
+from calib.estimation.plausibility import implausible, one_way, refuse_impossible, refuse_refuted
 from calib.estimation.power_levels import unlike_powers
 from calib.estimation.problem import Problem
 from calib.estimation.result import FitResult
@@ -84,8 +84,9 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     constant); `constants` "pair" gives each pair a constant of its own instead of each tag a delay. Where power never
     changes the curve is flat.
 
-    Raises `UnanswerableError` when there are too few ranges or the pairs do not determine the delays, and
-    `BadInputError` for pinned tags or groups that are not in the data, and for a parameter that cannot be used.
+    Raises `UnanswerableError` when there are too few ranges, when the pairs do not determine the delays, or when what
+    was found is beyond what any radio has (true distances in millimetres, say), and `BadInputError` for pinned tags or
+    groups that are not in the data, and for a parameter that cannot be used.
 
     >>> import calib
     >>> result = calib.fit(calib.sample_flight())
@@ -147,6 +148,7 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
         problem, ended = problem.without_design(), found.ended
         del found
         residuals, inliers = _left(calibration, ranges)
+        refuse_refuted(calibration.delays_ns, residuals, ranges)
         columns = residuals, inliers, *(getattr(ranges, name) for name in COLUMNS)
         warnings = [
             *limits(ranges, problem, residuals, fixed),

@@ -16,6 +16,7 @@ from calib.long_columns import computed, let_go, picked
 from calib.ranges import STATIC, Ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
+from uwblink.ticks import TICK_S
 
 MOST_LEFT_OUT: Final = 0.5
 SCALE: Final = (0.75, 1.35)
@@ -24,7 +25,7 @@ SCALE: Final = (0.75, 1.35)
 ENOUGH: Final = 100_000
 """Of more ranges, only every so many are asked for their scale and their clocks."""
 
-UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet", 1000.0: "kilometres"}
+UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
 FEWEST_SPREADS: Final = 3.0
 """True distances must spread by so much more than errors for their scale to be known."""
 
@@ -42,6 +43,10 @@ MEDIAN: Final = 1.2533
 FEWEST_WAYS: Final = 20
 LOUD_M: Final = 0.5
 """Errors that spread by more are not those of a UWB range."""
+
+REGISTER_NS: Final = 65_536 * TICK_S * 1e9
+"""Antenna delays are registers of 16 bits, in ticks: up to 1.03 us, twice what a board has that is programmed with none
+(514 ns). A delay beyond is a length in the wrong unit: 154 m of range a tag."""
 
 
 def refuse_impossible(ranges: Ranges) -> None:
@@ -80,11 +85,19 @@ def _scale(ranges: Ranges) -> None:
     rest = robust_spread(raw - slope * truth)
     if SCALE[0] < slope < SCALE[1] or abs(slope) * robust_spread(truth) < FEWEST_SPREADS * rest:
         return
-    near = [name for ratio, name in UNITS.items() if abs(np.log(max(slope, 1e-9) / ratio)) < 0.2]
-    guess = f"; true distances look like {near[0]}" if near else ""
+    guess = _looks_like(slope)
     raise UnanswerableError(
-        f"{ranges.source}: ranges grow by {slope:.3g} m in a metre of true distance{guess}; give them in metres"
+        f"{ranges.source}: ranges grow by {slope:.3g} m in a metre of true distance; "
+        f"{guess and guess + '; '}give both in metres"
     )
+
+
+def _looks_like(ratio: float) -> str:
+    """Return what ranges that are so many times the true distances look like, an empty text where no unit is near."""
+    whose = "true distances" if ratio < 1 else "ranges"
+    smaller = min(ratio, 1 / max(ratio, 1e-9))
+    near = [name for own, name in UNITS.items() if abs(np.log(max(smaller, 1e-9) / own)) < 0.2]
+    return f"{whose} look like {near[0]}" if near else ""
 
 
 def robust_slope(x: Floats, y: Floats) -> float:
@@ -145,6 +158,27 @@ def _parts(error: Floats, key: Ints) -> dict[int, Floats]:
     let_go(key)
     several = picked(error, order)
     return dict(enumerate(np.split(several, np.cumsum(sizes)[:-1])))
+
+
+def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: Ranges) -> None:
+    """Raise `UnanswerableError` where a fit found what no radio has, so that its calibration is of no use.
+
+    Delays beyond what registers hold, and errors as large as the ranges are: then true distances say nothing of the
+    ranges, as they do in another unit where bodies move so little that how ranges grow with them is not seen.
+    """
+    every = slice(None, None, max(len(ranges) // ENOUGH, 1))
+    typical = float(np.median(np.abs(ranges.raw_m[every])))
+    largest = max(map(abs, delays_ns.values()), default=0.0)
+    spread = robust_spread(residuals_m[every])
+    if largest < REGISTER_NS and spread < max(typical, LOUD_M):
+        return
+    ratio = typical / max(float(np.median(np.abs(ranges.truth_m[every]))), 1e-9)
+    guess = _looks_like(ratio) or "they may be in another unit, or of other tags"
+    raise UnanswerableError(
+        f"{ranges.source}: no radio has a delay of {largest:.0f} ns (registers hold {REGISTER_NS:.0f}) or errors that "
+        f"spread by {spread:.3g} m in ranges of {typical:.3g} m; check the units of the true distances and of the "
+        f"ranges: {guess}"
+    )
 
 
 def implausible(delays_ns: Mapping[int, float], residuals_m: Floats) -> Iterator[str]:

@@ -21,7 +21,7 @@ from calib.estimation.arguments import check_choice, check_fit
 from calib.estimation.building import build_problem
 from calib.estimation.limits import limits
 from calib.estimation.losses import MIXTURE
-from calib.estimation.plausibility import implausible, one_way
+from calib.estimation.plausibility import implausible, one_way, refuse_refuted
 from calib.estimation.power_levels import unlike_powers
 from calib.estimation.problem import Problem
 from calib.estimation.result import FitResult
@@ -213,6 +213,7 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, riv
     calibration = replace(calibration, delays_std_ns=std)
     applied = replace(calibration, errors=None).apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
+    refuse_refuted(calibration.delays_ns, residuals, ranges)
     inliers = np.abs(residuals) < SIGMAS * applied.sigma_m
     warnings = [
         *found.open_ends(),
