@@ -229,26 +229,57 @@ def test_ctrl_c_ends_cleanly_and_completely(tmp_path, number):
     assert not Path(f"{path}.wal").exists()
 
 
+def held_up_s(process):
+    """Return how long the threads of a process waited for a processor so far."""
+    try:
+        texts = [path.read_text() for path in Path(f"/proc/{process.pid}/task").glob("*/schedstat")]
+    except OSError:  # not Linux
+        return 0.0
+    return sum(int(text.split()[1]) for text in texts) * 1e-9
+
+
 @pytest.mark.parametrize("moment", range(3))
 def test_kill_9_loses_nothing_older_than_a_quarter_of_a_second(tmp_path, moment):
     path, ages = tmp_path / "f.uwb", []
-    # A busy machine may not let the recorder run for a quarter of a second: one try in four must keep the promise.
+    # Besides the processor, the recorder waits for a disk that others use, too: one try in four must keep the promise.
     for attempt in range(4):
         with served() as server:
             process = subprocess.Popen(command(path, server), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             wait_for_rows(path, process)
-            time.sleep(0.073 * moment + 0.019 * attempt)
+            before_s = held_up_s(process)
+            time.sleep(0.3 + 0.073 * moment + 0.019 * attempt)
+            others_s = held_up_s(process) - before_s
             process.kill()
             killed_ns = time.time_ns()
             process.wait()
         exchanges, _, frames, _ = stored(path)
         assert len(exchanges) > 20
         # Up to 50 ms pass from one report to the next on three boards, besides the promised 0.25 s.
-        ages.append((killed_ns - max(frame.time_ns for frame in frames)) * 1e-9)
+        ages.append((killed_ns - max(frame.time_ns for frame in frames)) * 1e-9 - others_s)
         if ages[-1] < 0.3:
             return
         path.unlink()
     raise AssertionError(f"bytes of the last {ages} s were lost")
+
+
+@pytest.mark.parametrize("kind", ["f.uwb", ".f.uwb.*"])
+def test_a_recorder_that_is_killed_as_it_begins_leaves_a_recording_or_nothing(tmp_path, kind):
+    """Killed at the first sight of the file, and of what is to become it."""
+    path = tmp_path / "f.uwb"
+    with served() as server:
+        process = subprocess.Popen(command(path, server), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        end_s = time.monotonic() + 60
+        while not any(tmp_path.glob(kind)):
+            assert process.poll() is None
+            assert time.monotonic() < end_s
+        process.kill()
+        process.wait()
+    if path.exists():
+        exchanges, _, _, meta = stored(path)
+        assert meta["source"] == "boards"
+        assert len(exchanges) < 50
+    else:
+        assert kind != "f.uwb"
 
 
 def test_a_full_disk_ends_with_a_clear_line_and_a_readable_file(tmp_path):
