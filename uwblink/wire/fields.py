@@ -77,14 +77,14 @@ def _read_text(text: bytes) -> str:
         found = text.decode()
     except UnicodeDecodeError as error:
         raise Malformed from error
-    if len(text) > LONGEST_TEXT or "\r" in found:
+    if len(text) > LONGEST_TEXT or "\r" in found or "\0" in found:
         raise Malformed
     return found
 
 
 def _write_text(value: str) -> bytes:
-    if "|" in value or "\r" in value:
-        raise FrameError(f"found {value[:40]!r}, text on the wire cannot hold '|' or a carriage return")
+    if any(mark in value for mark in "|\r\0"):
+        raise FrameError(f"found {value[:40]!r}, text on the wire cannot hold '|', a carriage return or a NUL")
     data = value.encode()
     if len(data) > LONGEST_TEXT:
         raise FrameError(f"found {len(data)} bytes of text, at most {LONGEST_TEXT} fit")

@@ -111,7 +111,7 @@ def test_texts_and_bytes_have_the_length_of_the_firmware_s_buffers():
         TEXT.read(b"a" * 200)
     with pytest.raises(FrameError, match="1001 bytes, at most 1000"):
         BYTES.write(bytes(1001))
-    for text in (b"a\rb", b"\xff"):
+    for text in (b"a\rb", b"a\0b", b"\xff"):
         with pytest.raises(Malformed):
             TEXT.read(text)
     with pytest.raises(FrameError):

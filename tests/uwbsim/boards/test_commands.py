@@ -6,6 +6,7 @@ import pytest
 
 from tests.boards import bench_scenario
 from uwblink.boards.board import Board
+from uwblink.errors import RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
 from uwbsim.boards.board_air import MS
@@ -96,6 +97,34 @@ def test_fields_that_boards_cannot_read_are_refused(monkeypatch):
 )
 def test_numbers_are_read_as_c_reads_them(text, number):
     assert atoi(text) == number
+
+
+@pytest.mark.parametrize(
+    ("data", "kinds", "alive"),
+    [
+        (b"C01\0\r", [m.GetId], True),
+        (b"C05|2\0|0|0|0\r", [m.RangeCommand], True),
+        (b"C03|1|a\0b|1|\0\0\0\0|\x02\0\0\0\r", [m.DoTests], True),
+        (b"C01\n", [], False),
+        (b"C05|2|0|0|0\n", [], False),
+        (b"C-1\r", [], False),
+        (b"C03|1|" + b"a" * 196 + b"|1|\0\0\0\0|" + b"\x2a\0" + b"x" * 42 + b"\r", [m.DoTests], True),
+    ],
+)
+def test_what_boards_take_otherwise_than_the_firmware_is_what_the_page_says(data, kinds, alive):
+    """docs/firmware.md says it; the last of them has 255 bytes."""
+    reading = read(data)
+    assert [command.kind for command in reading.commands] == kinds
+    assert reading.alive == alive
+
+
+@pytest.mark.parametrize("text", ["a\0b", "a|b", "a\rb"])
+def test_the_driver_writes_no_text_that_boards_read_otherwise(text):
+    ports = VirtualPorts(bench_scenario())
+    with pytest.raises(RefusedError, match="text"):
+        Board(ports.port(1)).request(m.DoTests(1, text, True, 1.0, b"\0\r|"))
+    assert not ports.transfers
+    assert Board(ports.port(1)).request(m.DoTests(1, "a\nb", True, 1.0, b"\0\r|")).text == "a\nb"
 
 
 def test_the_last_command_of_a_buffer_keeps_its_values():
