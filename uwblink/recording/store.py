@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from uwblink.database import connect, log_of
 from uwblink.errors import RecordingError, RecordingInUseError, first_line
 from uwblink.recording.batches import batch_of
-from uwblink.recording.intake import check_intake, interrupted_after, longest_read_s
+from uwblink.recording.intake import COLUMNS, check_intake, interrupted_after, longest_read_s
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
 from uwblink.recording.soundness import check_length, check_name, damaged, is_locked
 
@@ -283,11 +283,8 @@ class Store:
 
     def _listed_columns(self) -> dict[str, set[str]]:
         found: dict[str, set[str]] = {}
-        rows = self.read(
-            "SELECT table_name AS t, column_name AS c FROM information_schema.columns WHERE table_schema = 'main'"
-        )
-        for table, column in zip(rows["t"], rows["c"], strict=True):
-            found.setdefault(str(table), set()).add(str(column))
+        for table, column, _kind in self.rows(COLUMNS):
+            found.setdefault(table, set()).add(column)
         return found
 
     def _create_missing(self) -> None:

@@ -53,6 +53,11 @@ ENDLESS = (
         (["CREATE SCHEMA other", "CREATE TABLE other.meta(key TEXT)"], "a schema, other"),
         (["CREATE TYPE mood AS ENUM ('good')"], "a type, mood"),
         (["CREATE SEQUENCE s"], "a sequence, s"),
+        (
+            ["DROP TABLE poses", "CREATE TABLE poses(x DOUBLE CHECK (len(range(x::BIGINT * 100000000000)) > 0))"],
+            "a constraint, CHECK",
+        ),
+        (["CREATE INDEX i ON poses((sin(x)))"], "an index, i"),
         (["ALTER TABLE tags ADD COLUMN w BIGINT DEFAULT 5"], "a computed column or a default, tags.w"),
         (
             [
@@ -75,6 +80,27 @@ def test_programs_in_a_file_are_refused_in_one_line(file, statements, named):
         assert named in str(caught.value)
         assert "\n" not in str(caught.value)
     assert time.process_time() - begun < 5.0  # the endless ones never return where they are read
+
+
+def test_a_trigger_in_a_file_is_refused(file, tmp_path):
+    with duckdb.connect() as db:
+        if not db.execute("SELECT 1 FROM duckdb_functions() WHERE function_name = 'duckdb_triggers'").fetchall():
+            pytest.skip(f"DuckDB {duckdb.__version__} has no triggers")
+        db.execute(f"ATTACH '{file}' AS plain (READ_ONLY)")
+        db.execute(f"ATTACH '{tmp_path / 'stranger2.uwb'}' AS stranger (STORAGE_VERSION 'v2.0.0')")
+        db.execute("COPY FROM DATABASE plain TO stranger")
+        db.execute("USE stranger")
+        db.execute("CREATE TRIGGER t AFTER INSERT ON poses FOR EACH STATEMENT DELETE FROM tags")
+    with pytest.raises(RecordingError, match=r"stranger2\.uwb: holds a trigger, t,"):
+        Recording.open(tmp_path / "stranger2.uwb", update=True)
+
+
+def test_a_recording_may_be_called_as_the_database_calls_its_own(file, tmp_path):
+    for name in ("system", "information_schema", "main", 'a"b;--'):
+        place = tmp_path / f"{name}.uwb"
+        place.write_bytes(file.read_bytes())
+        with Recording.open(place) as recording:
+            assert len(recording.tags()) == 1
 
 
 def test_an_export_looks_the_file_over_too(file, tmp_path):
