@@ -158,8 +158,13 @@ def reduced(information: Floats, keep: Sequence[int] | Bools) -> Floats:
     values, vectors = np.linalg.eigh(information[np.ix_(rest, rest)] / size[:, None] / size)
     good = values > ROUNDING * len(rest) * max(float(values[-1]), 1e-300)
     root = (information[np.ix_(kept, rest)] / size) @ vectors[:, good] / np.sqrt(values[good])
-    found = information[np.ix_(kept, kept)] - root @ root.T
-    return np.asarray((found + found.T) / 2)
+    given = information[np.ix_(kept, kept)]
+    found = given - root @ root.T
+    # The difference has rounding errors of the size of what it was taken from, and may be all there is: none below 0.
+    unit = np.sqrt(np.maximum(np.diag(given), 1e-300))
+    values, vectors = np.linalg.eigh((found + found.T) / 2 / unit[:, None] / unit)
+    values[values < ROUNDING * len(kept)] = 0.0
+    return np.asarray((vectors * values) @ vectors.T * unit[:, None] * unit)
 
 
 def _checked(information: Floats, unknowns: Sequence[Unknown], loosest: float) -> Floats:

@@ -8,6 +8,7 @@ from uwblink.cli import shared
 
 FLAGS: Final = {
     "boards": "COUNT",
+    "data": "RECORDINGS",
     "distances": "--distance",
     "robots": "COUNT",
     "noise_m": "--noise",

@@ -81,9 +81,10 @@ class Knowledge:
 def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     """Read a TOML file of `[[arrangements]]`, `[[distances]]` and `[[positions]]`; raises `BadInputError`, one line.
 
-    `known = "line"` or "plane" at the head holds for all arrangements; an arrangement has `name`, and any of `known`,
-    `order = [3, 1, 2]`, `start_s` and `end_s`. A distance has `between = [1, 2]`, `distance_m`, and any of `sigma_m`
-    and `arrangement`; a position `tag`, `position_m`, and any of the same two.
+    `known = "line"` or "plane" at the head holds for all arrangements but those with a `known` of their own; an
+    arrangement has `name`, and any of `known`, `order = [3, 1, 2]`, `start_s` and `end_s`. A distance has
+    `between = [1, 2]`, `distance_m`, and any of `sigma_m` and `arrangement`; a position `tag`, `position_m`, and any of
+    the same two.
     """
     file = TomlReader(Path(path), BadInputError, "file of what is known")
     file.known(file.table, ("known", "arrangements", "distances", "positions"))
@@ -120,8 +121,8 @@ def _arrangements(
         names.add(name)
         if "order" in row:
             orders[name] = _order(file, f"{where}order", row["order"], row.get("known", "line"))
-        if "known" in row or name not in orders:
-            shapes[name] = _shape(file, f"{where}known", row.get("known", ""))
+        if "known" in row:
+            shapes[name] = _shape(file, f"{where}known", row["known"])
         if ("start_s" in row) != ("end_s" in row):
             raise BadInputError(f"{file.path}: {where}start_s: give both start_s and end_s, or neither")
         if "start_s" in row:
