@@ -51,6 +51,13 @@ def bias_m(power: float, size_m: float) -> float:
     return size_m * float(np.tanh((-82.0 - power) / 8.0))
 
 
+def wave_m(power: Floats | float, size_m: float) -> Floats:
+    """Return a bias that is not monotone: one period of a sine over lifted power up to 1.7, zero at -82 dBm."""
+    lifted = np.minimum(10 ** ((np.append(power, -82.0) + 82.0) / 10), 1.7)
+    found = size_m * np.sin(2 * np.pi * lifted / 1.7)
+    return np.asarray(found[:-1] - found[-1])
+
+
 def standing_boards(  # noqa: PLR0913 - a world has many settings
     seed: int,
     shape: str = "line",
@@ -65,6 +72,8 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
     reflected: float = 0.0,
     detour_m: tuple[float, float] = (0.15, 0.6),
     bias_size_m: float = 0.0,
+    wave_size_m: float = 0.0,
+    board_power_db: float = 0.0,
     stay_s: float = 60.0,
     pause_s: float = 10.0,
     places: Sequence[Floats] | None = None,
@@ -72,6 +81,7 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
     """Return ranges of boards in random arrangements on a "line", in a "plane" or in "space".
 
     `each` ranges a pair and arrangement; `reflected` is the share of pairs whose way is longer in one, by `detour_m`.
+    `board_power_db` is the spread of the boards' own powers.
     """
     rng = np.random.default_rng([seed, boards, arrangements])
     delays = dict(zip(range(1, boards + 1), rng.normal(-0.05, 0.2, boards).tolist(), strict=True))
@@ -80,12 +90,13 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
         if places is not None
         else [places_of(rng, boards, DIMENSIONS[shape], size_m, apart_m) for _ in range(arrangements)]
     )
+    own_db = board_power_db * np.random.default_rng([seed, 1]).normal(size=boards)
     columns: dict[str, list[Floats]] = {name: [] for name in ("t", "i", "j", "r", "p")}
     for k, place in enumerate(where):
         for i, j in combinations(range(boards), 2):
             length = float(np.linalg.norm(place[i] - place[j]))
-            power = power_dbm(length) + rng.normal(0, 1.0)
-            constant = pair_error_m * rng.normal() + bias_m(power, bias_size_m)
+            power = power_dbm(length) + rng.normal(0, 1.0) + float(own_db[i] + own_db[j])
+            constant = pair_error_m * rng.normal() + bias_m(power, bias_size_m) + float(wave_m(power, wave_size_m)[0])
             constant += rng.uniform(*detour_m) if rng.uniform() < reflected else 0.0
             constant -= C_M_PER_NS / 2 * (delays[i + 1] + delays[j + 1])
             turned = rng.uniform(size=each) < 0.5
@@ -100,7 +111,7 @@ def standing_boards(  # noqa: PLR0913 - a world has many settings
         whole["r"][order],
         initiator=whole["i"][order].astype(int),
         target=whole["j"][order].astype(int),
-        fpp1_dbm=whole["p"][order] if bias_size_m else np.nan,
+        fpp1_dbm=whole["p"][order] if bias_size_m or wave_size_m else np.nan,
         time_ns=(whole["t"][order] * 1e9).astype(np.int64),
         source="standing",
     )

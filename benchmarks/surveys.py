@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import re
 import sys
 from collections.abc import Iterator
@@ -45,6 +46,8 @@ WORLDS: dict[str, dict[str, Any]] = {
     "plane, 5 % of pairs reflected": PLANE | {"reflected": 0.05},
     "space, 5 % of pairs reflected": SPACE | {"reflected": 0.05},
     "plane, bias over power": PLANE | {"bias_size_m": 0.05, "size_m": 8.0},
+    "plane, bias that is not monotone": PLANE | {"wave_size_m": 0.05, "board_power_db": 1.0},
+    "line, bias that is not monotone": LINE | {"wave_size_m": 0.05, "board_power_db": 1.0},
     "space, one arrangement": {"shape": "space", "boards": 5, "arrangements": 1},
 }
 
@@ -109,7 +112,7 @@ def promised(world: Standing, dimensions: int, curve_m: float, reflected: float)
     """Return how well delays (tags,) can be known, ns, by Fisher's information of the very arrangements.
 
     That is a plan's promise, with a share of the pairs reflected, those of any draw. Of the curve over power, where one
-    is planted, its size is known and that it bends over 8 dB, and no more.
+    is planted, its size is known and that it bends over 4 dB, and no more.
     """
     if not curve_m:
         shape = next(name for name, size in DIMENSIONS.items() if size == dimensions)
@@ -131,7 +134,8 @@ def promised(world: Standing, dimensions: int, curve_m: float, reflected: float)
         lines.append(rows)
         powers += [power_dbm(value) for value in length.tolist()]
     power = np.array([*powers, -82.0])
-    likeness = np.exp(-0.5 * ((power[:, None] - power) / 8.0) ** 2)
+    apart = math.sqrt(5.0) * np.abs(power[:, None] - power) / 4.0
+    likeness = (1 + apart + apart**2 / 3) * np.exp(-apart)
     curve = curve_m**2 * (likeness[:-1, :-1] - np.outer(likeness[:-1, -1], likeness[-1, :-1]))
     weight = np.linalg.inv((PAIR_M**2 + 0.005**2) * np.eye(len(powers)) + curve)
     every = np.vstack(lines)
@@ -155,9 +159,7 @@ def row(name: str, outcomes: dict[int, Outcome]) -> str:
     spreads = []
     for seed, found in some.items():
         world = standing_boards(seed, **settings)
-        spread = promised(
-            world, DIMENSIONS[settings["shape"]], settings.get("bias_size_m", 0.0), settings.get("reflected", 0.0)
-        )
+        spread = promised(world, DIMENSIONS[settings["shape"]], _curve_size_m(settings), settings.get("reflected", 0.0))
         spreads.append(spread[np.array(found.tags) - 1])
     every = np.concatenate(spreads)
     rms, promise = (float(np.sqrt(np.mean(v**2))) for v in (errors, every[np.isfinite(every)]))
@@ -170,6 +172,10 @@ def row(name: str, outcomes: dict[int, Outcome]) -> str:
         str(refused),
     ]
     return f"| {name} | {len(outcomes)} | {' | '.join(cells)} |"
+
+
+def _curve_size_m(settings: dict[str, Any]) -> float:
+    return float(settings.get("bias_size_m", 0.0) + settings.get("wave_size_m", 0.0))
 
 
 def labels_row(name: str, outcomes: dict[int, Outcome]) -> str:

@@ -2,7 +2,7 @@
 
 A reflected pair says nothing of the delays: which pairs those will be is drawn, and what is promised is the root mean
 square over the draws. A curve is what a survey takes it for: a smooth function of the power, which falls with distance
-as in free space, bent over 8 dB, by 5 cm.
+as in free space, bent over 4 dB, by 5 cm.
 """
 
 from __future__ import annotations

@@ -8,12 +8,14 @@ little of either.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from calib.surveys.network import DETOUR_M, Network
+from calib.surveys.power import CURVE_FACTOR, CURVE_STD_M
 from calib.surveys.reflections import choices, of_marked, searched, unlikely
 from uwblink.arrays import Bools, Floats
 
@@ -21,15 +23,14 @@ PAIR_STD_M: Final = 0.02
 """What a constant error of a pair is like before any data, and worth how many degrees of freedom."""
 
 PAIR_WORTH: Final = 3.0
-CURVE_STD_M: Final = 0.03
-CURVE_FACTOR: Final = 1.8
-"""Spread of a curve before any data, and the factor by which that may be wrong."""
-
 SETTLED: Final = 1e-8
 """Share of the weighed squares below which a step gains nothing: a ten-thousandth of a standard deviation."""
 
 ORDER_IS_RIGHT: Final = 2 * math.log(100.0)
 """-2 log of the chance that boards stand in another order than somebody said who put them so: one in a hundred."""
+
+LEAST_WEIGHT: Final = 1e-3
+"""Share of the likeliest spreads' weight below which others are left out of the mean."""
 
 MOST_STEPS: Final = 60
 ROUNDS: Final = 6
@@ -42,7 +43,8 @@ class Adjusted:
     `unlikely` is -2 log of the likelihood of everything, up to a constant that all adjustments of one set of means
     share; `freedom` the degrees of freedom that are left; `pair_std_m` and `curve_std_m` are the estimated spreads.
     Which means are reflected is marked in `network`; `chance` (n,) is how probable that is of each, and `open_m2` what
-    it adds to the covariance (unknowns, unknowns) that others may be reflected instead.
+    it adds to the covariance (unknowns, unknowns) that others may be reflected instead, or spreads be others.
+    `pair_known` says that the spread of pairs was given.
     """
 
     network: Network
@@ -56,6 +58,7 @@ class Adjusted:
     settled: bool
     chance: Floats
     open_m2: Floats
+    pair_known: bool
 
     def information(self, *, guess: bool = False) -> Floats:
         """Return the information (unknowns, unknowns), rigid motions held; with the guess of delays, or without."""
@@ -161,6 +164,7 @@ def _alternated(network: Network, x: Floats, known: float | None, *, first_sprea
         settled=settled,
         chance=network.reflected.astype(float),
         open_m2=np.zeros((network.size,) * 2),
+        pair_known=known is not None,
     )
 
 
@@ -176,27 +180,76 @@ def unlikely_at(network: Network, x: Floats, std_m: Floats, curve_std_m: float, 
 
 
 def averaged(found: Adjusted) -> Adjusted:
-    """Return the mean over choices of reflected means that are nearly as likely, with the covariance that they add."""
+    """Return the mean over what is nearly as likely, with the covariance that the other possibilities add.
+
+    These are other choices of reflected means and, where there is a curve, other spreads of pairs and curve: few pairs
+    say little of how large a curve is, and what all delays share depends on it.
+    """
     network, x, std = found.network, found.x, found.std_m
     every = choices(network, x, std, found.curve_std_m)
-    held = network.motions(x)
-    jacobian, prior = network.jacobian(x), network.prior(found.curve_std_m)
-    deviation = network.residuals(x) + DETOUR_M * _padded(network.reflected, len(std))
-    steps, spreads = [], []
-    for marks in every.marks:
-        other = network.marked(marks).std_m(found.pair_std_m)
-        rows = jacobian / other[:, None]
-        spread = np.linalg.inv(rows.T @ rows + prior + held.T @ held)
-        away = (deviation - DETOUR_M * _padded(marks, len(std))) / other
-        steps.append(spread @ (rows.T @ away - prior @ (x - network.centre())))
-        spreads.append(spread)
-    mean = every.weight @ np.array(steps)
-    around = np.array(steps) - mean
-    wider = np.einsum("k,kij->ij", every.weight, np.array(spreads)) - spreads[0] + (around.T * every.weight) @ around
-    values, vectors = np.linalg.eigh((wider + wider.T) / 2)
-    more = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    here = _Case(network.reflected, found.pair_std_m, found.curve_std_m)
+    solve_case = _solver_of_cases(network, x)
+    mean, more = _mixed(solve_case, here, [replace(here, marks=marks) for marks in every.marks], every.weight)
+    if network.power is not None:
+        spreads, weight = _likely_spreads(found)
+        cases = [replace(here, pair_m=pair, curve_m=curve) for pair, curve in spreads]
+        step, wider = _mixed(solve_case, here, cases, weight)
+        mean, more = mean + step, more + wider
     at = x + mean
     return replace(found, x=at, residuals_m=network.residuals(at), chance=every.chance, open_m2=more)
+
+
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """What may be: which means are reflected, the spread of pairs, that of the curve."""
+
+    marks: Bools
+    pair_m: float
+    curve_m: float
+
+
+def _solver_of_cases(network: Network, x: Floats) -> Callable[[_Case], tuple[Floats, Floats]]:
+    """Return a function of a case: the step from `x` to its best unknowns, linear, and their covariance."""
+    held, jacobian = network.motions(x), network.jacobian(x)
+    straight = network.marked(np.zeros_like(network.reflected)).residuals(x)
+
+    def solved(case: _Case) -> tuple[Floats, Floats]:
+        std, prior = network.marked(case.marks).std_m(case.pair_m), network.prior(case.curve_m)
+        rows = jacobian / std[:, None]
+        spread = np.asarray(np.linalg.inv(rows.T @ rows + prior + held.T @ held), dtype=np.float64)
+        away = (straight - DETOUR_M * _padded(case.marks, len(std))) / std
+        return spread @ (rows.T @ away - prior @ (x - network.centre())), spread
+
+    return solved
+
+
+def _mixed(
+    solve_case: Callable[[_Case], tuple[Floats, Floats]], here: _Case, cases: list[_Case], weight: Floats
+) -> tuple[Floats, Floats]:
+    """Return the mean step over cases, and what the mixture's covariance is more than that of one case, not below 0."""
+    solved = [solve_case(case) for case in cases]
+    steps, spreads = np.array([step for step, _ in solved]), np.array([spread for _, spread in solved])
+    mean = weight @ steps
+    around = steps - mean
+    wider = np.einsum("k,kij->ij", weight, spreads) - solve_case(here)[1] + (around.T * weight) @ around
+    values, vectors = np.linalg.eigh((wider + wider.T) / 2)
+    return np.asarray(mean), np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _likely_spreads(found: Adjusted) -> tuple[list[tuple[float, float]], Floats]:
+    """Return spreads of pairs and curve about those that were found, and their weights, which sum to 1.
+
+    Logarithms in steps of 0.3 for pairs and 0.4 for the curve, about half of what a survey knows of either.
+    """
+    unlikely = _unlikeliness(found.network, found.x)
+    steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5)]
+    if found.pair_known:
+        steps = [(pair, curve) for pair, curve in steps if pair == 0.0]
+    spreads = [(found.pair_std_m * math.exp(pair), found.curve_std_m * math.exp(curve)) for pair, curve in steps]
+    worse = np.array([unlikely(math.log(pair), math.log(curve)) for pair, curve in spreads])
+    weight = np.exp(-0.5 * (worse - worse.min()))
+    kept = np.flatnonzero(weight > LEAST_WEIGHT)
+    return [spreads[k] for k in kept.tolist()], weight[kept] / weight[kept].sum()
 
 
 def _padded(marks: Bools, rows: int) -> Floats:
@@ -226,8 +279,8 @@ def leverages(found: Adjusted) -> Floats:
     return np.asarray(1 - np.einsum("ij,ji->i", rows, np.linalg.solve(information, rows.T)))
 
 
-def _spreads(network: Network, x: Floats, pair: float, curve: float, known: float | None) -> tuple[float, float]:
-    """Return the spreads of pairs and curve that are likeliest, by a search that halves its steps.
+def _unlikeliness(network: Network, x: Floats) -> Callable[[float, float], float]:
+    """Return -2 log likelihood as a function of the logarithms of the spreads of pairs and curve.
 
     By error contrasts: combinations of rows in which neither coordinates nor delays are, as many as freedoms are left.
     """
@@ -251,6 +304,12 @@ def _spreads(network: Network, x: Floats, pair: float, curve: float, known: floa
             value += 2 * float(np.log(np.diag(root)).sum()) + float(np.sum(np.linalg.solve(root, seen) ** 2))
         return value
 
+    return unlikely
+
+
+def _spreads(network: Network, x: Floats, pair: float, curve: float, known: float | None) -> tuple[float, float]:
+    """Return the spreads of pairs and curve that are likeliest, by a search that halves its steps."""
+    unlikely = _unlikeliness(network, x)
     at = [math.log(pair), math.log(curve)]
     free = [k for k in (0, 1) if not (k == 0 and known) and not (k == 1 and network.power is None)]
     best, step = unlikely(*at), 0.5

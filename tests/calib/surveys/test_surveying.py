@@ -2,20 +2,24 @@
 
 import json
 import math
+import re
 import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import calib
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
+from calib.cli.flags import FLAGS
 from calib.errors import BadInputError, UnanswerableError
 from calib.surveys.knowledge import load_knowledge
 from calib.surveys.samples import DELAYS_NS
 from uwblink import Arrangement, Contents, Exchanges
+from uwblink.cli.shared import run
 from uwblink.recording.schema import KnownDistance
 from uwblink.recording.tags import load_places
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
@@ -97,6 +101,42 @@ def test_a_curve_over_power_is_found_along_with_the_delays():
     # -77 dBm at a metre: from 0.4 m (-69) to 9 m (-96) the planted curve rises by 11 cm.
     low, high = curve.range
     assert float(curve(np.array([low]))[0] - curve(np.array([high]))[0]) > 0.05
+
+
+@pytest.mark.parametrize("seed", [1000, 1001, 1002])
+def test_what_delays_share_is_inside_its_interval_where_the_curve_is_not_monotone(seed):
+    world = standing_boards(seed, boards=5, arrangements=8, wave_size_m=0.05, board_power_db=1.0)
+    length = float(np.linalg.norm(world.places[0][0] - world.places[0][1]))
+    taped = calib.Knowledge(shape="line", distances=(KnownDistance(1, 2, length, 0.005, "1"),))
+    found = calib.survey(world.ranges, known=taped).calibration
+    off = np.mean([found.delays_ns[tag] - planted for tag, planted in world.delays_ns.items()])
+    spread = math.sqrt(np.mean(found.uncertainty.delays_ns2))
+    assert abs(off) < 2 * spread < 0.2
+    # Planted: 7.6 cm between these two powers.
+    fall = found.bias_curve(10 ** ((np.array([-86.0, -82.0]) + 82.0) / 10))
+    assert float(fall[0] - fall[1]) == pytest.approx(0.076, abs=0.045)
+
+
+def test_the_shape_at_the_head_holds_for_arrangements_that_say_nothing_of_it(tmp_path):
+    world = standing_boards(3, places=FOUR)
+    marks = "".join(f"[[arrangements]]\nname = 'm{k}'\nstart_s = {70 * k}\nend_s = {70 * k + 60}\n" for k in range(7))
+    path = tmp_path / "known.toml"
+    path.write_text("known = 'line'\n" + marks + "[[arrangements]]\nname = 'p'\nknown = 'plane'\n")
+    known = load_knowledge(path)
+    assert [known.shape_of(Arrangement(name, 0, 1)) for name in ("m0", "p")] == ["line", "plane"]
+    path.write_text("known = 'line'\n" + marks)
+    result = calib.survey(world.ranges, known=path)
+    assert {one.known for one in result.arrangements} == {"line"}
+    assert sorted(result.calibration.delays_ns) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("shape", ["", "line"])
+def test_one_pair_determines_nothing_in_whatever_arrangements(shape):
+    ranges = standing_boards(1, boards=2, arrangements=4).ranges
+    for count in range(1, 5):
+        spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(count)}
+        with pytest.raises(UnanswerableError, match="determine no delay"):
+            calib.survey(ranges, known=calib.Knowledge(shape=shape, spans_s=spans))
 
 
 def test_known_positions_give_the_frame_and_the_mirror_is_told():
@@ -321,6 +361,14 @@ def test_the_command_says_what_is_not_determined_and_writes_nothing(recording, t
     assert isinstance(done.exception, UnanswerableError)
     assert json.loads(done.stdout)["undetermined"] == [[1, 2, 3, 4]]
     assert not (tmp_path / "c.json").exists()
+
+
+def test_an_error_of_the_command_names_only_flags_that_it_has(recording, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(app, BadInputError, arguments=["survey", recording[0], recording[0], "-o", "c.json"], flags=FLAGS)
+    assert ended.value.code == 2
+    options = {option for one in typer.main.get_command(app).commands["survey"].params for option in one.opts}
+    assert set(re.findall(r"--[a-z-]+", capsys.readouterr().err)) <= options
 
 
 def test_two_arrangements_of_one_name_are_refused(recording):
