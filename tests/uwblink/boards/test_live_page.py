@@ -150,6 +150,12 @@ def test_the_page_is_for_this_computer_alone(tmp_path):
                 fetch(page, path, Host=host)
             assert refused.value.code == status
             refused.value.close()
+        for method in ("POST", "PUT", "DELETE", "OPTIONS"):
+            request = urllib.request.Request(page.url, data=b"C09\r", method=method)  # noqa: S310 - the page's own
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                urllib.request.urlopen(request, timeout=30)  # noqa: S310
+            assert refused.value.code == 501
+            refused.value.close()
         with pytest.raises(PortError, match="cannot be served there"):
             LivePage(tmp_path / "f.uwb", port=int(page.url.rsplit(":", 1)[1].rstrip("/")))
 
