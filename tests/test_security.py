@@ -7,11 +7,14 @@ import operator
 import os
 import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
+import numpy as np
 import pytest
 
+import calib
 import uwblink
 import uwbsim
 from tests.in_process import run
@@ -232,6 +235,50 @@ def test_a_recording_is_a_file(place, what):
     assert refused(run("uwblink", "show", path), path)
 
 
+# What a stranger's file says.
+
+STEERING = "\x1b[31m\x1b]0;title\x07<script>alert(1)</script>/../../../../evil\u202e"
+PRINTING = (
+    "uwblink show hostile.uwb",
+    "uwblink show hostile.uwb --json",
+    "uwblink poses hostile.uwb --from poses.csv",
+    "uwblink export hostile.uwb --to tum -o out",
+    "uwblink stream hostile.uwb --speed inf",
+    "calib doctor hostile.uwb",
+    "calib fit hostile.uwb -o out.json",
+    "calib evaluate hostile.uwb -c c.json",
+    "calib localize hostile.uwb -c c.json --tum out",
+    "calib report hostile.uwb -o out.html",
+)
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory):
+    """A flight with names that would steer a terminal, run in a page, or lead elsewhere; and a calibration."""
+    folder = tmp_path_factory.mktemp("hostile") / "deep" / "in" / "here"
+    folder.mkdir(parents=True)
+    flight = calib.sample_flight(300)
+    calib.fit(flight).calibration.save(folder / "c.json")
+    poses = replace(flight.poses, body=np.array([STEERING + body for body in flight.poses.body], dtype=object))
+    tags = [replace(tag, body=STEERING + tag.body) for tag in flight.tags]
+    meta = {"source": STEERING, "name": STEERING, "ports": {"1": STEERING}, "plan": {"protocol": STEERING}}
+    uwblink.Contents(exchanges=flight.exchanges, poses=poses, tags=tags, meta=meta).save(folder / "hostile.uwb")
+    (folder / "poses.csv").write_text(f'time_s,body,x,y,z,qx,qy,qz,qw\n0,"{STEERING}",0,0,0,0,0,0,1\n')
+    return folder
+
+
+@pytest.mark.parametrize("line", PRINTING)
+def test_what_a_file_says_steers_nothing(hostile, line):
+    ended = run(*line.split(), folder=hostile)
+    assert ended.status in (0, 2), ended
+    assert all(c.isprintable() or c == "\n" for c in ended.out + ended.err), ended
+    assert not list(hostile.parents[2].rglob("evil*"))
+    for page in hostile.glob("*.html"):
+        assert "<script>alert" not in page.read_text()
+    for path in [*hostile.glob("out*")]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
 # Outputs.
 
 WRITERS = (
@@ -259,6 +306,17 @@ def test_outputs_go_through_no_planted_link(place, line, output):
     assert secret.read_text() == SECRET
     assert not path.is_symlink()
     assert path.exists()
+
+
+def test_no_name_of_a_partial_file_can_be_guessed(place):
+    secret, names_of = place / "secret.txt", ("out.uwb", "out.json", "out.toml", "out")
+    for name in names_of:
+        (place / f".{name}.{os.getpid()}.partial").symlink_to(secret)
+    uwblink.load(place / "f.uwb").save(place / "out.uwb")
+    calib.fit(place / "f.uwb").calibration.save(place / "out.json")
+    calib.apply(place / "f.uwb", calib.load_calibration(place / "out.json"), place / "out", to="csv")
+    assert secret.read_text() == SECRET
+    assert not any((place / name).is_symlink() for name in names_of)
 
 
 def test_a_live_recording_goes_through_no_planted_link(tmp_path):

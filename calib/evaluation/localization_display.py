@@ -15,6 +15,7 @@ from calib.evaluation.localization import PAPER_RMSE_M
 from calib.evaluation.onboard_track import OnboardSettings, OnboardTrack
 from calib.evaluation.tracking import Localization, Settings, Track
 from uwblink.arrays import Floats, Ints
+from uwblink.display import printable
 from uwblink.output import write_files
 
 NAMES: Final = {"raw": "raw", "calibrated": "calibrated", "variance": "variance", "robust": "robust"}
@@ -28,7 +29,7 @@ def localization_text(found: list[Localization], summary: Summary, settings: Set
     lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{NAMES[name]:>{WIDTH}s}" for name in filters)]
     for one in found:
         figures = "".join(f"{one.rmse_m[name].mean():{WIDTH}.3f}" for name in filters)
-        lines.append(f"{one.source + ' ' + one.body:{first}s}{figures}")
+        lines.append(f"{printable(f'{one.source} {one.body}'):{first}s}{figures}")
     lines.append(f"{'mean':{first}s}" + "".join(f"{summary.rmse_m[name]:{WIDTH}.3f}" for name in filters))
     if settings.seeds > 1:
         spread = "".join(f"{summary.spread_m[name]:{WIDTH}.3f}" for name in filters)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Final
@@ -123,7 +124,10 @@ def drawn(draw: Draw, width_in: float, kinds: Iterable[str], salt: str = "") -> 
     `salt` tells apart what drawings on one page call their parts. What each panel shows, and where, is in the
     drawing's metadata as JSON, for pages that read off values under a pointer.
     """
-    with style(**{"svg.hashsalt": salt or "uwbcal"}):
+    with style(**{"svg.hashsalt": salt or "uwbcal"}), warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", "Glyph .* missing"
+        )  # names of bodies may be in any script: they show as boxes
         figure = draw(width_in)
         engine = figure.get_layout_engine()
         if engine is not None:
