@@ -19,6 +19,7 @@ from uwblink.streaming import FoxgloveServer, StreamedRange, UdpSender
 from uwbsim.boards.virtual_port import VirtualPorts
 
 BIN = Path(sys.executable).parent
+LISTENING = Path("/proc/net/tcp")
 
 ONE = StreamedRange(
     time_ns=1_706_822_508_042_560_815,
@@ -146,6 +147,22 @@ def test_requests_that_are_none_print_nothing_and_end_nothing(gated, capfd):
     assert viewer.status == 101
     viewer.close()
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("address", ["{}", ":{}"])
+def test_a_port_without_a_host_is_of_this_computer_alone(address):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with FoxgloveServer(address.format(port)) as server:
+        assert server.url == f"ws://127.0.0.1:{port}"
+        if LISTENING.exists():
+            addresses = [line.split()[1].split(":") for line in LISTENING.read_text().splitlines()[1:]]
+            mine = [place for place, number in addresses if int(number, 16) == port]
+            assert mine == ["0100007F"], "at 127.0.0.1, and nowhere else"
+        # Another address of this computer, which a server at every address would answer.
+        with socket.socket() as other:
+            other.settimeout(5)
+            assert other.connect_ex(("127.0.0.2", port))
 
 
 def test_a_port_that_is_taken_and_a_missing_extra_are_said(monkeypatch):
