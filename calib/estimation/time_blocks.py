@@ -17,6 +17,9 @@ from uwblink.arrays import Bools, Floats, Ints
 
 MOST_BLOCKS: Final = 1000
 SHORTEST_S: Final = 0.1
+FEWEST_BLOCKS: Final = 30
+"""Blocks are no shorter than a tenth of a second, unless a recording has few: sums over fewer blocks than there are
+delays and splines, some twenty, do not vary in all directions, and their covariance is too small."""
 
 GAP_S: Final = 10.0
 USUAL_STEPS: Final = 20
@@ -92,7 +95,8 @@ def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:
     cut = changed | (steps > max(GAP_S * 1e9, USUAL_STEPS * float(np.median(steps))))
     steps[cut] = 0
     elapsed = np.cumsum(steps)
-    length = max(int(elapsed[-1]) // MOST_BLOCKS, int(SHORTEST_S * 1e9))
+    whole = int(elapsed[-1])
+    length = max(whole // MOST_BLOCKS, min(int(SHORTEST_S * 1e9), whole // FEWEST_BLOCKS), 1)
     cut[1:] |= np.diff(elapsed // length) > 0
     number: Ints = np.asarray(np.cumsum(cut), dtype=np.int32)
     first = np.concatenate([[0], np.flatnonzero(changed)])

@@ -158,3 +158,22 @@ def test_a_fit_is_the_same_to_the_last_digit_whatever_was_imported_before():
         for before in ("", "import scipy.linalg; ", "import os; os.environ['OPENBLAS_NUM_THREADS'] = '1'; ")
     }
     assert len(found) == 1
+
+
+def test_ranges_far_too_short_are_no_inliers_and_are_counted():
+    some = ranges(n=1200, noise_m=0.05, tail=0)
+    short = np.arange(len(some)) % 40 == 0
+    found = fit(replace(some, raw_m=some.raw_m - 1.5 * short))
+    rows = np.isin(found.ranges.time_ns, some.time_ns[short])
+    assert not found.inliers[rows].any()
+    assert np.mean(found.inliers[~rows]) > 0.98
+    assert found.calibration.provenance["inliers"] == np.count_nonzero(found.inliers)
+
+
+def test_a_scale_that_is_given_is_the_scale_of_the_loss():
+    some = ranges(n=600)
+    assert fit(some, loss="cauchy", scale_ns=0.3).calibration.scale_ns == pytest.approx(0.3)
+    # Far beyond all errors, Cauchy's loss is that of least squares.
+    wide, squares = fit(some, loss="cauchy", scale_ns=1000.0), fit(some, loss="l2")
+    for tag in DELAYS_NS:
+        assert wide.calibration.delays_ns[tag] == pytest.approx(squares.calibration.delays_ns[tag], abs=1e-4)
