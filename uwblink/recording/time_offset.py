@@ -91,6 +91,8 @@ def _loss(
     exchanges: Exchanges, ranges: Floats, tracks: Tracks, tags: list[Tag], offset_ns: int, scale_m: float
 ) -> float:
     centred = _centred(exchanges, ranges, tracks, tags, offset_ns)
+    # One exchange, or exact ranges, have no spread.
+    scale_m = max(scale_m, 1e-6)
     return float(np.mean(np.log1p((centred / scale_m) ** 2))) if len(centred) else float("nan")
 
 

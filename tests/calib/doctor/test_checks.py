@@ -138,6 +138,22 @@ def test_an_anchor_whose_delay_changed_between_sessions_is_named(gap):
     assert f"tag {anchor} " in found.evidence
 
 
+def test_boards_at_one_distance_are_asked_about_the_unit_of_the_tape():
+    flight = fly(SHORT, 98)
+    e = flight.exchanges[(flight.exchanges.initiator == 10) & (flight.exchanges.target == 20)]
+    tape = np.full(len(e), 3000.0)
+    known = calib.Ranges.from_exchanges(e, poses=flight.poses, tags=flight.tags).truth_m
+    near = planted.longer(replace(flight, exchanges=e), 3.0 - known)
+    (found,) = calib.examine(replace(planted.changed(near, truth_m=tape), poses=flight.poses[:0]))
+    assert found.fault == "unit of the true distances"
+    assert 'distance = "mm"' in found.remedy
+
+
+def test_one_exchange_is_no_traceback():
+    flight = fly(SHORT, 98)
+    assert faults(replace(flight, exchanges=flight.exchanges[:1])) == ["too few pairs", "static data"]
+
+
 def test_the_command_asks_for_units_and_prints_p_values(tmp_path):
     flight = planted.doubled(planted.stepped(fly(SHORT, 91), RNG(1)), RNG(2))
     with Recording.create(tmp_path / "f.uwb") as recording:
@@ -211,3 +227,22 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
         "too few pairs",
         "anchor stands elsewhere" if wrong else "reflections that last",
     }
+
+
+def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
+    with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as tar:
+        logs = [one for one in tar.getnames() if one.endswith("uwb_range.csv")]
+        logged = [row for one in logs for row in DictReader(TextIOWrapper(tar.extractfile(one)))]
+    stamps = [f"{way}{k}" for k in (1, 2, 3) for way in ("tx", "rx")]
+    names = {"time_s": "timestamp", **{name: f"{name}_raw" for name in stamps}, "range_m": "range_raw"}
+    names |= {name: name for name in ("from_id", "to_id", "fpp1", "fpp2", "skew1", "skew2", "gt_range")}
+    with (tmp_path / "t.csv").open("w") as out:
+        table = DictWriter(out, [{"gt_range": "gt_range_m"}.get(name, name) for name in names])
+        table.writeheader()
+        for row in sorted(logged, key=lambda row: float(row["timestamp"])):
+            table.writerow(dict(zip(table.fieldnames, (row[theirs] for theirs in names.values()), strict=True)))
+    (tmp_path / "m.toml").write_text('bits = 40\n[units]\nstamps = "ns"\n')
+    import_recording(tmp_path / "t.csv", tmp_path / "t.uwb", map_file=tmp_path / "m.toml")
+    (found,) = calib.examine(tmp_path / "t.uwb")
+    assert found.fault == "doubled exchanges"
+    assert found.evidence.startswith("123 of 440 rows")
