@@ -20,6 +20,7 @@ from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import DISTANCES, IDS, LEVELS, ColumnMap, load_map
 from uwblink.importers.exchange_rows import optional
 from uwblink.importers.long_tables import exchanges_of_long
+from uwblink.importers.repeated import likely_repeated
 from uwblink.importers.staged_tables import StagedTables, Watch
 from uwblink.importers.stamps import stamps_of
 from uwblink.importers.table_import import TableImport
@@ -91,6 +92,8 @@ def plan(tables: StagedTables, watch: Watch | None = None) -> TableImport:
     if layout == "ranges":
         usable, reading = _plain_ranges(tables, source, unusable, total), None
         check_units(tables, _sample(source, usable), None)
+        first, _ = next(usable.of_blocks(source.blocks(["range_m"])))
+        notes += filter(None, [likely_repeated(first)])
     else:
         usable, reading = _from_stamps(tables, source, protocol, unusable, total, notes)
     return TableImport(
@@ -127,8 +130,12 @@ def _from_stamps(
     for name in stamps_of(chosen):
         if not source.has(name):
             raise tables.missing(name)
-    usable, bits, counter = usable_exchanges(source, unusable, stamps_of(chosen))
+    usable, bits, counter = usable_exchanges(source, unusable, stamps_of(chosen), tables.stage)
     _half(tables, unusable, total)
+    if usable.repeated:
+        notes.append(
+            f"{usable.repeated} of {total} rows repeat an exchange, with the same devices and stamps, and are left out"
+        )
     if counter != "wrapped":
         notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
     sample = _sample(source, usable)

@@ -90,7 +90,7 @@ def check_lines(path: Path, delimiter: str | None = None) -> None:
     length = cells = 0
     try:
         with (gzip.open if path.suffix == ".gz" else open)(path, "rb") as file:
-            while piece := file.read(AT_ONCE):
+            while piece := file.read(16 * BLOCK):
                 for start in range(0, len(piece), BLOCK):
                     # Only lines that fill whole blocks are looked at: a hundredth of the time of looking at all.
                     if piece.find(b"\n", start, start + BLOCK) >= 0:

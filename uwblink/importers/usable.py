@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.importers.column_map import IDS, STAMP_UNITS
+from uwblink.importers.repeated import Repeated
+from uwblink.importers.staging import Stage
 from uwblink.importers.stamps import NEVER, Counted, beyond
 from uwblink.importers.table_rows import Rows, RowSource, has_ends, take
 from uwblink.importers.unusable import Unusable
@@ -18,12 +20,16 @@ from uwblink.twr import LARGEST_ID
 
 @dataclass(frozen=True, slots=True)
 class Usable:
-    """The rows of a table that can be used: `flags` are bits, (n / 8,), `count` how many, `tags` their ids."""
+    """The rows of a table that can be used: `flags` are bits, (n / 8,), `count` how many, `tags` their ids.
+
+    `repeated` more are left out, which repeat an exchange.
+    """
 
     flags: list[NDArray[np.uint8]]
     sizes: list[int]
     count: int
     tags: list[int]
+    repeated: int = 0
 
     def of_blocks(self, blocks: Iterable[Rows]) -> Iterator[tuple[Rows, int]]:
         """Yield what can be used of the blocks of all rows, and how many such rows come before."""
@@ -46,15 +52,18 @@ class Usable:
 
 
 class _Collecting:
-    """Rows that can be used, as blocks come."""
+    """Rows that can be used, as blocks come; those that repeat an exchange are looked for where there is a stage."""
 
-    def __init__(self) -> None:
+    def __init__(self, stage: Stage | None = None) -> None:
+        self._repeated = Repeated(stage) if stage else None
         self.flags: list[NDArray[np.uint8]] = []
         self.sizes: list[int] = []
         self.count = 0
         self._seen = np.zeros(LARGEST_ID + 1, dtype=bool)
 
-    def add(self, rows: Rows, good: Bools) -> None:
+    def add(self, rows: Rows, good: Bools, stamps: Mapping[str, Floats] | None = None) -> None:
+        if self._repeated and stamps is not None:
+            self._repeated.add(rows, stamps, good, self.count)
         self.flags.append(np.packbits(good))
         self.sizes.append(len(good))
         self.count += int(np.count_nonzero(good))
@@ -62,7 +71,18 @@ class _Collecting:
             self._seen[rows.ids[name][good]] = True
 
     def usable(self) -> Usable:
-        return Usable(self.flags, self.sizes, self.count, np.flatnonzero(self._seen).tolist())
+        twice = self._repeated.rows() if self._repeated else np.empty(0, dtype=np.int64)
+        tags = np.flatnonzero(self._seen).tolist()
+        if not len(twice):
+            return Usable(self.flags, self.sizes, self.count, tags)
+        flags, before = [], 0
+        for packed, size in zip(self.flags, self.sizes, strict=True):
+            good = np.unpackbits(packed, count=size)
+            places = np.flatnonzero(good)
+            good[places[twice[(twice >= before) & (twice < before + len(places))] - before]] = 0
+            flags.append(np.packbits(good))
+            before += len(places)
+        return Usable(flags, self.sizes, self.count - len(twice), tags, len(twice))
 
 
 def with_ends(rows: Rows, unusable: Unusable) -> Bools:
@@ -85,12 +105,14 @@ def usable_ranges(source: RowSource, unusable: Unusable) -> Usable:
     return found.usable()
 
 
-def usable_exchanges(source: RowSource, unusable: Unusable, stamps: tuple[str, ...]) -> tuple[Usable, int, str]:
-    """Return the rows that hold all stamps, the counter's bits, and how it is written."""
+def usable_exchanges(
+    source: RowSource, unusable: Unusable, stamps: tuple[str, ...], stage: Stage
+) -> tuple[Usable, int, str]:
+    """Return the rows that hold all stamps, each exchange once, the counter's bits, and how it is written."""
     column_map = source.column_map
     assumed: tuple[int, str] | None = None
     while True:
-        found, counted, bad = _Collecting(), Counted(), Unusable()
+        found, counted, bad = _Collecting(stage), Counted(), Unusable()
         for rows in source.blocks(stamps):
             ticks = {name: _ticks(rows, name) for name in stamps}
             counted.add(ticks)
@@ -99,7 +121,7 @@ def usable_exchanges(source: RowSource, unusable: Unusable, stamps: tuple[str, .
             good = with_ends(rows, bad) & _timed(rows, bad)
             for name, column in ticks.items():
                 good &= _stamped(rows, name, column, assumed, bad, good)
-            found.add(rows, good)
+            found.add(rows, good, ticks)
         told = counted.told(column_map.bits, column_map.counter)
         if told == (assumed or told):
             unusable.take(bad)

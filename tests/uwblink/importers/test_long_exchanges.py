@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 
 from tests.uwblink.importers.test_long_tables import told
 from tests.uwblink.importers.test_planted_delays import messages_of
-from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, stamps, wrapped, write
+from tests.uwblink.importers.test_table_forms import (
+    as_messages,
+    flights,
+    later,
+    mapped,
+    repeated,
+    stamps,
+    wrapped,
+    write,
+)
 from uwblink.errors import ImportTableError
 from uwblink.importers import exchange_bags, import_file, row_files, split_rows, staged_tables, table_rows
 from uwblink.importers.column_map import ColumnMap
@@ -211,12 +220,11 @@ def test_what_a_layout_needs_is_said(tmp_path, layout, missing):
 
 def test_memory_does_not_grow_with_the_table(tmp_path, monkeypatch):
     at_once(monkeypatch, 2_000)
-    lines = as_messages(wrapped(flights()))
     text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n')
     peaks = []
     for times in (10, 40, 140):  # the first is for what is only made once
-        later = [line | {"time_s": line["time_s"] + 100 * k} for k in range(times) for line in lines]
-        table = write(tmp_path / f"{times}.csv", later)
+        rows = [row | {"time_s": row["time_s"] + 100 * (k // 60)} for k, row in enumerate(repeated(flights(), times))]
+        table = write(tmp_path / f"{times}.csv", as_messages(wrapped(rows)))
         tracemalloc.start()
         import_file(table, tmp_path / f"{times}.uwb", map_file=text)
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -234,9 +242,10 @@ class Bag:
         self.path, self.count = path, count
 
     def messages(self, _):
-        rows = wrapped(flights())
+        rows = flights()
         for k in range(self.count):
-            yield "/uwb", "uwb", 1_000_000 * k, {n: v for n, v in rows[k % 60].items() if n != "time_s"}
+            (row,) = wrapped([later(rows[k % 60], k // 60)])
+            yield "/uwb", "uwb", 1_000_000 * k, {n: v for n, v in row.items() if n != "time_s"}
 
 
 def test_memory_does_not_grow_with_a_bag(tmp_path, monkeypatch):

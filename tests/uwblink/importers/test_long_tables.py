@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import uwblink
-from tests.uwblink.importers.test_table_forms import flights, wrapped, write
+from tests.uwblink.importers.test_table_forms import flights, repeated, wrapped, write
 from uwblink.errors import ImportTableError
 from uwblink.importers import antenna_places, import_file, row_faults, staged_tables, table_rows
 from uwblink.importers.exchange_tables import read_table
@@ -69,10 +69,9 @@ def test_a_table_that_is_half_useless_is_refused_alike_and_leaves_nothing(tmp_pa
 def test_memory_does_not_grow_with_the_table(tmp_path, monkeypatch):
     for room in (table_rows, staged_tables):
         monkeypatch.setattr(room, "ROWS_AT_ONCE", 1_000)
-    rows = wrapped(flights())
     peaks = []
     for times in (20, 150, 600):  # the first is for what is only made once
-        table = write(tmp_path / f"{times}.csv", rows * times)
+        table = write(tmp_path / f"{times}.csv", wrapped(repeated(flights(), times)))
         tracemalloc.start()
         import_file(table, tmp_path / f"{times}.uwb")
         peaks.append(tracemalloc.get_traced_memory()[1])

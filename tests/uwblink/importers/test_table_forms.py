@@ -39,6 +39,16 @@ def flights(count=60, third="target", bits=32, seed=1):
     return rows
 
 
+def repeated(rows, times):
+    """The same exchanges many times, each time with all clocks further on: no two have the same stamps."""
+    return [later(row, k) for k in range(times) for row in rows]
+
+
+def later(row, ticks):
+    """The same exchange when both clocks are further on."""
+    return {n: v + ticks if n in HEADER[3:9] else v for n, v in row.items()}
+
+
 def wrapped(rows, bits=32):
     return [{n: v % 2**bits if n in HEADER[3:9] else v for n, v in row.items() if n != "truth"} for row in rows]
 
@@ -462,3 +472,24 @@ def test_files_that_cannot_be(tmp_path, name, content):
     with pytest.raises(ImportTableError) as caught:
         read_table(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("unit", "length"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048), ("in", 0.0254)])
+def test_every_unit_of_distances(tmp_path, unit, length):
+    rows = [{"time_s": k, "from_id": 1, "to_id": 2, "range_m": (3 + k / 7) / length} for k in range(30)]
+    path = write(tmp_path / "t.csv", rows)
+    found = read_table(path, mapped(tmp_path, f'[units]\ndistance = "{unit}"\n')).exchanges.range_m
+    assert found == pytest.approx([3 + k / 7 for k in range(30)], rel=1e-12)
+
+
+@pytest.mark.parametrize("bits", [32, 40])
+@pytest.mark.parametrize(("counter", "low"), [("wrapped", 0), ("signed", -1)])
+def test_the_first_stamp_that_a_counter_cannot_show_is_a_fault(tmp_path, bits, counter, low):
+    lowest = low * 2 ** (bits - 1)
+    rows = wrapped(flights(), bits - 1)
+    rows[3]["tx1"], rows[4]["tx1"] = lowest, lowest + 2**bits - 1
+    rows[5]["tx1"], rows[6]["tx1"] = lowest - 1, lowest + 2**bits
+    path = write(tmp_path / "t.csv", rows)
+    found = read_table(path, mapped(tmp_path, f'protocol = "ds"\nbits = {bits}\ncounter = "{counter}"\n'))
+    assert len(found.exchanges) == 58
+    assert [fault.detail.split(",")[0] for fault in found.faults] == ["row 7", "row 8"]
