@@ -1,0 +1,194 @@
+"""What a report, an evaluation and exports must say, by NumPy and SciPy from exported tables: no code of the packages.
+
+It follows docs/theory.md and the reference of a calibration's keys, and is here to disagree with them.
+"""
+
+import csv
+import json
+from html.parser import HTMLParser
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.optimize import brentq
+from scipy.stats import chi2, exponnorm, norm
+
+LIGHT, TICK_S = 299_702_547.0, 1 / (128 * 499.2e6)
+STAGES = ("raw", "delays", "full")
+
+
+class Tables(HTMLParser):
+    """Tables of a page: rows of the texts of their cells, without the heads above."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tables, self._cell = [], None
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self._cell = ""
+
+    def handle_data(self, data):
+        if self._cell is not None:
+            self._cell += data
+
+    def handle_endtag(self, tag):
+        if tag in ("td", "th") and self._cell is not None:
+            self.tables[-1][-1].append(self._cell.strip())
+            self._cell = None
+
+    def having(self, *cells):
+        """Return the one table in whose rows all of some cells stand."""
+        found = [t for t in self.tables if all(any(cell in row for row in t) for cell in cells)]
+        assert len(found) == 1, (cells, len(found))
+        return found[0]
+
+    def row(self, *cells):
+        """Return the row that begins with the first of some cells, of the table that has them all."""
+        return next(row for row in self.having(*cells) if row[:1] == [cells[0]])
+
+
+def number(text):
+    """Return the number that a cell begins with."""
+    return float(text.split()[0].replace("−", "-").rstrip("%,;"))
+
+
+def columns(path):
+    """Return the exchanges of an exported table, as columns."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = {name: [row[name] for row in rows] for name in rows[0]}
+    whole = ("time_ns", "initiator", "target", "tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
+    numbers = ("truth_m", "fpp1_dbm", "fpp2_dbm")
+    return {name: np.array(found[name], dtype=np.int64) for name in whole} | {
+        name: np.array([float(cell or "nan") for cell in found[name]]) for name in numbers
+    }
+
+
+def curve(table, lifted):
+    spline = BSpline(np.array(table["knots"]), np.array(table["coefficients"]), table["degree"])
+    return spline(np.clip(lifted, *table["range"]))
+
+
+def beyond(table, lifted):
+    """How far the curve would go on beyond its range, straight on from the tenth at either end."""
+    low, high = table["range"]
+    step = 0.1 * (high - low)
+    a, b, c, d = curve(table, np.array([low, low + step, high - step, high]))
+    up, down = np.maximum(lifted - high, 0), np.maximum(low - lifted, 0)
+    return abs(b - a) / step * down + abs(d - c) / step * up
+
+
+class Corrected:
+    """Double-sided exchanges corrected by a calibration's JSON, and what is known of their errors."""
+
+    def __init__(self, table, known):
+        e = columns(table)
+        rows = np.isfinite(e["truth_m"])
+        e = {name: column[rows] for name, column in e.items()}
+        self.first, self.second = e["initiator"], e["target"]
+        self.truth = e["truth_m"]
+
+        def since(later, earlier):
+            return ((e[later] - e[earlier]) % 2**32).astype(float)
+
+        k = since("rx3", "rx2") / since("tx3", "tx2")
+        self.raw = LIGHT * TICK_S / 2 * (since("rx2", "tx1") - k * since("tx2", "rx1"))
+        delay = {int(tag): ns * 1e-9 for tag, ns in known["delays_ns"].items()}
+        d_i, d_j = (np.array([delay[t] for t in ids.tolist()]) for ids in (self.first, self.second))
+        self.delays = self.raw + LIGHT / 2 * (d_i + k * d_j)
+        self.lifted = np.mean([10 ** ((e[p] - known["alpha_dbm"]) / 10) for p in ("fpp1_dbm", "fpp2_dbm")], axis=0)
+        bias = known["bias_curve"]
+        self.full = self.delays - curve(bias, self.lifted)
+        self.sigma = curve(known["sigma_curve"], self.lifted)
+        self.clamped = (self.lifted < bias["range"][0]) | (self.lifted > bias["range"][1])
+        self.beyond = beyond(bias, self.lifted)
+        self._errors(known["errors"])
+
+    def _errors(self, model):
+        nodes, p_out, least = np.array(model["lifted"]), model["outlier_share"], model["least_m"]
+        names = [tuple(sorted(pair)) for pair in zip(self.first.tolist(), self.second.tolist(), strict=True)]
+        self.pair = np.array([f"{a}-{b}" for a, b in names])
+        shape = (len(self.pair),)
+        self.mean_error, self.total, self.tail_share = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        self.low95, self.high95 = np.zeros(shape), np.zeros(shape)
+        levels = np.array([[0.0, 0.0], *model["levels"], [1.0, 1.0]]).T
+        own = np.interp([0.025, 0.975], *levels)
+        odds = np.log(np.array(model["tail_share"]) / (1 - np.array(model["tail_share"])))
+        for name in np.unique(self.pair):
+            rows = self.pair == name
+            factor = model["pairs"].get(name, {"noise": 1.0, "odds": 1.0, "detour": 1.0})
+            detour = model["detour_m"] * factor["detour"]
+
+            def parts(lifted, factor=factor):
+                noise = np.exp(np.interp(lifted, nodes, np.log(model["noise_m"]))) * factor["noise"]
+                return noise, 1 / (1 + np.exp(-np.interp(lifted, nodes, odds)) / factor["odds"])
+
+            def below(x, lifted, detour=detour, parts=parts):
+                noise, share = parts(lifted)
+                x = x - model["location_m"]
+                reflected = exponnorm.cdf(x, detour / noise, loc=least, scale=noise)
+                inside = (1 - share) * norm.cdf(x / noise) + share * reflected
+                return (1 - p_out) * inside + p_out * norm.cdf(x / model["outlier_m"])
+
+            noise, share = parts(self.lifted[rows])
+            mean = (1 - p_out) * share * (least + detour)
+            second = (1 - p_out) * (noise**2 + share * (detour**2 + (least + detour) ** 2))
+            second += p_out * model["outlier_m"] ** 2
+            self.mean_error[rows] = mean + model["location_m"]
+            total = model["scale"] * np.sqrt(second - mean**2)
+            wide = np.hypot(total, self.beyond[rows])
+            self.total[rows], self.tail_share[rows] = wide, share
+            for level, found in zip(own, (self.low95, self.high95), strict=True):
+                at = [brentq(lambda x, n=n: below(x, n) - level, -80.0, 80.0) for n in nodes]  # noqa: B023
+                found[rows] = np.interp(self.lifted[rows], nodes, at) * (wide / total)
+
+    def groups(self):
+        """Rows of each pair, and of all."""
+        found = {str(name): self.pair == name for name in np.unique(self.pair)}
+        return found | {"all": np.ones(len(self.pair), dtype=bool)}
+
+    def of(self, rows):
+        """What an evaluation says of some rows, by the keys of its JSON."""
+        error = {name: (getattr(self, name) - self.truth)[rows] for name in STAGES}
+        z2 = (error["full"] / self.sigma[rows]) ** 2
+        raw_variance = np.mean((self.raw - self.truth - np.mean(self.raw - self.truth)) ** 2)
+        standard = (error["full"] - self.mean_error[rows]) / self.total[rows]
+        threshold = chi2.ppf(0.95, 1)
+        inside = (error["full"] > self.low95[rows]) & (error["full"] < self.high95[rows])
+        return {
+            **{name: stats(error[name]) for name in STAGES},
+            "rejected_raw": np.mean(error["raw"] ** 2 > threshold * raw_variance),
+            "rejected": np.mean(z2 > threshold),
+            "accepted": stats(error["full"][z2 <= threshold]),
+            "coverage": {
+                str(p): np.mean(z2 <= (1.0 if p == 68 else chi2.ppf(p / 100, 1))) for p in (50, 68, 90, 95, 99)
+            },
+            "clamped": np.mean(self.clamped[rows]),
+            "total_mean": np.mean(standard),
+            "total_std": np.std(standard),
+            "inside_95": np.mean(inside),
+            "tail_share": np.mean(self.tail_share[rows]),
+        }
+
+
+def stats(error):
+    middle = np.median(error)
+    return {
+        "n": len(error),
+        "mean_m": error.sum() / len(error),
+        "median_m": middle,
+        "std_m": np.sqrt(np.mean((error - error.mean()) ** 2)),
+        "robust_std_m": np.median(np.abs(error - middle)) / norm.ppf(0.75),
+        "low_m": np.percentile(error, 2.5),
+        "high_m": np.percentile(error, 97.5),
+        "abs95_m": np.percentile(np.abs(error), 95),
+    }
+
+
+def corrected(table, calibration):
+    return Corrected(table, json.loads(calibration.read_text()))
