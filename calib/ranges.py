@@ -18,6 +18,7 @@ from calib.range_columns import columns_of, measured_powers
 from calib.single_sided import LeftSkew, left_skew, worst
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of, delays_in_meta
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges
 
@@ -43,7 +44,8 @@ class Ranges:
     `excluded` counts by reason what was left out; `planted` is what a simulation put in, for display only;
     `recordings` are name and `fingerprint` of each that they come from, empty where they come from none;
     `left_skew` says what clock skew may have left in single-sided ranges, None where there are none; `bodies` are tags
-    with the body that carries each, as far as it is known. `session` numbers the sessions (n,), whose names are
+    with the body that carries each, as far as it is known; `antenna_delays` is what was programmed into tags when they
+    ranged, as far as that is known. `session` numbers the sessions (n,), whose names are
     `sessions`: recordings that are joined, of which those that ran at the same time count as one.
     """
 
@@ -66,6 +68,7 @@ class Ranges:
     bodies: tuple[tuple[int, str], ...] = ()
     session: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
     sessions: tuple[str, ...] = ()
+    antenna_delays: AntennaDelays = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Put all ranges into one session where nothing else is said."""
@@ -82,6 +85,7 @@ class Ranges:
         tags: Sequence[Tag] = (),
         planted: Mapping[str, Any] | None = None,
         source: str = IN_MEMORY,
+        antenna_delays: AntennaDelays | None = None,
     ) -> Ranges:
         """Return a row for every exchange, usable or not (`usable` leaves out those that a fit cannot use).
 
@@ -99,6 +103,7 @@ class Ranges:
             left_skew=left_skew(exchanges),
             clocks_apart=clocks_apart(exchanges),
             bodies=bodies_of(tags),
+            antenna_delays=antenna_delays or {},
             **columns_of(exchanges, given, poses, tags),
         )
 
@@ -239,14 +244,27 @@ def require_some(
     raise UnanswerableError(f"{source}: none of its {count} exchanges can be used: {most}{hint}")
 
 
-APART: Final = ("source", "excluded", "planted", "left_skew", "clocks_apart", "recordings", "bodies", "sessions")
+APART: Final = (
+    "source",
+    "excluded",
+    "planted",
+    "left_skew",
+    "clocks_apart",
+    "recordings",
+    "bodies",
+    "sessions",
+    "antenna_delays",
+)
 """What is no column."""
 
 COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in APART)
 
 
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
-    """Join the ranges of several recordings, in their order."""
+    """Join the ranges of several recordings, in their order.
+
+    Raises `BadInputError` where other antenna delays were programmed into a tag in one of them than in another.
+    """
     columns: dict[str, Any] = {name: joined([getattr(p, name) for p in parts]) for name in COLUMNS}
     columns["session"], names = _sessions(parts)
     reasons = sorted({reason for p in parts for reason in p.excluded})
@@ -259,8 +277,34 @@ def concatenate(parts: Sequence[Ranges]) -> Ranges:
         recordings=tuple(one for p in parts for one in p.recordings),
         bodies=_bodies_of_all(parts),
         sessions=names,
+        antenna_delays=_antenna_delays_of_all(parts),
         **columns,
     )
+
+
+def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
+    """Return what a recording's `meta` says was programmed; raises `BadInputError` where it cannot be understood."""
+    try:
+        return delays_in_meta(meta)
+    except ValueError as error:
+        raise BadInputError(f"{source}: {error}") from error
+
+
+def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:
+    found: dict[int | None, AntennaDelay] = {}
+    where: dict[int, str] = {}
+    for part in parts:
+        for tag in part.tags():
+            delay = delay_of(part.antenna_delays, tag)
+            if delay is None:
+                continue
+            if found.setdefault(tag, delay) != delay:
+                raise BadInputError(
+                    f"{part.source}: tag {tag} had antenna delays of {delay} ticks programmed, and {found[tag]} in "
+                    f"{where[tag]}; take recordings with the same ones"
+                )
+            where.setdefault(tag, part.source)
+    return found
 
 
 def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:

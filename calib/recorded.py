@@ -16,7 +16,7 @@ from calib.carriers import Asked
 from calib.long_columns import ROWS_AT_ONCE, empty, let_go, put
 from calib.planted import check_planted
 from calib.range_columns import columns_of
-from calib.ranges import COLUMNS, Ranges, bodies_of, usable_rows
+from calib.ranges import COLUMNS, Ranges, antenna_delays_in, bodies_of, usable_rows
 from calib.single_sided import Terms, left_in, skew_terms
 from uwblink.recording.file import Recording
 from uwblink.recording.target_reports import single_exchange_blocks
@@ -88,7 +88,9 @@ class _Reading:
         self._columns, self._range_m = _Columns(most), empty(most)
         self._times, self._terms, self._asked = sha256(), list[Terms](), Asked()
         self._tags, self._windows = recording.tags(), recording.pose_windows()
-        planted = recording.meta().get("planted")
+        meta = recording.meta()
+        self._delays = antenna_delays_in(meta, recording.path.name)
+        planted = meta.get("planted")
         self._planted = planted if isinstance(planted, dict) and planted else None
 
     def add(self, block: Exchanges) -> None:
@@ -125,6 +127,7 @@ class _Reading:
             left_skew=left_in(self._terms),
             clocks_apart=self._asked.apart(),
             bodies=bodies_of(self._tags),
+            antenna_delays=self._delays,
             recordings=((name, found.hexdigest()[:FINGERPRINT]),),
             **self._columns.found(),
         )

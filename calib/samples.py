@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.arrays import Floats
+from uwblink.recording.antenna_delays import AntennaDelay, meta_of_delays
 from uwblink.recording.schema import Poses, Tag
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges
@@ -33,6 +34,11 @@ class SampleFlight:
     planted: dict[str, Any]
     imu: Mapping[str, Any] = field(default_factory=dict)
     height: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """Return what a recording of it would say: that the boards' usual antenna delays were programmed."""
+        return {"planted": self.planted, **meta_of_delays({None: AntennaDelay()})}
 
 
 def sample_flight(count: int = 900, *, seed: int = 1, anchors: bool = False) -> SampleFlight:

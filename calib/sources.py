@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from calib.errors import BadInputError, UnanswerableError
 from calib.planted import check_planted
 from calib.range_columns import FAINTEST_DBM, LOUDEST_DBM
-from calib.ranges import IN_MEMORY, Ranges, concatenate, without_static
+from calib.ranges import IN_MEMORY, Ranges, antenna_delays_in, concatenate, without_static
 from calib.recorded import FINGERPRINT, read_ranges
+from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
 from uwblink.recording.target_reports import single_reports
@@ -41,7 +42,8 @@ class Source(Protocol):
     """What anything may hand over instead of a file: exchanges, poses of bodies, and the tags on them.
 
     A simulation's result has these attributes. Used where they are there, too: `planted`, what a simulation put in,
-    which is shown and never used (or `meta` with that entry); `faults`; `overheard`, columns of the recording's table.
+    which is shown and never used (or `meta` with that entry, and with what was programmed); `faults`; `overheard`,
+    columns of the recording's table.
     """
 
     @property
@@ -82,6 +84,11 @@ class RecordedSource:
     def tags(self) -> list[Tag]:
         """Return the tags."""
         return self.recording.tags()
+
+    @cached_property
+    def meta(self) -> Mapping[str, Any]:
+        """Return what the recording says of itself."""
+        return self.recording.meta()
 
     @cached_property
     def planted(self) -> Mapping[str, Any] | None:
@@ -206,8 +213,10 @@ def _load(data: Data, need_power: bool) -> Ranges:
         exchanges = single_reports(source.exchanges).exchanges
         complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
         poses, tags = None if complete else source.poses, source.tags
-        planted = _planted(source, name)
-    ranges = Ranges.from_exchanges(exchanges, poses=poses, tags=tags, planted=planted, source=name)
+        planted, delays = _planted(source, name), antenna_delays_of(source, name)
+    ranges = Ranges.from_exchanges(
+        exchanges, poses=poses, tags=tags, planted=planted, source=name, antenna_delays=delays
+    )
     ranges = replace(ranges, recordings=((name, fingerprint(exchanges)),))
     return ranges.usable(_why_no_truth(ranges, poses, tags), _why_no_power(exchanges), need_power=need_power)
 
@@ -227,6 +236,11 @@ def fingerprint(exchanges: Exchanges) -> str:
     for column in (exchanges.time_ns, exchanges.range_m):
         found.update(np.ascontiguousarray(column).data)
     return found.hexdigest()[:FINGERPRINT]
+
+
+def antenna_delays_of(source: Source, name: str) -> AntennaDelays:
+    """Return what was programmed into the tags of a source; raises what `antenna_delays_in` raises."""
+    return antenna_delays_in(getattr(source, "meta", None) or {}, name)
 
 
 def _planted(source: Source, name: str) -> Mapping[str, Any] | None:

@@ -83,7 +83,7 @@ COMMANDS = (
     ),
     *(
         (f"calib export {{c.json}} --to {form} -o out", 20)
-        for form in ("registers", "json", "csv", "miluv", "ros-yaml")
+        for form in ("registers", "firmware", "json", "csv", "miluv", "ros-yaml")
     ),
     ("calib export {c.json} --to c-header -o out.h", 20),
     ("calib localize {f.uwb} -c {c.json} --tum out", 1_000),

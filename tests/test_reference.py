@@ -34,7 +34,8 @@ def test_a_map_knows_the_tables_that_its_reference_has():
 def flat(table, above=""):
     """Every key of a JSON document, dotted; names that people or data choose in capitals."""
     for key, value in table.items():
-        free = {"delays_ns": "TAG", "delays_std_ns": "TAG", "groups": "NAME", "provenance": "KEY"}
+        free = dict.fromkeys(("delays_ns", "delays_std_ns", "antenna_delays"), "TAG")
+        free |= {"groups": "NAME", "provenance": "KEY"}
         name = free.get(above, key)
         name = "PAIR" if above in ("errors.pairs", "pair_offsets") else name
         dotted = f"{above}.{name}".strip(".")

@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from calib.calibration.formats import free_delays, programmed, read_miluv
+    from calib.calibration.formats import antenna_delays_warning, free_delays, programmed, read_miluv
     from calib.calibration.foundations import rests_on
 
 __all__ = [
+    "antenna_delays_warning",
     "free_delays",
     "programmed",
     "read_miluv",
@@ -16,6 +17,7 @@ __all__ = [
 ]
 
 _HOMES: Final = {
+    "antenna_delays_warning": "calib.calibration.formats",
     "free_delays": "calib.calibration.formats",
     "programmed": "calib.calibration.formats",
     "read_miluv": "calib.calibration.formats",

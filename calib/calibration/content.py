@@ -13,6 +13,7 @@ from calib.calibration.parts import TagGroup, Uncertainty
 from calib.calibration.power_curves import Curve, lifted_power
 from calib.ranges import Ranges
 from uwblink.arrays import Floats
+from uwblink.recording.antenna_delays import AntennaDelays
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -34,6 +35,7 @@ class CalibrationContent:
     power_at: str = "exchange"
     errors: ErrorModel | None = None
     pair_offsets: dict[tuple[int, int], PairOffset] = field(default_factory=dict)
+    antenna_delays: AntennaDelays = field(default_factory=dict)
 
     @property
     def stopped(self) -> bool:

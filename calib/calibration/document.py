@@ -11,11 +11,12 @@ from typing import Any, Final
 
 from calib.calibration.content import CalibrationContent
 from calib.calibration.error_model import read_errors
-from calib.calibration.json_format import DELAY_NS, LIGHT, POWER_DBM, STD_NS, Reader
+from calib.calibration.json_format import DELAY_NS, LIGHT, POWER_DBM, REGISTER, STD_NS, Reader, is_tag
 from calib.calibration.pair_offsets import offsets_from, table_of
 from calib.calibration.parts import TagGroup, Uncertainty
 from calib.calibration.power_curves import LIFTS, Curve
 from calib.errors import BadInputError
+from uwblink.recording.antenna_delays import AntennaDelay
 
 SCHEMA_VERSION: Final = 1
 GROUPED_VERSION: Final = 2
@@ -60,6 +61,10 @@ def _what_not_all_have(calibration: CalibrationContent) -> dict[str, Any]:
         found["errors"] = calibration.errors.to_dict()
     if calibration.pair_offsets:
         found["pair_offsets"] = table_of(calibration.pair_offsets)
+    if calibration.antenna_delays:
+        found["antenna_delays"] = {
+            str(tag): one._asdict() for tag, one in sorted(calibration.antenna_delays.items(), key=str)
+        }
     if calibration.uncertainty:
         found["uncertainty"] = asdict(calibration.uncertainty)
     return found
@@ -115,6 +120,7 @@ def fields_of(text: str, where: str) -> dict[str, Any]:
         "uncertainty": _uncertainty(read),
         "groups": _groups(read),
         "errors": read_errors(read.inside("errors")) if read.has("errors") else None,
+        "antenna_delays": _antenna_delays(read) if read.has("antenna_delays") else {},
         "pair_offsets": offsets_from(read) if read.has("pair_offsets") else {},
     }
 
@@ -161,6 +167,16 @@ def _uncertainty(read: Reader) -> Uncertainty | None:
         inner.matrix("bias_m2", bias),
         inner.matrix("sigma_m2", sigma),
     )
+
+
+def _antenna_delays(read: Reader) -> dict[int | None, AntennaDelay]:
+    every, found = read.inside("antenna_delays"), dict[int | None, AntennaDelay]()
+    for name in read.table("antenna_delays"):
+        if not is_tag(name):
+            raise read.wrong("antenna_delays", "tag ids as keys")
+        inner = every.inside(name)
+        found[int(name)] = AntennaDelay(*(int(inner.number(key, REGISTER)) for key in AntennaDelay._fields))
+    return found
 
 
 def _groups(read: Reader) -> dict[str, TagGroup]:

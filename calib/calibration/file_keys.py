@@ -65,6 +65,14 @@ FILE_KEYS: Final = (
     FileKey("errors.pairs.PAIR.detour", "number, above 0", "1", "Its factor on the mean detour."),
     FileKey("pair_offsets.PAIR.offset_m", "number, m", "no constants", "How much longer ranges of a pair read."),
     FileKey("pair_offsets.PAIR.std_m", "number, m", "needed", "Its standard error."),
+    *(
+        FileKey(f"antenna_delays.TAG.{name}", "whole number, ticks", "not known", f"{what}, when it was recorded.")
+        for name, what in (
+            ("tx", "Transmit antenna delay register of a tag"),
+            ("rx", "Receive antenna delay register of a tag"),
+            ("reply", "What a tag's firmware added to the stamps of its delayed replies"),
+        )
+    ),
     FileKey("uncertainty.tags", "whole numbers", "not known", "Tags in the order of the next key."),
     FileKey("uncertainty.delays_ns2", "matrix, ns²", "needed", "Covariance of the delays."),
     FileKey("uncertainty.bias_m2", "matrix, m²", "needed", "Covariance of the bias curve's coefficients."),

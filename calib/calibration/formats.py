@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -17,52 +15,52 @@ from calib.calibration.json_format import is_tag
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.errors import BadInputError
+from calib.ranges import antenna_delays_in
 from uwblink.output import write_text
+from uwblink.recording.antenna_delays import (
+    REGISTER_MAX,
+    AntennaDelay,
+    AntennaDelays,
+    delay_of,
+    delays_differ,
+    load_antenna_delays,
+    text_of_delays,
+)
 from uwblink.recording.file import Recording
 from uwblink.text_files import read_text
-from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 TX_SHARE: Final = 0.44
 RX_SHARE: Final = 0.56
 """How an aggregate delay is split between transmitter and receiver (APS014, section 2; the authors' code)."""
 
 
-REGISTER_MAX: Final = 65_535
+def programmed(path: str | os.PathLike[str]) -> AntennaDelays:
+    """Return what was programmed into devices, from a recording or from a file of antenna delays (.toml).
+
+    Raises what `Recording.open` and `load_antenna_delays` raise.
+    """
+    if Path(path).suffix == ".toml":
+        return load_antenna_delays(Path(path))
+    with Recording.open(path) as opened:
+        found = antenna_delays_in(opened.meta(), str(path))
+    if not found:
+        raise BadInputError(f"{path}: does not say what was programmed into its devices")
+    return found
 
 
-@dataclass(frozen=True, slots=True)
-class Programmed:
-    """What stood in the antenna-delay registers (TX, RX) of devices when they were recorded, in ticks."""
+def registers(
+    calibration: Calibration, base: AntennaDelays | None = None, *, firmware: bool = False
+) -> dict[int | None, AntennaDelay]:
+    """Return what to program into tags, on top of what was programmed when they were recorded.
 
-    every: tuple[int, int] = (ANTENNA_DELAY_TICKS, ANTENNA_DELAY_TICKS)
-    single: Mapping[int, tuple[int, int]] = field(default_factory=dict)
-
-    def of(self, tag: int) -> tuple[int, int]:
-        """Return the registers of one device."""
-        return self.single.get(tag, self.every)
-
-
-def programmed(recording: str | os.PathLike[str]) -> Programmed:
-    """Return what a recording says was programmed into its devices; raises what `Recording.open` raises."""
-    with Recording.open(recording) as opened:
-        meta = opened.meta()
-    try:
-        every = meta["configured_antenna_delay_ticks"]
-        single = meta.get("configured_antenna_delay_ticks_by_tag", {})
-        by_tag = {int(tag): (int(row["tx"]), int(row["rx"])) for tag, row in single.items()}
-        return Programmed((int(every["tx"]), int(every["rx"])), by_tag)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BadInputError(f"{recording}: does not say what was programmed into its devices") from error
-
-
-def registers(calibration: Calibration, base: Programmed | None = None) -> dict[int, tuple[int, int]]:
-    """Return the values of the DW1000's TX and RX antenna-delay registers by tag, on top of what stood there.
-
-    `base` is what that was (`programmed`); without it the boards' 16436 in both. The chip adds the one to transmit
-    stamps and takes the other from receive stamps. A recorded stamp is the true one plus d_t = 0.44 d or
-    d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md). Raises `BadInputError` for a value that
-    16 bits do not hold, and for delays that the data left free: a device ranges with any other, and its register would
-    be right with some of them alone.
+    The calibration says what that was, or `base` does (`programmed`) for one that does not. The chip adds the
+    transmitter's register to transmit stamps and takes the receiver's from receive stamps. A recorded stamp is the
+    true one plus d_t = 0.44 d or d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md). With
+    `firmware`, its constant for the stamps of delayed replies is that of the transmitter; without, it stays as it was.
+    Raises `BadInputError` for a value that 16 bits do not hold, for delays that the data left free (a device ranges
+    with any other, and its register would be right with some of them alone), where nothing says what was programmed,
+    and where calibration and `base` contradict each other.
     """
     free = free_delays(calibration)
     if free:
@@ -71,7 +69,27 @@ def registers(calibration: Calibration, base: Programmed | None = None) -> dict[
             "is known (`fixed_ns`), or fit ranges between more tags (csv and json say what is known)",
             parameter="to",
         )
-    return _on_top(calibration, base or Programmed())
+    found = _on_top(calibration, base)
+    unknown = [tag for tag in calibration.delays_ns if tag not in found]
+    if unknown:
+        raise BadInputError(
+            f"nothing says what was programmed into tag {', '.join(map(str, sorted(unknown)))} when the calibration "
+            "was fitted; give the recording that it was fitted to, or a file of antenna delays",
+            parameter="base",
+        )
+    if firmware:
+        return {tag: one._replace(reply=one.tx) for tag, one in found.items()}
+    return found
+
+
+def antenna_delays_warning(calibration: Calibration, path: str | os.PathLike[str]) -> str:
+    """Say where other antenna delays were programmed into a recording's tags than where a calibration was fitted.
+
+    Returns "" where they were the same, or nothing says so; raises what `Recording.open` raises.
+    """
+    with Recording.open(path) as opened:
+        now, tags = antenna_delays_in(opened.meta(), str(path)), [tag.tag for tag in opened.tags()]
+    return delays_differ(calibration.antenna_delays, now, tags)
 
 
 def free_delays(calibration: Calibration) -> list[int]:
@@ -79,28 +97,45 @@ def free_delays(calibration: Calibration) -> list[int]:
     return [tag for tag, std in sorted(calibration.delays_std_ns.items()) if not math.isfinite(std)]
 
 
-def _on_top(calibration: Calibration, known: Programmed) -> dict[int, tuple[int, int]]:
-    """Return registers by tag, whatever is known of the delays."""
-    found = {}
-    for tag, delay in sorted(calibration.delays_ns.items()):
-        ticks = -delay * 1e-9 / TICK_S
-        tx, rx = known.of(tag)
-        found[tag] = (round(tx + TX_SHARE * ticks), round(rx + RX_SHARE * ticks))
+def _on_top(calibration: Calibration, base: AntennaDelays | None) -> dict[int | None, AntennaDelay]:
+    """Return what to program by tag, whatever is known of the delays; nothing for tags without a known base.
+
+    The sum of both registers is rounded once: it is what ranges are made of.
+    """
+    tags = sorted(calibration.delays_ns)
+    if base is not None and (differ := delays_differ(calibration.antenna_delays, base, tags)):
+        raise BadInputError(differ, parameter="base")
+    then, found = {**(base or {}), **calibration.antenna_delays}, dict[int | None, AntennaDelay]()
+    for tag in tags:
+        before, ticks = delay_of(then, tag), round(-calibration.delays_ns[tag] * 1e-9 / TICK_S)
+        if before is None:
+            continue
+        tx = round(TX_SHARE * ticks)
+        found[tag] = AntennaDelay(before.tx + tx, before.rx + ticks - tx, before.reply)
         if not all(0 <= value <= REGISTER_MAX for value in found[tag]):
             raise BadInputError(
-                f"tag {tag}: its registers would be {found[tag][0]} and {found[tag][1]}, which 16 bits do not hold; "
-                "give the recording that the calibration was fitted to",
+                f"tag {tag}: its registers would be {found[tag]}, which 16 bits do not hold; give the recording that "
+                "the calibration was fitted to",
                 parameter="base",
             )
     return found
 
 
-def _registers(calibration: Calibration, base: Programmed | None = None) -> str:
-    rows = [f"{tag},{tx},{rx}" for tag, (tx, rx) in registers(calibration, base).items()]
-    return "\n".join(["tag,tx_antenna_delay,rx_antenna_delay", *rows]) + "\n"
+REGISTERS_HEAD: Final = """\
+# Antenna delays to program, in ticks of 15.65 ps: the transmitter's register, the receiver's, and the firmware's
+# constant for the stamps of delayed replies (TX_ANT_DLY). `uwblink record --antenna-delays` takes this file.
+"""
 
 
-def _csv(calibration: Calibration, _base: Programmed | None = None) -> str:
+def _registers(calibration: Calibration, base: AntennaDelays | None = None) -> str:
+    return REGISTERS_HEAD + text_of_delays(registers(calibration, base))
+
+
+def _firmware(calibration: Calibration, base: AntennaDelays | None = None) -> str:
+    return REGISTERS_HEAD + text_of_delays(registers(calibration, base, firmware=True))
+
+
+def _csv(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
     rows = [
         f"{tag},{delay!r},{calibration.delays_std_ns.get(tag, '')!s}"
         for tag, delay in sorted(calibration.delays_ns.items())
@@ -117,7 +152,7 @@ def _one_curve(calibration: Calibration, form: str) -> None:
         )
 
 
-def _miluv(calibration: Calibration, _base: Programmed | None = None) -> str:
+def _miluv(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
     _one_curve(calibration, "miluv")
     original = calibration.provenance.get("miluv")
     document = dict(original) if isinstance(original, dict) else {}
@@ -129,17 +164,15 @@ def _miluv(calibration: Calibration, _base: Programmed | None = None) -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
-def _ros_yaml(calibration: Calibration, base: Programmed | None = None) -> str:
+def _ros_yaml(calibration: Calibration, base: AntennaDelays | None = None) -> str:
     _one_curve(calibration, "ros-yaml")
     lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}"]
     lines += [f"  power_at: {calibration.power_at}", "  tags:"]
-    for tag, (tx, rx) in _on_top(calibration, base or Programmed()).items():
-        lines += [
-            f"    '{tag}':",
-            f"      delay_ns: {calibration.delays_ns[tag]!r}",
-            f"      tx_antenna_delay: {tx}",
-            f"      rx_antenna_delay: {rx}",
-        ]
+    to_program = _on_top(calibration, base)
+    for tag, delay in sorted(calibration.delays_ns.items()):
+        lines += [f"    '{tag}':", f"      delay_ns: {delay!r}"]
+        if tag in to_program:
+            lines += [f"      tx_antenna_delay: {to_program[tag].tx}", f"      rx_antenna_delay: {to_program[tag].rx}"]
     for name, curve in (("bias_curve", calibration.bias_curve), ("sigma_curve", calibration.sigma_curve)):
         lines += [
             f"  {name}:",
@@ -174,11 +207,11 @@ def _error_lines(calibration: Calibration) -> list[str]:
     return lines
 
 
-def _json(calibration: Calibration, _base: Programmed | None = None) -> str:
+def _json(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
     return calibration.to_json()
 
 
-def _c_header(calibration: Calibration, _base: Programmed | None = None) -> str:
+def _c_header(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
     _one_curve(calibration, "c-header")
     return c_header(calibration)
 
@@ -186,13 +219,14 @@ def _c_header(calibration: Calibration, _base: Programmed | None = None) -> str:
 class Format(Protocol):
     """What turns a calibration, and what was programmed into its devices, into text."""
 
-    def __call__(self, calibration: Calibration, base: Programmed | None = None, /) -> str:
+    def __call__(self, calibration: Calibration, base: AntennaDelays | None = None, /) -> str:
         """Return the text; raises `BadInputError`."""
         ...
 
 
 FORMATS: Final[dict[str, Format]] = {
     "registers": _registers,
+    "firmware": _firmware,
     "json": _json,
     "csv": _csv,
     "miluv": _miluv,
@@ -206,20 +240,21 @@ def export(
     to: str,
     path: str | os.PathLike[str] | None = None,
     *,
-    base: Programmed | None = None,
+    base: AntennaDelays | None = None,
     force: bool = False,
 ) -> str:
     """Return a calibration as text in another form, and write it to `path` where one is given.
 
-    `to` is "registers" (values for the DW1000's antenna-delay registers, as CSV), "json", "csv" (delays), "miluv",
-    "ros-yaml" or "c-header" (tables and a function that corrects a range). Registers are on top of `base`, what was
-    programmed when the devices were recorded (`programmed`), else of the boards' own 16436. Raises `BadInputError` for
+    `to` is "registers" (values for the DW1000's antenna-delay registers, as TOML), "firmware" (those, and the constants
+    of its build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and a function that corrects a
+    range). Registers are on top of what was programmed when the devices were recorded, which the calibration says, or
+    `base` (`programmed`). Raises `BadInputError` for
     another form, for a calibration with groups of tags in a form that has one curve, and for registers of tags whose
     delays the data left free.
 
     >>> import calib
-    >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[0])
-    tag,tx_antenna_delay,rx_antenna_delay
+    >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])
+    [antenna_delays.tags.1]
     """
     require_calibration(calibration)
     if to not in FORMATS:
@@ -236,7 +271,8 @@ def read_miluv(path: Path) -> Calibration:
     """Read the JSON form of MILUV's published calibration; raises `BadInputError`.
 
     Its bias curve is meant for each reception (`power_at="reception"`), ours for the mean of an exchange's lifted
-    powers. What has no place here is kept, so that exporting gives it back.
+    powers, and its delays are on top of 16436 in both registers, as the boards had them. What has no place here is
+    kept, so that exporting gives it back.
     """
     text = read_text(path, BadInputError, "calibration of MILUV (.json)")
     try:
@@ -259,6 +295,7 @@ def read_miluv(path: Path) -> Calibration:
         bias_curve=bias,
         sigma_curve=sigma,
         power_at="reception",
+        antenna_delays=dict.fromkeys(delays, AntennaDelay()),
         provenance={"imported_from": path.name, "miluv": {key: rest.get(key) for key in order}},
     )
     return Calibration.from_json(found.to_json(), str(path))

@@ -9,6 +9,7 @@ import numpy as np
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from calib.ranges import LONGEST_M
+from uwblink.recording.antenna_delays import REGISTER_MAX
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import LARGEST_ID
 
@@ -42,6 +43,7 @@ STD_NS: Final = Bounds(0.0, LARGEST_DELAY_NS, f"nanoseconds, 0 to {LARGEST_DELAY
 METRES: Final = Bounds(-LONGEST_M, LONGEST_M, f"metres, up to ±{LONGEST_M:g}, the longest range that is read")
 STD_M: Final = Bounds(0.0, LONGEST_M, f"metres, 0 to {LONGEST_M:g}")
 POWER_DBM: Final = Bounds(-200.0, 100.0, "dBm, -200 to 100: the noise in a bandwidth of 500 MHz is -87 dBm")
+REGISTER: Final = Bounds(0, REGISTER_MAX, f"ticks of a register of 16 bits, 0 to {REGISTER_MAX}")
 LIGHT: Final = Bounds(
     0.999 * SPEED_OF_LIGHT, 1.001 * SPEED_OF_LIGHT, f"metres a second in air or vacuum, about {SPEED_OF_LIGHT:.0f}"
 )

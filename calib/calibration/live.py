@@ -16,8 +16,9 @@ from uwblink.twr import Exchanges
 def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
     """Return a function that corrects exchanges (n,) to `corrected_m`, and what else `CorrectedColumns` has.
 
-    The numbers are those of `calib.apply`. The function raises what `Calibration.apply` raises, as for a tag that is
-    not calibrated. Raises what `load_calibration` raises.
+    The numbers are those of `calib.apply`; its attribute `antenna_delays` says what was programmed where the
+    calibration was fitted. The function raises what `Calibration.apply` raises, as for a tag that is not calibrated.
+    Raises what `load_calibration` raises.
     """
     calibration = load_calibration(path)
 
@@ -27,4 +28,5 @@ def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
         known = CorrectedColumns.of(calibration.apply(ranges))._asdict()
         return {"corrected_m": known.pop("range_m"), **known}
 
+    correct.antenna_delays = calibration.antenna_delays  # type: ignore[attr-defined]
     return correct

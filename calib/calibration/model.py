@@ -37,7 +37,8 @@ class Calibration(CalibrationContent):
     own curves, and the plain ones are the groups' average, for a look only. `errors` says what the errors of corrected
     ranges are made of, by pair and power; None where that is not known, as in older and in imported calibrations. With
     `pair_offsets`, by pair with the smaller id first, ranges of a pair read longer by its constant, beside what delays
-    and curves say, and a pair that has none cannot be corrected.
+    and curves say, and a pair that has none cannot be corrected. `antenna_delays` is what was programmed into the tags
+    when they were recorded, which delays are on top of; empty where that is not known.
     """
 
     _corrector: RangeCorrector | None = field(default=None, init=False, compare=False)

@@ -63,7 +63,7 @@ def evaluate(
 
         check_places(report, None, figures, force=force)
         keep_imported()
-    known = known_calibration(calibration)
+    known = known_calibration(calibration, recordings)
     with waiting("evaluating"):
         parts = load_each(recordings, need_power=known.needs_power)
         evaluation = calib.evaluate(parts, known)
@@ -134,7 +134,7 @@ def localize(
         from calib.report import check_places, write_track_figures
 
         check_places(None, None, figures, force=force)
-    known = known_calibration(calibration)
+    known = known_calibration(calibration, recordings)
     if model != "poses":
         _onboard(recordings, known, model, tum, figures, as_json=as_json, force=force)
         return

@@ -62,7 +62,7 @@ def apply(
     import calib
 
     with waiting("correcting"):
-        applied = calib.apply(recording, known_calibration(calibration), output, to=to, force=force)
+        applied = calib.apply(recording, known_calibration(calibration, [recording]), output, to=to, force=force)
     typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
     if applied.unpowered:
         typer.echo(
@@ -75,13 +75,18 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="registers: antenna delays of the DW1000; csv: delays in ns; c-header: a function for a robot's code.",
-            **choice("registers", "json", "csv", "miluv", "ros-yaml", "c-header"),
+            help="registers: antenna delays of the DW1000; firmware: those, and constants of its build; csv: delays "
+            "in ns; c-header: a function for a robot's code.",
+            **choice("registers", "firmware", "json", "csv", "miluv", "ros-yaml", "c-header"),
         ),
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; else it is printed.")] = None,
     base: Annotated[
-        Path | None, typer.Option(help="Recording that says what was programmed into the devices; else 16436.")
+        Path | None,
+        typer.Option(
+            help="What was programmed when a calibration was fitted that does not say it: a recording or antenna "
+            "delays (.toml)."
+        ),
     ] = None,
     force: Force = False,
 ) -> None:

@@ -15,6 +15,7 @@ from calib.estimation.arguments import check_choice, check_tag
 from calib.estimation.losses import LOSSES
 from calib.estimation.robust import robust_fit, sandwich
 from calib.sources import Data, load_ranges
+from uwblink.recording.antenna_delays import delays_differ, known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 FEWEST = 50
@@ -41,6 +42,9 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     ranges = load_ranges(data, need_power=calibration.needs_power)
     if tag in calibration.delays_ns:
         raise BadInputError(f"tag {tag} has a delay in the calibration already; fit anew to change it", parameter="tag")
+    differ = delays_differ(calibration.antenna_delays, ranges.antenna_delays, calibration.delays_ns)
+    if differ:
+        raise BadInputError(differ, parameter="calibration")
     if tag not in ranges.tags():
         raise BadInputError(
             f"tag {tag} does not range in {ranges.source}; its tags are {', '.join(map(str, ranges.tags()))}",
@@ -72,5 +76,6 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
         calibration,
         delays_ns=calibration.delays_ns | {tag: delay},
         delays_std_ns=calibration.delays_std_ns | {tag: float(np.sqrt(covariance[0, 0]))},
+        antenna_delays={**calibration.antenna_delays, **known_delays(ranges.antenna_delays, [tag])},
         provenance=calibration.provenance | {"added": [*calibration.provenance.get("added", []), added]},
     )

@@ -19,6 +19,7 @@ from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
 from calib.long_columns import computed, let_go
 from uwblink.arrays import Floats
+from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
@@ -66,6 +67,7 @@ def calibration_of(
         pair_offsets=offsets,
         groups={name: TagGroup(tuple(tags), biases[name], sigma.curves[name]) for name, tags in groups.items()},
         errors=error_model(problem, found.residuals, found.mixture),
+        antenna_delays=known_delays(problem.ranges.antenna_delays, problem.ranges.tags()),
     )
 
 

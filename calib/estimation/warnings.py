@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from calib.ranges import STATIC, Ranges
+from uwblink.recording.antenna_delays import known_delays
 
 MANY_MISSING: Final = 0.05
 MANY_OUTLIERS: Final = 0.4
@@ -21,6 +22,14 @@ def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: 
         groups = "; ".join(", ".join(map(str, group)) for group in free)
         found.append(
             f"the data leave the delays of tags {groups} free; those written are the smallest that agree with the data"
+        )
+    delays = known_delays(ranges.antenna_delays, ranges.tags())
+    apart = [f"{tag} ({one})" for tag, one in delays.items() if tag is not None and one.reply != one.tx]
+    if apart:
+        found.append(
+            f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} carry two antenna delays, the register's "
+            "and another constant in those of delayed replies: no delay of a tag fits both; program the firmware's "
+            "constants, too (`calib export --to firmware`), and record anew"
         )
     everything = len(ranges) + sum(ranges.excluded.values())
     for reason, count in ranges.excluded.items():

@@ -11,12 +11,13 @@ import numpy as np
 
 from calib.errors import BadInputError, UnanswerableError
 from calib.ranges import Ranges, concatenate
-from calib.sources import Data, each, opened
+from calib.sources import Data, antenna_delays_of, each, opened
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.pair_means import PairMeans, pair_means
 from calib.surveys.result import Contradiction
 from calib.surveys.stillness import moved, stretches_ns
 from uwblink.arrays import Ints
+from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.recording.schema import Arrangement, KnownDistance
 from uwblink.recording.target_reports import single_reports
 
@@ -34,6 +35,7 @@ class Gathered:
     exchanges: int
     findings: tuple[Contradiction, ...]
     warnings: tuple[str, ...]
+    antenna_delays: AntennaDelays
 
 
 def gather(data: Data | Iterable[Data], knowledge: Knowledge) -> Gathered:
@@ -73,6 +75,7 @@ def gather(data: Data | Iterable[Data], knowledge: Knowledge) -> Gathered:
         exchanges=int(means.count.sum()),
         findings=tuple(findings),
         warnings=tuple(warnings),
+        antenna_delays=whole.antenna_delays,
     )
 
 
@@ -83,9 +86,12 @@ def _load(data: Data) -> tuple[Ranges, list[Arrangement], list[KnownDistance]]:
         exchanges = single_reports(source.exchanges).exchanges
         marked = list(getattr(source, "arrangements", ()))
         stated = list(getattr(source, "known_distances", ()))
+        delays = antenna_delays_of(source, name)
     if not len(exchanges):
         raise UnanswerableError(f"{name}: holds no exchanges")
-    return _finite(Ranges.from_exchanges(exchanges, np.full(len(exchanges), np.nan), source=name)), marked, stated
+    unknown = np.full(len(exchanges), np.nan)
+    ranges = Ranges.from_exchanges(exchanges, unknown, source=name, antenna_delays=delays)
+    return _finite(ranges), marked, stated
 
 
 def _finite(ranges: Ranges) -> Ranges:

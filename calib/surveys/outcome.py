@@ -23,6 +23,7 @@ from calib.surveys.scales import M_PER_NS
 from calib.surveys.surveyed import SurveyedArrangement, SurveyedBoard
 from calib.surveys.taken_curve import TakenCurve
 from uwblink.arrays import Floats
+from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 
@@ -62,6 +63,7 @@ def calibration_of(
         sigma_curve=flat_curve(sigma, span),
         provenance=_provenance(gathered, found, verdict, warnings, curve) | dict(more),
         uncertainty=Uncertainty(tuple(tags), _rows(covariance), _rows(curve_covariance), _rows(variance)),
+        antenna_delays=known_delays(gathered.antenna_delays, tags),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.errors import UnanswerableError
 from calib.ranges import Ranges
-from calib.sources import Data, Source, opened
+from calib.sources import Data, Source, antenna_delays_of, opened
 from calib.trajectories.attitudes import Attitude, matrices
 from calib.trajectories.heights import heights_of, no_heights
 from calib.trajectories.inertial import Readings, integrated, windows
@@ -70,12 +70,17 @@ def scene_from(data: Data, usable: Usable, *, need_power: bool = True) -> Scene:
         exchanges = single_reports(source.exchanges).exchanges
         poses, tags = source.poses, list(source.tags)
         planted = _planted(source)
-        beside = _Beside.of(source)
+        beside, delays = _Beside.of(source), antenna_delays_of(source, name)
     if not tags:
         raise UnanswerableError(f"{name}: does not say which tag sits on which body; 'uwblink poses --tags' adds that")
     # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
     numbered = Ranges.from_exchanges(
-        exchanges, np.arange(len(exchanges), dtype=np.float64), tags=tags, planted=planted, source=name
+        exchanges,
+        np.arange(len(exchanges), dtype=np.float64),
+        tags=tags,
+        planted=planted,
+        source=name,
+        antenna_delays=delays,
     ).usable(need_power=need_power)
     carried = {tag.tag for tag in tags}
     rows = numbered.truth_m.astype(np.int64)

@@ -13,7 +13,7 @@ from calib.ranges import APART, COLUMNS, Ranges
 from calib.recorded import read_ranges
 from calib.samples import sample_flight
 from calib.sources import fingerprint
-from uwblink.recording import blocks, target_reports
+from uwblink.recording import AntennaDelay, blocks, target_reports
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.target_reports import single_reports
@@ -34,7 +34,12 @@ def of_all(path):
     with Recording.open(path) as recording:
         whole = recording.exchanges()
         found = Ranges.from_exchanges(
-            whole, poses=recording.poses(), tags=recording.tags(), planted=recording.meta()["planted"], source="it"
+            whole,
+            poses=recording.poses(),
+            tags=recording.tags(),
+            planted=recording.meta()["planted"],
+            source="it",
+            antenna_delays={None: AntennaDelay()},
         )
     return found.usable()
 
@@ -159,7 +164,12 @@ def test_of_two_reports_one_counts_wherever_blocks_and_stretches_end(tmp_path, m
         reports = single_reports(recording.exchanges())
         alone = reports.exchanges
         whole = Ranges.from_exchanges(
-            alone, poses=recording.poses(), tags=recording.tags(), planted=recording.meta()["planted"], source="it"
+            alone,
+            poses=recording.poses(),
+            tags=recording.tags(),
+            planted=recording.meta()["planted"],
+            source="it",
+            antenna_delays={None: AntennaDelay()},
         ).usable()
         monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", 23)
         found = read_ranges(recording, "it", need_power=True, rows=rows)

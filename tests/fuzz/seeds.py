@@ -126,7 +126,7 @@ KINDS: Final = (
             "uwblink stream {flight.uwb} --speed inf -c {}",
             *(
                 f"calib export {{}} --to {form} -o {{out}}"
-                for form in ("registers", "json", "csv", "miluv", "ros-yaml", "c-header")
+                for form in ("registers", "firmware", "json", "csv", "miluv", "ros-yaml", "c-header")
             ),
         ),
         ("calib evaluate {flight.uwb} -c {} --report {out}.html", "uwbsim twin {flight.uwb} -c {} -o {out} --seeds 1"),

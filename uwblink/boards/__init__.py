@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from uwblink.boards.corrections import load_correction
+    from uwblink.boards.corrections import Correction, delays_warning, load_correction
     from uwblink.boards.figures import plot_cir
     from uwblink.boards.live_page import LivePage
     from uwblink.boards.ports import boards_ports, serial_number
@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from uwblink.boards.replay import decode_again, play, rewrite, summarize
 
 __all__ = [
+    "Correction",
     "LivePage",
     "Progress",
     "boards_ports",
     "decode_again",
+    "delays_warning",
     "load_correction",
     "load_plan",
     "play",
@@ -28,10 +30,12 @@ __all__ = [
 ]
 
 _HOMES: Final = {
+    "Correction": "uwblink.boards.corrections",
     "LivePage": "uwblink.boards.live_page",
     "Progress": "uwblink.boards.progress",
     "boards_ports": "uwblink.boards.ports",
     "decode_again": "uwblink.boards.replay",
+    "delays_warning": "uwblink.boards.corrections",
     "load_correction": "uwblink.boards.corrections",
     "load_plan": "uwblink.boards.ranging_plan",
     "play": "uwblink.boards.replay",

@@ -6,7 +6,7 @@ function that takes the path of a calibration and returns the function which cor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Final
 
 from uwblink.arrays import Bools, Floats
 from uwblink.errors import PlanError
+from uwblink.recording.antenna_delays import AntennaDelays, delays_differ
 from uwblink.twr import Exchanges
 
 GROUP: Final = "uwbcal.corrections"
@@ -45,6 +46,16 @@ def _as_plan_errors() -> Iterator[None]:
         yield
     except (ValueError, OSError, ImportError) as error:
         raise PlanError(str(error)) from error
+
+
+def delays_warning(correct: Correction | None, delays: AntennaDelays, tags: Iterable[int] | None = None) -> str:
+    """Say where a correction is of other antenna delays than are programmed now; "" where it is not, or not known.
+
+    A correction says what it is of by an attribute `antenna_delays`. `tags` are those that range, by default all that
+    it knows.
+    """
+    then: AntennaDelays = getattr(correct, "antenna_delays", {})
+    return delays_differ(then, delays, (tag for tag in then if tag is not None) if tags is None else tags)
 
 
 def check_pairs(correct: Correction | None, pairs: Sequence[tuple[int, int]]) -> None:

@@ -11,18 +11,25 @@ get_cir = false                # have the initiator print its channel impulse re
 id = 10
 body = "ifo001"
 lever_arm_m = [0.17, -0.17, -0.05]
+
+[antenna_delays.tags.10]       # optional: what was programmed into a board; without any, 16436 into all
+tx = 16446
+rx = 16449
+reply = 16446
 ```
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from uwblink.errors import PlanError
+from uwblink.recording.antenna_delays import FILE_KEYS as DELAY_KEYS
+from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of, read_antenna_delays
 from uwblink.recording.schema import Tag
 from uwblink.recording.tags import is_board_id, read_tags
 from uwblink.toml import FileKey, TomlReader, heads, is_number
@@ -39,6 +46,7 @@ FILE_KEYS: Final = (
     FileKey("tags[].id", "whole number, 0 to 254", "needed", "A board whose place on a body is known."),
     FileKey("tags[].body", "text", "needed", "The body that carries it, as motion capture calls it."),
     FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Where its antenna sits in the body's frame."),
+    *DELAY_KEYS,
 )
 KEYS: Final = tuple(name.removesuffix("[]") for name in heads(FILE_KEYS))
 
@@ -47,8 +55,9 @@ KEYS: Final = tuple(name.removesuffix("[]") for name in heads(FILE_KEYS))
 class RangingPlan:
     """A ranging plan: `pairs` of (initiator, target) in the order in which they take turns, "all", or () to listen.
 
-    `rate_hz` exchanges a second in total, as fast as boards answer without it. `tags` say where boards sit. Raises
-    `PlanError` for what cannot be played.
+    `rate_hz` exchanges a second in total, as fast as boards answer without it. `tags` say where boards sit, and
+    `antenna_delays` what was programmed into them (under None: into those not named), 16436 into all where it is empty.
+    Raises `PlanError` for what cannot be played.
 
     >>> import uwblink
     >>> uwblink.RangingPlan().turns([10, 20, 30])
@@ -64,6 +73,7 @@ class RangingPlan:
     target_reports: bool = False
     get_cir: bool = False
     tags: tuple[Tag, ...] = ()
+    antenna_delays: AntennaDelays = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check what was given."""
@@ -74,6 +84,21 @@ class RangingPlan:
         for pair in () if self.pairs == "all" else self.pairs:
             if not (isinstance(pair, tuple) and len(pair) == 2 and all(map(is_board_id, pair)) and pair[0] != pair[1]):
                 raise PlanError(f'pairs: found {pair!r:.60}, expected "all" or pairs of two different ids')
+
+    def delays(self) -> AntennaDelays:
+        """Return what is programmed into boards: what is said of it, else the 16436 of their firmware into all."""
+        return self.antenna_delays or {None: AntennaDelay()}
+
+    def programmed(self, present: Iterable[int]) -> AntennaDelays:
+        """Return what is programmed into boards that are present; raises `PlanError` where only some are told."""
+        found = {board: delay_of(self.delays(), board) for board in sorted(present)}
+        unknown = [board for board, delay in found.items() if delay is None]
+        if unknown:
+            raise PlanError(
+                f"antenna_delays: nothing is said of board {_listed(unknown)}; say what is programmed into it, or give "
+                "tx, rx and reply for all that are not named"
+            )
+        return {board: delay for board, delay in found.items() if delay is not None}
 
     def turns(self, present: Sequence[int]) -> tuple[tuple[int, int], ...]:
         """Return the pairs among boards that are present, none to only listen; raises `PlanError` naming absent ones.
@@ -108,7 +133,9 @@ def load_plan(path: Path) -> RangingPlan:
     for name, value in flags.items():
         file.check(name, value, isinstance(value, bool), "true or false")
     pairs = _pairs(path, table.get("pairs", "all"))
-    return RangingPlan(pairs, rate_hz=rate, protocol=protocol, tags=read_tags(file), **flags)
+    return RangingPlan(
+        pairs, rate_hz=rate, protocol=protocol, tags=read_tags(file), antenna_delays=read_antenna_delays(file), **flags
+    )
 
 
 def _pairs(path: Path, value: Any) -> tuple[tuple[int, int], ...] | Literal["all"]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from uwblink.boards.board import Board
+from uwblink.boards.delay_check import DelayCheck, WrongDelayError
 from uwblink.boards.listeners import Heard, Listener, Pair, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.progress import Progress
@@ -16,6 +18,7 @@ from uwblink.boards.recorder import Recorder
 from uwblink.boards.writer import RecordingWriter
 from uwblink.errors import PlanError
 from uwblink.output import check_output
+from uwblink.recording.antenna_delays import meta_of_delays
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import SHAPES, Arrangement, Tag
 
@@ -45,8 +48,10 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     (see `uwblink.boards.listeners`), and `using` are other ports than this computer's serial ones (`VirtualPorts`).
     `arrangement` names the places of boards that stand still meanwhile, `known` to be on a "line" or a "plane", and
     `order` says in which order their ids lie along a line; it is marked in the recording, for a survey.
+    What is programmed into boards as antenna delays is what `plan` says of it, and goes into the recording.
     `KeyboardInterrupt` ends a recording like `stop`, with everything in the file. Raises the errors of `Board.open`,
-    `PlanError` (a tag of plan or order is absent, two boards have one id, a duration that is none), and
+    `PlanError` (a tag of plan or order is absent, two boards have one id, a duration that is none, stamps of other
+    antenna delays than the plan's, whose recording is removed), and
     `RecordingError` (cannot be written, disk full); the file stays readable.
 
     >>> import uwblink, uwbsim
@@ -89,12 +94,17 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
         )
     for listener in others:
         listener.on_start(turns)
-    meta = _meta(found, plan, turns, passive)
-    with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
+    delays = plan.programmed(found)
+    meta = _meta(found, plan, turns, passive) | (meta_of_delays(delays) if plan.antenna_delays else {})
+    with (
+        _without_wrong_delays(path),
+        Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording,
+    ):
         seats = {tag.tag: tag for tag in plan.tags}
         recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
         with RecordingWriter(recording) as writer:
-            recorder = Recorder(found, plan, turns, [writer, *others], passive=passive, ports=using)
+            told = [writer, DelayCheck(delays), *others]
+            recorder = Recorder(found, plan, turns, told, passive=passive, ports=using)
 
             def tell(progress: Progress) -> None:
                 progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
@@ -110,6 +120,16 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
             mark = Arrangement(arrangement, recorder.progress.start_ns, last_ns, known, tuple(order))
             recording.append_arrangements([mark])
     return recorder.progress
+
+
+@contextmanager
+def _without_wrong_delays(path: Path) -> Iterator[None]:
+    """Remove a recording that was given up because its `meta` would say wrong antenna delays."""
+    try:
+        yield
+    except WrongDelayError:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def _meta(found: dict[int, str], plan: RangingPlan, turns: Iterable[Pair], passive: bool) -> dict[str, Any]:

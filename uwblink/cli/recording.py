@@ -14,8 +14,13 @@ from uwblink.cli.guide import add, choice
 from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
+    from uwblink import RangingPlan
     from uwblink.boards import LivePage, Progress
 
+AntennaDelays = Annotated[
+    Path | None,
+    typer.Option(help="What was programmed into the boards, as calib export wrote it (.toml); else 16436 into all."),
+]
 PANEL: Final = "Recording and streaming"
 LIVE: Final = "Live page"
 LINE_EVERY_S = 2.0
@@ -50,6 +55,7 @@ def record(
     order: Annotated[
         str, typer.Option(metavar="TAG,TAG...", help="In which order they lie along a line, from either end.")
     ] = "",
+    antenna_delays: AntennaDelays = None,
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
     cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
     live: Annotated[
@@ -78,6 +84,7 @@ def record(
     if pairs not in (None, "all", "none"):
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
     chosen = load_plan(plan) if plan else RangingPlan("all" if pairs == "all" else ())
+    chosen = with_antenna_delays(chosen, antenna_delays)
     if rate:
         chosen = replace(chosen, rate_hz=rate)
     if cir:
@@ -88,7 +95,7 @@ def record(
         raise PlanError("--order: is that of boards on a line; give --known line, too")
     if calibration and not live:
         raise PlanError("--calibration: corrected ranges are shown on the page of --live; give that, too")
-    with interrupts() as stop, _watcher() as watch, _page(output, calibration, live_port, live) as page:
+    with interrupts() as stop, _watcher() as watch, _page(output, calibration, live_port, live, chosen) as page:
 
         def watch_all(progress: Progress) -> None:
             watch(progress)
@@ -112,6 +119,22 @@ def record(
     typer.echo(f"{output}: {_summary(progress)}")
 
 
+def with_antenna_delays(plan: RangingPlan, path: Path | None) -> RangingPlan:
+    """Return a plan with the antenna delays of a file; raises `PlanError` where it has some of its own."""
+    from dataclasses import replace
+
+    from uwblink.errors import PlanError
+    from uwblink.recording import load_antenna_delays
+
+    if path is None:
+        return plan
+    if plan.antenna_delays:
+        raise PlanError(
+            f"{path}: the plan has [antenna_delays], too; leave one of them out", parameter="antenna_delays"
+        )
+    return replace(plan, antenna_delays=load_antenna_delays(path))
+
+
 def _ids(text: str) -> tuple[int, ...]:
     from uwblink.errors import PlanError
 
@@ -122,14 +145,18 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 @contextmanager
-def _page(output: Path, calibration: Path | None, port: int, live: bool) -> Iterator[LivePage | None]:
+def _page(
+    output: Path, calibration: Path | None, port: int, live: bool, plan: RangingPlan
+) -> Iterator[LivePage | None]:
     """Serve the live page, if it was asked for."""
     if not live:
         yield None
         return
-    from uwblink.boards import LivePage, load_correction
+    from uwblink.boards import LivePage, delays_warning, load_correction
 
     correct = load_correction(calibration) if calibration else None
+    if warning := delays_warning(correct, plan.delays()):
+        typer.echo(f"warning: {calibration}: {warning}", err=True)
     with LivePage(output, correct=correct, port=port) as page:
         typer.echo(f"live page: {page.url}", err=True)
         yield page

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from uwblink.cli.guide import add
-from uwblink.cli.recording import PANEL
+from uwblink.cli.recording import PANEL, with_antenna_delays
 from uwblink.cli.shared import Force, interrupts
 
 if TYPE_CHECKING:
     from uwblink import RangingPlan, StreamedRange
+    from uwblink.boards import Correction
 
 SUFFIX: Final = ".uwb"
 BOARDS: Final = "Of boards"
@@ -43,6 +44,10 @@ def stream(
     ] = None,
     rate: Annotated[
         float | None, typer.Option(min=0.001, rich_help_panel=BOARDS, help="Exchanges a second in total (Hz).")
+    ] = None,
+    antenna_delays: Annotated[
+        Path | None,
+        typer.Option(rich_help_panel=BOARDS, help="What was programmed into them (.toml); else 16436 into all."),
     ] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until the end.")] = None,
     speed: Annotated[float, typer.Option(min=0.001, help="How much faster a recording plays; inf: at once.")] = 1.0,
@@ -71,18 +76,40 @@ def stream(
     with ExitStack() as stack:
         stop = stack.enter_context(interrupts())
         senders += _senders(stack, udp, foxglove)
-        chosen = _plan(source, plan, rate, output)
+        chosen = _plan(source, plan, rate, output, antenna_delays)
+        correct = _correction(calibration, source, chosen)
         if output and chosen:
-            count = _record(source, output, chosen, calibration, duration, stop, [seen], senders, force=force)
+            count = _record(source, output, chosen, correct, duration, stop, [seen], senders, force=force)
         else:
-            ranges = _begin(source, calibration, chosen, duration, speed, stop, seen)
+            ranges = _begin(source, correct, chosen, duration, speed, stop, seen)
             stack.callback(ranges.close)
             count = _hand_on(ranges, senders)
     faults = ", ".join(f"{kind} {number}" for kind, number in sorted(seen.faults.items()))
     typer.echo(f"{count} ranges" + (f"; faults: {faults}" if faults else ""), err=True)
 
 
-def _plan(source: list[str], path: Path | None, rate: float | None, output: Path | None) -> RangingPlan | None:
+def _correction(calibration: Path | None, source: list[str], plan: RangingPlan | None) -> Correction | None:
+    """Return the correction of a calibration, and warn where it is of other antenna delays than the ranges."""
+    from uwblink import Recording
+    from uwblink.boards import delays_warning, load_correction
+    from uwblink.recording import delays_in_meta
+
+    if calibration is None:
+        return None
+    correct = load_correction(calibration)
+    if plan is None:
+        with Recording.open(source[0]) as recording:
+            warning = delays_warning(correct, delays_in_meta(recording.meta()), [t.tag for t in recording.tags()])
+    else:
+        warning = delays_warning(correct, plan.delays())
+    if warning:
+        typer.echo(f"warning: {calibration}: {warning}", err=True)
+    return correct
+
+
+def _plan(
+    source: list[str], path: Path | None, rate: float | None, output: Path | None, antenna_delays: Path | None
+) -> RangingPlan | None:
     from dataclasses import replace
 
     from uwblink import RangingPlan
@@ -90,10 +117,12 @@ def _plan(source: list[str], path: Path | None, rate: float | None, output: Path
     from uwblink.errors import PlanError
 
     if _is_recording(source):
-        if path or rate or output:
-            raise PlanError(f"{source[0]}: it is streamed as it is; --plan, --rate and --output are for boards")
+        if path or rate or output or antenna_delays:
+            raise PlanError(
+                f"{source[0]}: it is streamed as it is; --plan, --rate, --antenna-delays and --output are for boards"
+            )
         return None
-    chosen = load_plan(path) if path else RangingPlan()
+    chosen = with_antenna_delays(load_plan(path) if path else RangingPlan(), antenna_delays)
     return replace(chosen, rate_hz=rate) if rate else chosen
 
 
@@ -103,7 +132,7 @@ def _is_recording(source: list[str]) -> bool:
 
 def _begin(
     source: list[str],
-    calibration: Path | None,
+    calibration: Correction | None,
     plan: RangingPlan | None,
     duration: float | None,
     speed: float,
@@ -139,7 +168,7 @@ def _record(
     ports: list[str],
     output: Path,
     plan: RangingPlan,
-    calibration: Path | None,
+    calibration: Correction | None,
     duration: float | None,
     stop: Callable[[], bool],
     listeners: list[Any],

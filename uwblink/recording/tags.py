@@ -10,7 +10,7 @@ from uwblink.recording.schema import Tag
 from uwblink.toml import TomlReader, is_number
 
 LARGEST_BOARD_ID: Final = 254
-PLAN_KEYS: Final = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir")
+PLAN_KEYS: Final = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "antenna_delays")
 """What a ranging plan has beside its tags: a plan says where tags sit, too."""
 
 

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from uwblink.boards.corrections import Correction, check_pairs, load_correction
+from uwblink.boards.delay_check import DelayCheck
 from uwblink.boards.listeners import Heard, Listener, Pair, Turn, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
@@ -79,7 +80,7 @@ def stream(
     turns = chosen.turns(sorted(found))
 
     ranges: deque[StreamedRange] = deque()
-    told = [RangeListener(ranges.append, correct), *told]
+    told = [RangeListener(ranges.append, correct), DelayCheck(chosen.programmed(found)), *told]
     for listener in told:
         listener.on_start(turns)
     return _live(lambda: Recorder(found, chosen, turns, told, ports=ports), ranges, duration_s, stop)

@@ -135,12 +135,25 @@ class Radios:
         """Return the first transmit stamp that a board's clock allows at or after a true time (sub-ticks)."""
         me = self._one(board)
         ready = -(-int(self.medium.clocks.read(me, np.array([time]))[0]) // SUBTICKS)
-        return _on_grid(ready) + ANTENNA_DELAY_TICKS
+        return _on_grid(ready) + self.tx_register(board)
 
-    def reply_stamp(self, received: int) -> int:
+    def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of a reply sent at once to what was received at a stamp; its latency is drawn."""
         latency = round(float(draw_reply_s(self.scenario, self._chance, 1)[0]) / TICK_S)
-        return _on_grid(received + latency - ANTENNA_DELAY_TICKS) + ANTENNA_DELAY_TICKS
+        return _on_grid(received + latency - ANTENNA_DELAY_TICKS) + self.tx_register(board)
+
+    def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
+        """Return the transmit stamps of a frame that is to leave a while after the stamp `reference`.
+
+        The chip's, which ignores the low nine bits of the time at which it is told to send; and the one that the
+        firmware works out and sends, with a constant of its build.
+        """
+        due = (reference + delay_uus * UUS_TICKS) // DELAYED_TX_GRID * DELAYED_TX_GRID
+        return due + self.tx_register(board), due + int(self.medium.reply_constant[self.place[board]])
+
+    def tx_register(self, board: int) -> int:
+        """Return what is programmed into a board's register of the transmitter, in ticks."""
+        return int(self.medium.tx_register[self.place[board]])
 
     def excess_m(self) -> float:
         """Draw the detour of an exchange's signals."""
@@ -189,15 +202,6 @@ class Radios:
 
     def _one(self, board: int) -> Ints:
         return np.array([self.place[board]])
-
-
-def scheduled_stamp(reference: int, delay_uus: int) -> int:
-    """Return the transmit stamp of a frame that is to leave a while after the stamp `reference`.
-
-    The chip ignores the low nine bits of the time at which it is told to send.
-    """
-    due = reference + delay_uus * UUS_TICKS
-    return due // DELAYED_TX_GRID * DELAYED_TX_GRID + ANTENNA_DELAY_TICKS
 
 
 def _on_grid(ticks: int) -> int:

@@ -25,7 +25,6 @@ from uwbsim.boards.frames import (
     PollPayload,
     Received,
     ResponsePayload,
-    scheduled_stamp,
 )
 from uwbsim.world.impulse_response import impulse_response, in_transfers
 
@@ -119,23 +118,32 @@ def answer(board: VirtualBoard, received: Received) -> Steps:
     wish, initiator, radio = received.frame.payload, received.frame.sender, board.radio
     if not isinstance(wish, PollPayload):
         raise TypeError("only a poll is answered")
-    excess = received.frame.excess_m
+    excess, radios = received.frame.excess_m, board.bench.radios
     if wish.double_sided:
-        first = board.bench.radios.reply_stamp(received.stamp)
+        first = radios.reply_stamp(board.id, received.stamp)
         yield radio.over(radio.send(initiator, ResponsePayload(), first, excess))
         if not SHORTEST_WORKING_DELAY_UUS <= board.delay_uus <= LONGEST_ACCEPTED_DELAY_UUS:
             return
-        last = scheduled_stamp(first, board.delay_uus)
+        last, told = radios.scheduled_stamps(board.id, first, board.delay_uus)
+        sent = first, told
     else:
-        first = last = scheduled_stamp(received.stamp, SINGLE_SIDED_DELAY_UUS)
-    mine = received.stamp & MASK, first & MASK, last & MASK if wish.double_sided else 0
-    radio.send(initiator, FinalPayload(mine, received.power_dbm, received.skew_ppm), last, excess)
+        last, told = radios.scheduled_stamps(board.id, received.stamp, SINGLE_SIDED_DELAY_UUS)
+        first, sent = last, (told, told)
+    payload = FinalPayload(_of_target(received.stamp, *sent, wish), received.power_dbm, received.skew_ppm)
+    radio.send(initiator, payload, last, excess)
     if not wish.target_reports:
         return
     came = yield from radio.wait()
     if came is None or not is_expected(came, FinalPayload, initiator, board.id):
         return
+    # Its own report has the chip's stamps, and not those that it sent.
+    mine = _of_target(received.stamp, first, last, wish)
     yield from _target_report(board, mine, received, came, get_cir=wish.get_cir)
+
+
+def _of_target(received: int, first: int, last: int, wish: PollPayload) -> tuple[int, int, int]:
+    """Return the stamps of a target as they are printed: rx1, tx2, tx3, without the last in single-sided ranging."""
+    return received & MASK, first & MASK, last & MASK if wish.double_sided else 0
 
 
 def _target_report(

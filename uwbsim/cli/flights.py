@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -13,7 +13,13 @@ from uwblink.cli.shared import interrupts, print_json
 from uwblink.cli.waiting import waiting
 from uwbsim.cli.arguments import AllowFiles, AsJson, Force, Overrides, ScenarioFile, progress, shipped
 
+if TYPE_CHECKING:
+    from uwbsim import Scenario
+
 PANEL: Final = "Scenarios"
+AntennaDelays = Annotated[
+    Path | None, typer.Option(help="What is programmed into the tags, as calib export wrote it (.toml).")
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -39,6 +45,7 @@ def run(
     seed: Annotated[int | None, typer.Option(min=0, help="Seed instead of the file's.")] = None,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
+    antenna_delays: AntennaDelays = None,
     wire: Annotated[
         bool, typer.Option("--through-wire", help="Encode and decode every report, and record the bytes.")
     ] = False,
@@ -53,7 +60,7 @@ def run(
     from uwblink.output import check_output
 
     check_output(output, force=force, recording=True)
-    loaded = uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ())
+    loaded = _programmed(uwbsim.load(scenario, overrides or (), seed, allow_files=allow_files or ()), antenna_delays)
     with progress(loaded.run.name) as report:
         simulated = uwbsim.simulate(loaded, report, contention=contention)
     if wire:
@@ -66,6 +73,15 @@ def run(
         f"{len(loaded.pairs())} pairs, {loaded.run.duration_s:g} s, "
         f"{len(simulated.faults)} failed"
     )
+
+
+def _programmed(scenario: Scenario, path: Path | None) -> Scenario:
+    """Return a scenario with the antenna delays of a file programmed into its tags."""
+    from uwbsim.scenario import with_antenna_delays
+
+    if path is None:
+        return scenario
+    return scenario.model_copy(update={"tags": with_antenna_delays(scenario.tags, path)})
 
 
 def scenarios(
@@ -104,6 +120,7 @@ def serve(
     faults: Annotated[Path | None, typer.Option(help="What goes wrong (.toml).")] = None,
     poses: Annotated[Path | None, typer.Option(help="Motion capture to write as it goes (.csv), in host time.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
+    antenna_delays: AntennaDelays = None,
     overrides: Overrides = None,
     allow_files: AllowFiles = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the poses if they exist.")] = False,
@@ -115,7 +132,7 @@ def serve(
 
     if poses:
         check_output(poses, force=force)
-    loaded = uwbsim.load(scenario, overrides or (), allow_files=allow_files or ())
+    loaded = _programmed(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), antenna_delays)
     wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
     server = uwbsim.Server(extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True))
     try:

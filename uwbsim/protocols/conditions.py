@@ -9,6 +9,7 @@ import numpy as np
 
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
+from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.airtime import before_marker_s
 from uwbsim.scenario.model import Scenario
@@ -100,7 +101,16 @@ COLUMNS: Final = tuple(f.name for f in fields(Conditions) if f.type == "Floats")
 
 
 def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
-    """Sample the exchanges of a scenario's plan, evenly over its duration; fewer than `count` if it plans fewer."""
+    """Sample the exchanges of a scenario's plan, evenly over its duration; fewer than `count` if it plans fewer.
+
+    Raises `ScenarioError` for tags whose stamps of delayed replies have another antenna delay than their other stamps.
+    """
+    for tag in scenario.tags:
+        if tag.antenna_delay.reply != tag.antenna_delay.tx:
+            raise ScenarioError(
+                f"tag {tag.id}: antenna_delay: reply = {tag.antenna_delay.reply} and tx = {tag.antenna_delay.tx} are "
+                "simulated by `uwbsim run` and served boards only, not in comparisons of protocols"
+            )
     # Exchanges that an outage prevents have no range.
     scenario = scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"outages": None})})
     plan = schedule(scenario)

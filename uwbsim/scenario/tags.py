@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Final, Self
 
 from pydantic import Field, model_validator
 
+from uwblink.errors import PlanError
+from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
+from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
+from uwbsim.errors import ScenarioError
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.devices import GroupDelay, Profile
 from uwbsim.scenario.motion import Motion
@@ -13,6 +18,7 @@ from uwbsim.scenario.sensors import Height, Imu
 from uwbsim.scenario.surroundings import Shadow
 from uwbsim.units import NS, PPM
 
+Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]
 PATTERN_SIZES: Final = (0, 1, 4, 9, 16, 25)
 
 
@@ -40,6 +46,18 @@ class Body(Section):
     height: Height | None = Field(None, description="Its height sensor, whose readings the recording has.")
 
 
+class Programmed(Section):
+    """Antenna delays that are programmed into a board, in ticks of 15.65 ps.
+
+    The chip adds `tx` to the stamps of what it sends, and takes `rx` from those of what it receives. The firmware works
+    out the stamp of a reply that it schedules, with a constant of its build, `reply`.
+    """
+
+    tx: Register = Field(ANTENNA_DELAY_TICKS, description="Register of the transmitter.")
+    rx: Register = Field(ANTENNA_DELAY_TICKS, description="Register of the receiver.")
+    reply: Register = Field(ANTENNA_DELAY_TICKS, description="Constant in the stamps of delayed replies (TX_ANT_DLY).")
+
+
 class Tag(Section):
     """A board: where it sits, its antenna delay and its clock.
 
@@ -61,6 +79,10 @@ class Tag(Section):
     rx_delay_ns: float | None = Field(
         None,
         description="What the antenna adds to receive stamps; give tx_delay_ns, too, and not delay_ns.",
+    )
+    antenna_delay: Programmed = Field(
+        Programmed(),
+        description="What is programmed into the board; by default the 16436 ticks that delays are relative to.",
     )
     skew_ppm: Annotated[float, Field(ge=-100, le=100)] = Field(
         0.0,
@@ -125,7 +147,7 @@ class Tag(Section):
 
     @property
     def antenna_delays_s(self) -> tuple[float, float]:
-        """Return what the antenna adds to a transmit and to a receive stamp, in seconds."""
+        """Return what is added to a transmit and to a receive stamp beyond what belongs there, in seconds."""
         transmit, receive = self.delays_ns()
         return transmit * NS, receive * NS
 
@@ -155,8 +177,23 @@ class Tag(Section):
         return self.ramp_ppm_per_s * PPM
 
     def delays_ns(self) -> tuple[float, float]:
-        """Return what the antenna adds to a transmit and to a receive stamp, in nanoseconds."""
-        if self.tx_delay_ns is not None and self.rx_delay_ns is not None:
-            return self.tx_delay_ns, self.rx_delay_ns
+        """Return what is added to a transmit and to a receive stamp beyond what belongs there, in nanoseconds.
+
+        That is what the antenna adds, and what is programmed above or below 16436.
+        """
         aggregate = self.delay_ns or 0.0
-        return 0.44 * aggregate, -0.56 * aggregate
+        transmit = 0.44 * aggregate if self.tx_delay_ns is None else self.tx_delay_ns
+        receive = -0.56 * aggregate if self.rx_delay_ns is None else self.rx_delay_ns
+        more = [(ticks - ANTENNA_DELAY_TICKS) * TICK_S / NS for ticks in (self.antenna_delay.tx, self.antenna_delay.rx)]
+        return transmit + more[0], receive - more[1]
+
+
+def with_antenna_delays(tags: tuple[Tag, ...], path: Path) -> tuple[Tag, ...]:
+    """Return tags with the antenna delays of a file programmed into them; raises `ScenarioError`."""
+    try:
+        delays = load_antenna_delays(path)
+    except PlanError as error:
+        raise ScenarioError(str(error)) from error
+    found = {tag.id: delay_of(delays, tag.id) for tag in tags}
+    programmed = {tag: Programmed(**one._asdict()) for tag, one in found.items() if one is not None}
+    return tuple(tag.model_copy(update={"antenna_delay": programmed.get(tag.id, tag.antenna_delay)}) for tag in tags)

@@ -9,6 +9,7 @@ import numpy as np
 
 from uwblink.arrays import Floats, Ints
 from uwblink.protocols.rows import RangingProtocol
+from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, meta_of_delays
 from uwblink.recording.schema import Fault
 from uwblink.ticks import REPORT_BITS
 from uwblink.twr import STAMPS, Exchanges, board_range, raw_range
@@ -91,6 +92,12 @@ def reported_faults(run: Run, begun: Ints, plan: Schedule, outcomes: air.Outcome
     return found
 
 
+def _programmed(scenario: Scenario) -> AntennaDelays:
+    """Return what is programmed into tags; under None what is usual, and the others by their ids."""
+    found = {tag.id: AntennaDelay(**tag.antenna_delay.model_dump()) for tag in scenario.tags}
+    return {None: AntennaDelay(), **{tag: one for tag, one in found.items() if one != AntennaDelay()}}
+
+
 def provenance(scenario: Scenario) -> dict[str, Any]:
     """Return a recording's `meta` of a simulated flight: the scenario whole, its seed, and what it planted."""
     # A scenario's text does not say what strangers added to the channel, and the flight cannot be repeated without.
@@ -101,4 +108,5 @@ def provenance(scenario: Scenario) -> dict[str, Any]:
         "scenario_name": scenario.run.name,
         "seed": scenario.run.seed,
         "planted": scenario.planted(),
+        **meta_of_delays(_programmed(scenario)),
     } | ({"channel_effects": added} if added else {})

@@ -120,13 +120,14 @@ def stamp(
         sender, receiver = ends if message.sender == "initiator" else ends[::-1]
         if message.after:
             reference = result.stamps[message.after]
-            printed = _transmission(message, reference, draws.reply_s, delay_uus)
+            counter = _transmission(message, reference, draws.reply_s, delay_uus)
         else:
-            printed = _next_grid(-(-ready // SUBTICKS)) + ANTENNA_DELAY_TICKS
-        left = medium.leave(sender, printed, draws.transmit[k])
+            counter = _next_grid(-(-ready // SUBTICKS))
+        left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[k])
         frames = Frames(sender=sender, receiver=receiver, departure=left)
         received = medium.receive(frames, draws.receive[k], draws.excess_m)
-        result.stamps[f"tx{k + 1}"] = printed
+        added = medium.reply_constant if message.timing == "scheduled" else medium.tx_register
+        result.stamps[f"tx{k + 1}"] = counter + added[sender]
         result.stamps[f"rx{k + 1}"] = received.stamp
         result.frames.append(frames)
         result.distance_m.append(received.link.distance_m)
@@ -135,13 +136,13 @@ def stamp(
 
 
 def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, delay_uus: int) -> Ints:
-    """Return the printed transmit stamp of a message that waits for the stamp `reference`."""
+    """Return when by the sender's counter, before any antenna delay, a message leaves that waits for `reference`."""
     if message.timing == "scheduled":
         due = reference + delay_uus * UUS_TICKS
         # The chip ignores the low nine bits of the time at which it is told to send.
-        return due // GRID * GRID + ANTENNA_DELAY_TICKS
+        return due // GRID * GRID
     latency = np.rint(reply_s / TICK_S).astype(np.int64)
-    return _next_grid(reference + latency - ANTENNA_DELAY_TICKS) + ANTENNA_DELAY_TICKS
+    return _next_grid(reference + latency - ANTENNA_DELAY_TICKS)
 
 
 def _next_grid(ticks: Ints) -> Ints:

@@ -76,20 +76,29 @@ class Reception:
 
 @dataclass(frozen=True, slots=True)
 class Medium:
-    """Everything a frame goes through: the links and the clocks of a scenario."""
+    """Everything a frame goes through: the links and the clocks of a scenario, and what stamps of it have added.
+
+    `tx_register` and `reply_constant` (tags,) are what is programmed, in ticks.
+    """
 
     scenario: Scenario
     links: Links
     clocks: Clocks
     delays: AntennaDelays = field(init=False)
+    tx_register: Ints = field(init=False)
+    reply_constant: Ints = field(init=False)
 
     def __post_init__(self) -> None:
         """Work out what antennas add to stamps."""
         object.__setattr__(self, "delays", AntennaDelays.of(self.scenario))
+        programmed = [tag.antenna_delay for tag in self.scenario.tags]
+        object.__setattr__(self, "tx_register", np.array([one.tx for one in programmed], dtype=np.int64))
+        object.__setattr__(self, "reply_constant", np.array([one.reply for one in programmed], dtype=np.int64))
 
     def leave(self, sender: Ints, stamp: Ints, noise: Floats) -> Ints:
         """Return the true sub-ticks (n,) at which frames leave that have transmit stamps of whole ticks (n,).
 
+        These are the chip's, which has added its register to the time at which a frame leaves by its own counter.
         `noise` is standard normal, (n,).
         """
         due = stamp * SUBTICKS

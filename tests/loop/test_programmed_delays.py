@@ -1,0 +1,245 @@
+"""Boards are recorded, calibrated, programmed, and recorded again: what is programmed is told and counted once."""
+
+import json
+import tomllib
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+import calib
+import uwblink
+import uwbsim
+from calib.errors import BadInputError
+from tests import processes
+from uwblink.errors import PlanError
+from uwblink.importers.motion_capture import add_poses
+from uwblink.recording import load_antenna_delays
+from uwbsim.scenario import with_antenna_delays
+
+LIGHT, TICK_S = 299_702_547.0, 1 / (128 * 499.2e6)
+DELAYS_NS = {1: -0.363812, 2: -0.00724, 3: 0.238, 4: -0.361457}
+PLACES_M = {1: (0.0, 0.0, 1.0), 2: (4.0, 0.0, 1.6), 3: (0.5, 3.5, 0.7), 4: (4.2, 3.1, 2.2)}
+
+
+def scenario(delays_ns, noise_ps=30.0, protocol="ds"):
+    """Boards that stand still, with clocks that run alike."""
+    bodies = "".join(
+        f"[[bodies]]\nname = 'b{tag}'\nmotion = {{ model = 'static', position_m = {list(PLACES_M[tag])} }}\n"
+        f"[[tags]]\nid = {tag}\nbody = 'b{tag}'\ndelay_ns = {delay}\n"
+        for tag, delay in delays_ns.items()
+    )
+    return uwbsim.load(
+        f"[run]\nduration_s = 4.0\n[ranging]\nrate_hz = 200.0\nprotocol = '{protocol}'\n"
+        f"[radio]\nrx_noise_ps = {noise_ps}\n{bodies}"
+    )
+
+
+def programmed(world, path):
+    return world if path is None else world.model_copy(update={"tags": with_antenna_delays(world.tags, path)})
+
+
+def record(world, path, delays=None, protocol="ss", said=True):
+    """Record virtual boards into which a file of antenna delays is programmed, with their poses."""
+    ports = uwbsim.VirtualPorts(programmed(world, delays))
+    told = load_antenna_delays(delays) if delays and said else {}
+    tags = tuple(uwblink.Tag(tag, f"b{tag}", (0.0, 0.0, 0.0)) for tag in PLACES_M)
+    plan = uwblink.RangingPlan(rate_hz=200.0, protocol=protocol, tags=tags, antenna_delays=told)
+    uwblink.record(ports.names.values(), path, plan, duration_s=3.0, using=ports)
+    time_ns = uwblink.load(path).exchanges.time_ns
+    rows = [
+        f"{when},b{tag},{x},{y},{z},0,0,0,1"
+        for when in (int(time_ns.min()) - 10**9, int(time_ns.max()) + 10**9)
+        for tag, (x, y, z) in PLACES_M.items()
+    ]
+    poses = path.with_suffix(".csv")
+    poses.write_text("\n".join(["time_ns,body,x,y,z,qx,qy,qz,qw", *rows]))
+    add_poses(path, poses)
+    return path
+
+
+def run(*words, status=0):
+    done = processes.run(*words)
+    assert done.returncode == status, done
+    return done
+
+
+def exported(calibration, to, path):
+    run("calib", "export", calibration, "--to", to, "-o", path)
+    return path
+
+
+def totals(path):
+    """What is programmed in all, by tag, read without any code of the packages."""
+    tags = tomllib.loads(path.read_text())["antenna_delays"]["tags"]
+    return {int(tag): one["tx"] + one["rx"] for tag, one in tags.items()}
+
+
+def errors_cm(path):
+    """Mean error of each pair's ranges as the boards print them, by the places where they stand."""
+    found = uwblink.load(path).exchanges
+    by_pair = {}
+    for a, b in combinations(PLACES_M, 2):
+        mine = (found.initiator == a) & (found.target == b)
+        true = np.linalg.norm(np.subtract(PLACES_M[a], PLACES_M[b]))
+        by_pair[a, b] = 100 * (found.range_m[mine].mean() - true)
+    return by_pair
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory):
+    """Recorded as delivered, fitted, exported, programmed, recorded and fitted again."""
+    folder = tmp_path_factory.mktemp("loop")
+    world = scenario(DELAYS_NS)
+    record(world, folder / "first.uwb")
+    run("calib", "fit", folder / "first.uwb", "-o", folder / "first.json", "--delays-only")
+    for to in ("registers", "firmware"):
+        exported(folder / "first.json", to, folder / f"{to}.toml")
+    record(world, folder / "second.uwb", folder / "firmware.toml")
+    run("calib", "fit", folder / "second.uwb", "-o", folder / "second.json", "--delays-only")
+    exported(folder / "second.json", "firmware", folder / "second.toml")
+    return folder
+
+
+def test_what_was_programmed_comes_out_again(loop):
+    once, again = totals(loop / "firmware.toml"), totals(loop / "second.toml")
+    for tag, delay in DELAYS_NS.items():
+        assert once[tag] - 2 * 16436 == pytest.approx(-delay * 1e-9 / TICK_S, abs=1.5)
+        assert again[tag] == pytest.approx(once[tag], abs=1)
+    delays = json.loads((loop / "second.json").read_text())["delays_ns"]
+    assert max(map(abs, delays.values())) < 1.5 * TICK_S * 1e9
+    by_base = run("calib", "export", loop / "second.json", "--to", "firmware", "--base", loop / "second.uwb")
+    assert by_base.stdout == (loop / "second.toml").read_text()
+
+
+def test_registers_alone_leave_the_constant_of_delayed_replies(loop):
+    """The target's own stamp has a constant of the firmware's build, by which single-sided ranges are wrong."""
+    record(scenario(DELAYS_NS), loop / "registers.uwb", loop / "registers.toml")
+    before, alone, with_constant = (errors_cm(loop / f"{name}.uwb") for name in ("first", "registers", "second"))
+    assert max(map(abs, before.values())) > 5
+    assert max(map(abs, alone.values())) > 2
+    assert max(map(abs, with_constant.values())) < 0.6
+    rows = tomllib.loads((loop / "registers.toml").read_text())["antenna_delays"]["tags"]
+    for (_, target), error in alone.items():
+        left = 100 * LIGHT / 2 * TICK_S * (rows[str(target)]["tx"] - 16436)
+        assert error - with_constant[_, target] == pytest.approx(left, abs=0.15)
+    done = run("calib", "fit", loop / "registers.uwb", "-o", loop / "registers.json", "--delays-only")
+    assert "delayed replies" in done.stderr
+    assert {row["reply"] for row in rows.values()} == {16436}
+
+
+@pytest.mark.parametrize("protocol", ["ss", "ds"])
+@pytest.mark.parametrize("through", ["boards", "simulation"])
+def test_stamps_are_those_of_the_firmware(tmp_path, protocol, through):
+    """Registers go into the chip's stamps, the constant into those of delayed replies; by ticks, without noise."""
+    rows = {1: (16446, 16449, 16436), 2: (16430, 16400, 16441), 3: (16436, 16436, 16436), 4: (17000, 15000, 17000)}
+    text = "".join(f"[antenna_delays.tags.{t}]\ntx = {a}\nrx = {b}\nreply = {c}\n" for t, (a, b, c) in rows.items())
+    (tmp_path / "d.toml").write_text(text)
+    world = scenario(dict.fromkeys(rows, 0.0), noise_ps=0.0, protocol=protocol)
+    if through == "boards":
+        record(world, tmp_path / "f.uwb", tmp_path / "d.toml", protocol)
+    else:
+        uwbsim.simulate(programmed(world, tmp_path / "d.toml")).save(tmp_path / "f.uwb")
+    with uwblink.Recording.open(tmp_path / "f.uwb") as recording:
+        meta = recording.meta()
+    by_tag = meta["configured_antenna_delay_ticks_by_tag"]
+    assert {int(t): (r["tx"], r["rx"], r.get("reply", r["tx"])) for t, r in by_tag.items()} == {
+        tag: row for tag, row in rows.items() if through == "boards" or tag != 3
+    }
+    found = uwblink.load(tmp_path / "f.uwb").exchanges
+    tx, rx, reply = (np.array([0, *column]) for column in zip(*rows.values(), strict=True))
+    i, j = found.initiator, found.target
+    assert np.all((found.tx1 - tx[i]) % 512 == 0)
+    assert np.all((found.tx2 - (tx if protocol == "ds" else reply)[j]) % 512 == 0)
+    d_i, d_j = (tx + rx - 2 * 16436)[i], (tx + rx - 2 * 16436)[j]
+    longer = -(d_i + d_j) / 2
+    if protocol == "ds":
+        assert np.all((found.tx3 - reply[j]) % 512 == 0)
+        wrapped = [(later - earlier) % 2**32 for later, earlier in ((found.tx2, found.rx1), (found.tx3, found.tx2))]
+        longer = longer + (reply - tx)[j] * wrapped[0] / wrapped[1] / 2
+    else:
+        longer = longer - (reply - tx)[j] / 2
+    true = [np.subtract(PLACES_M[a], PLACES_M[b]) for a, b in zip(i.tolist(), j.tolist(), strict=True)]
+    true = np.linalg.norm(true, axis=1)
+    left_m = calib.Ranges.from_exchanges(found).raw_m - true - longer * TICK_S * LIGHT
+    for a, b in combinations(rows, 2):
+        # Stamps are whole ticks of 4.7 mm; boards that stand still repeat the same rounding.
+        assert abs(left_m[(i == a) & (j == b)].mean()) < 2.4e-3
+
+
+def test_programmed_boards_are_not_recorded_as_if_they_were_not(loop, tmp_path):
+    world = scenario(DELAYS_NS)
+    with pytest.raises(PlanError, match=r"board 1.*16436"):
+        record(world, tmp_path / "f.uwb", loop / "firmware.toml", said=False)
+    assert not list(tmp_path.glob("f.uwb*"))
+    some = (loop / "firmware.toml").read_text().split("\n\n")
+    (tmp_path / "some.toml").write_text("\n".join(some[:2]))
+    with pytest.raises(PlanError, match="board 3, 4"):
+        record(world, tmp_path / "f.uwb", tmp_path / "some.toml")
+    (tmp_path / "unclear.toml").write_text("[antenna_delays]\ntx = 16446\nrx = 16449\n")
+    with pytest.raises(PlanError, match=r"unclear\.toml: antenna_delays\.reply"):
+        load_antenna_delays(tmp_path / "unclear.toml")
+
+
+def test_a_calibration_of_other_delays_is_told_wherever_it_is_used(loop, tmp_path):
+    second, first = loop / "second.uwb", loop / "first.json"
+    for words in (
+        ("calib", "evaluate", second, "-c", first),
+        ("calib", "apply", second, "-c", first, "-o", tmp_path / "c.uwb"),
+        ("uwblink", "stream", second, "-c", first, "--speed", "inf"),
+    ):
+        done = run(*words)
+        assert "warning: " in done.stderr
+        assert "tag 1: 16436/16436 then" in done.stderr
+        assert (
+            "tag 1" not in processes.run(*[loop / "second.json" if w == first else w for w in words], "--force").stderr
+        )
+    done = processes.run("calib", "localize", second, "-c", first)
+    assert "tag 1: 16436/16436 then" in done.stderr
+    done = run("calib", "export", first, "--to", "registers", "--base", second, status=2)
+    assert "--base" in done.stderr
+    with pytest.raises(BadInputError, match=r"second\.uwb: tag 1"):
+        calib.load_ranges([loop / "first.uwb", second])
+
+
+def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path):
+    flight = calib.sample_flight()
+    known = calib.fit(replace(calib.load_ranges(flight), antenna_delays={})).calibration
+    known.save(tmp_path / "c.json")
+    done = run("calib", "export", tmp_path / "c.json", "--to", "registers", status=2)
+    assert "--base" in done.stderr
+    (tmp_path / "d.toml").write_text("[antenna_delays]\ntx = 100\nrx = 200\nreply = 300\n")
+    run(
+        "calib",
+        "export",
+        tmp_path / "c.json",
+        "--to",
+        "firmware",
+        "--base",
+        tmp_path / "d.toml",
+        "-o",
+        tmp_path / "o.toml",
+    )
+    for tag, total in totals(tmp_path / "o.toml").items():
+        assert total == 300 + round(-known.delays_ns[tag] * 1e-9 / TICK_S)
+    rows = tomllib.loads((tmp_path / "o.toml").read_text())["antenna_delays"]["tags"]
+    assert all(row["reply"] == row["tx"] for row in rows.values())
+
+
+def test_a_flight_into_whose_tags_something_was_programmed_has_the_planted_delays_of_that(loop, tmp_path):
+    words = ("uwbsim", "run", "noiseless", "--set", "run.duration_s=10")
+    run(*words, "-o", tmp_path / "a.uwb")
+    rows = {tag: (16440 + tag, 16450 - 2 * tag) for tag in range(1, 7)}
+    text = "".join(f"[antenna_delays.tags.{t}]\ntx = {a}\nrx = {b}\nreply = {a}\n" for t, (a, b) in rows.items())
+    (tmp_path / "d.toml").write_text(text)
+    run(*words, "-o", tmp_path / "b.uwb", "--antenna-delays", tmp_path / "d.toml")
+    planted = []
+    for name in "ab":
+        with uwblink.Recording.open(tmp_path / f"{name}.uwb") as recording:
+            planted.append(recording.meta()["planted"]["delays_ns"])
+        found = calib.fit(tmp_path / f"{name}.uwb").calibration
+        apart = np.array([found.delays_ns[tag] - planted[-1][str(tag)] for tag in rows])
+        assert np.ptp(apart) < 0.03
+    for tag, (a, b) in rows.items():
+        assert planted[1][str(tag)] - planted[0][str(tag)] == pytest.approx((a + b - 2 * 16436) * TICK_S * 1e9)

@@ -1,0 +1,173 @@
+"""Antenna delays that are programmed into devices: in files people write, in a recording's `meta`, and compared.
+
+```toml
+[antenna_delays]           # of all devices that are not named
+tx = 16436                 # register of the transmitter, in ticks of 15.65 ps
+rx = 16436                 # register of the receiver
+reply = 16436              # what the firmware adds to the time at which it told the chip to send a reply
+
+[antenna_delays.tags.7]    # of one device
+tx = 16446
+rx = 16449
+reply = 16446
+```
+
+The chip adds `tx` to the stamps of what it sends, and takes `rx` from those of what it receives. A reply that is sent
+at a time chosen before carries its own stamp: the firmware works it out, with a constant of its build (`TX_ANT_DLY`),
+and the chip's register has no part in it. Where both differ, stamps of one device carry two delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from uwblink.errors import PlanError
+from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
+from uwblink.toml import FileKey, TomlReader, is_number
+from uwblink.twr import LARGEST_ID
+
+REGISTER_MAX: Final = 65_535
+ALL: Final = "configured_antenna_delay_ticks"
+BY_TAG: Final = "configured_antenna_delay_ticks_by_tag"
+"""Keys of a recording's `meta`."""
+
+FILE_KEYS: Final = tuple(
+    FileKey(f"antenna_delays.{place}{name}", "whole number, ticks", default, meaning.format(whose))
+    for place, default, whose in (("", "none", "devices not named"), ("tags.ID.", "as all", "one device"))
+    for name, meaning in (
+        ("tx", "Transmit antenna delay register of {}."),
+        ("rx", "Receive antenna delay register of {}."),
+        ("reply", "What the firmware of {} adds to the stamps of its delayed replies; 16436, or as `tx`."),
+    )
+)
+
+
+class AntennaDelay(NamedTuple):
+    """What is programmed into one device, in ticks: both registers, and the firmware's constant for replies."""
+
+    tx: int = ANTENNA_DELAY_TICKS
+    rx: int = ANTENNA_DELAY_TICKS
+    reply: int = ANTENNA_DELAY_TICKS
+
+    def __str__(self) -> str:
+        """Return both registers, and the constant where it differs from the transmitter's."""
+        return f"{self.tx}/{self.rx}" + (f", replies {self.reply}" if self.reply != self.tx else "")
+
+
+AntennaDelays = Mapping[int | None, AntennaDelay]
+"""Delays by device, under None those of devices that are not named; a device may have none."""
+
+
+def delay_of(delays: AntennaDelays, tag: int) -> AntennaDelay | None:
+    """Return what is programmed into a device; None where that is not known."""
+    return delays.get(tag, delays.get(None))
+
+
+def known_delays(delays: AntennaDelays, tags: Iterable[int]) -> AntennaDelays:
+    """Return what is programmed into some devices, each by its id, without those of which it is not known."""
+    found = {tag: delay_of(delays, tag) for tag in tags}
+    return {tag: delay for tag, delay in found.items() if delay is not None}
+
+
+def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
+    """Return what a recording's `meta` says was programmed, which may be nothing; raises `ValueError`.
+
+    Devices of which no constant for replies is told have that of their transmitter.
+    """
+    found: dict[int | None, AntennaDelay] = {}
+    rows: dict[int | None, Any] = {None: meta[ALL]} if ALL in meta else {}
+    try:
+        rows |= {int(tag): row for tag, row in meta.get(BY_TAG, {}).items()}
+        for tag, row in rows.items():
+            found[tag] = AntennaDelay(int(row["tx"]), int(row["rx"]), int(row.get("reply", row["tx"])))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ValueError(f"does not say what was programmed into its devices ({ALL})") from error
+    return found
+
+
+def meta_of_delays(delays: AntennaDelays) -> dict[str, Any]:
+    """Return the entries of a recording's `meta` that say what was programmed."""
+    rows = {tag: one._asdict() for tag, one in delays.items()}
+    for row in rows.values():
+        if row["reply"] == row["tx"]:
+            del row["reply"]
+    every = {ALL: rows.pop(None)} if None in rows else {}
+    return every | ({BY_TAG: {str(tag): row for tag, row in rows.items()}} if rows else {})
+
+
+def read_antenna_delays(file: TomlReader) -> dict[int | None, AntennaDelay]:
+    """Return the `[antenna_delays]` of a file, none where there is none; raises the file's error, with the key.
+
+    A device whose registers are not the boards' 16436 needs its `reply`: which constant its firmware was built with
+    cannot be told from its registers.
+    """
+    section = file.section("antenna_delays")
+    tags = section.pop("tags", {})
+    file.check("antenna_delays.tags", tags, isinstance(tags, dict), "a table for each device")
+    found: dict[int | None, AntennaDelay] = {}
+    if section:
+        found[None] = _delay(file, "antenna_delays", section, {})
+    for name, row in tags.items():
+        where = f"antenna_delays.tags.{name}"
+        named = name.isascii() and name.isdecimal() and int(name) <= LARGEST_ID
+        file.check(where, row, named and isinstance(row, dict), "a table with tx, rx and reply, named by an id")
+        found[int(name)] = _delay(file, where, row, section)
+    return found
+
+
+def _delay(file: TomlReader, where: str, row: Mapping[str, Any], every: Mapping[str, Any]) -> AntennaDelay:
+    file.known(dict(row), AntennaDelay._fields, f"{where}.")
+    both = {**every, **row}
+    if both.get("tx") == ANTENNA_DELAY_TICKS:
+        both.setdefault("reply", ANTENNA_DELAY_TICKS)
+    for name in AntennaDelay._fields:
+        value = both.get(name)
+        good = isinstance(value, int) and is_number(value) and 0 <= value <= REGISTER_MAX
+        why = f" ({ANTENNA_DELAY_TICKS} where only registers were programmed)" if name == "reply" else ""
+        file.check(f"{where}.{name}", value, good, f"a whole number of ticks, 0 to {REGISTER_MAX}{why}")
+    return AntennaDelay(both["tx"], both["rx"], both["reply"])
+
+
+def load_antenna_delays(path: Path) -> dict[int | None, AntennaDelay]:
+    """Read a file of antenna delays, as `calib export --to registers` writes it; raises `PlanError`."""
+    file = TomlReader(path, PlanError, "file of antenna delays (.toml)")
+    file.known(file.table, ("antenna_delays",))
+    found = read_antenna_delays(file)
+    if not found:
+        raise PlanError(f"{path}: holds no [antenna_delays]; `calib export --to registers` writes one")
+    return found
+
+
+def text_of_delays(delays: AntennaDelays) -> str:
+    """Return a file of antenna delays (.toml)."""
+    rows = [
+        f"[antenna_delays{'' if tag is None else f'.tags.{tag}'}]\ntx = {one.tx}\nrx = {one.rx}\nreply = {one.reply}\n"
+        for tag, one in delays.items()
+    ]
+    return "\n".join(rows)
+
+
+def delays_differ(then: AntennaDelays, now: AntennaDelays, tags: Iterable[int]) -> str:
+    """Say where other delays are programmed `now` than `then` in some tags, as far as both are known; "" for nowhere.
+
+    A calibration that was fitted to what was measured then is wrong now by half of the sum, in ranges of such a tag.
+    How a sum is divided between the two registers makes no difference.
+    """
+    pairs = {tag: (delay_of(then, tag), delay_of(now, tag)) for tag in sorted(tags)}
+    told, far_m = [], 0.0
+    for tag, (before, after) in pairs.items():
+        if before is None or after is None:
+            continue
+        longer = after.tx + after.rx - before.tx - before.rx
+        if longer or after.reply - after.tx != before.reply - before.tx:
+            told.append(f"tag {tag}: {before} then, {after} now")
+            far_m = max(far_m, abs(longer) / 2 * TICK_S * SPEED_OF_LIGHT)
+    if not told:
+        return ""
+    more = f" and {len(told) - 3} more" if len(told) > 3 else ""
+    return (
+        "it was fitted while other antenna delays were programmed than in these ranges, which it makes wrong by up to "
+        f"{100 * far_m:.1f} cm a tag ({'; '.join(told[:3])}{more}); fit anew"
+    )
