@@ -28,6 +28,9 @@ from calib.long_columns import computed, let_go, spans
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
+READINGS: Final = ("readings",)
+"""The finding that powers are read with noise."""
+
 FAR_M: Final = 0.12
 """Detours of less may as well be an error that wanders."""
 
@@ -63,7 +66,8 @@ class Doubts:
 def doubts(problem: Problem, found: Solved) -> Doubts:
     """Hold a fit against its residuals, and widen the delays' covariance by what does not fit."""
     louder = of_a_decibel(problem, found)
-    tested, kept = families(problem, louder), found.scores.design.kept
+    beside_curve = found.scores.design.shape[1] == problem.design.shape[1]
+    tested, kept = families(problem, louder, beside_curve=beside_curve), found.scores.design.kept
     judged = examine(
         found.scores,
         found.by_block,
@@ -74,7 +78,10 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
         tested=tested,
         shape_m=kept(_of_another_shape(problem, found)),
     )
-    places = of_places(problem, found.scores, judged.pairs, kept(problem.blocks.number))
+    places = OfPlaces(widening_ns2=np.zeros((len(problem.tags),) * 2))
+    if beside_curve:
+        # Delays that were fitted without their curve leave its errors, which ranges of two bodies have in common.
+        places = of_places(problem, found.scores, judged.pairs, kept(problem.blocks.number))
     covariance, sentences = weighed(problem, found, judged, places)
     sentences += [*reflected(problem, found), *short(found), *_confounded(problem, found)]
     return Doubts(covariance_ns2=covariance, sentences=sentences, of_places_ns2=places.widening_ns2)
@@ -83,19 +90,39 @@ def doubts(problem: Problem, found: Solved) -> Doubts:
 def weighed(problem: Problem, found: Solved, judged: Judgement, places: OfPlaces) -> tuple[Floats, list[str]]:
     """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences."""
     plain = problem.directions @ found.covariance[: problem.rank, : problem.rank] @ problem.directions.T
-    said = places.told(plain + judged.widening_ns2)
+    before = plain + judged.widening_ns2
+    said = places.told(before)
     covariance = plain + judged.widening_ns2 + places.widening_ns2
+    narrower = [finding for finding in judged.findings if _of_arithmetic(finding, before, certain=bool(said))]
+    if any("late" in finding.names for finding in narrower):
+        # Ranges of two bodies are wrong together then, too: the narrower cause is named. Walls may follow the distance.
+        said = []
     matter, plain = [], covariance
     for finding in judged.findings:
         moved = _moved(finding, plain)
         if moved > MATTERS:
             covariance = covariance + finding.spread_ns2
         large = abs(finding.offset_m) > SMALLEST_M
-        if moved > MATTERS and (large or (moved > CLEARLY and finding.largest_ns > SMALLEST_NS)):
+        if finding.names == READINGS:
+            # The curve is right for the powers that are read.
+            continue
+        given = any(finding is one for one in narrower)
+        if given or (moved > MATTERS and (large or (moved > CLEARLY and finding.largest_ns > SMALLEST_NS))):
             matter.append(finding)
     # A tag that was moved stands out in more than one span of time: once is enough.
     once = {(finding.kind, finding.names): finding for finding in reversed(matter)}
     return covariance, [*said, *(told(one) for one in matter if once[one.kind, one.names] is one)]
+
+
+def _of_arithmetic(finding: Finding, before_ns2: Floats, *, certain: bool) -> bool:
+    """Return whether a finding that all ranges share is a cause by itself, with places `certain` or not.
+
+    True distances of another time than ranges move ranges, and hardly delays.
+    """
+    if finding.kind != "shared" or finding.names == READINGS:
+        return False
+    large = abs(finding.offset_m) > SMALLEST_M
+    return certain or (large and ("late" in finding.names or _moved(finding, before_ns2) > MATTERS))
 
 
 def _moved(finding: Finding, covariance: Floats) -> float:

@@ -202,35 +202,51 @@ def _test(
 ) -> Tested:
     """Return a family's efficient slopes; `own` (blocks, D) are those by the fitted parameters."""
     size, count, runs = len(family.names), len(own), family.runs
-    plain, square = np.zeros((count, size)), np.zeros((size, size))
-    known = np.empty(len(runs.block))
+    plain, square, own_known = np.zeros((count, size)), np.zeros((size, size)), np.zeros((count, size))
+    # Ends that have a weight in common share its sums; of several weights each belongs to one end.
+    weights = family.weight if isinstance(family.weight, tuple) else (family.weight,)
+    ends = [family.ends] if len(weights) == 1 else [(end,) for end in family.ends]
+    known = np.empty((len(weights), len(weights), len(runs.block)))
     for which, rows in scores.spans(runs):
-        weight = family.weight[rows] if isinstance(family.weight, np.ndarray) else family.weight
-        known[which] = np.add.reduceat(scores.known(rows) * weight**2, runs.starts[which] - rows.start)
-        slope, lengths, when = scores.score[rows] * weight, runs.lengths[which], number[rows] * size
-        for place, sign in family.ends:
-            where = when + np.repeat(place[which], lengths)
-            plain += sign * np.bincount(where, slope, minlength=count * size).reshape(count, size)
+        some = [weight[rows] if isinstance(weight, np.ndarray) else weight for weight in weights]
+        fisher, starts = scores.known(rows), runs.starts[which] - rows.start
+        for k, m in np.ndindex(len(weights), len(weights)):
+            known[k, m, which] = np.add.reduceat(fisher * some[k] * some[m], starts)
+        lengths, when = runs.lengths[which], number[rows] * size
+        for k, weight in enumerate(some if len(weights) > 1 else ()):
+            own_known[:, k] += np.bincount(number[rows], fisher * weight**2, count)
+        for weight, own_ends in zip(some, ends, strict=True):
+            slope = scores.score[rows] * weight
+            for place, sign in own_ends:
+                where = when + np.repeat(place[which], lengths)
+                plain += sign * np.bincount(where, slope, minlength=count * size).reshape(count, size)
         scores.let_go()
-        let_go(number, family.weight if isinstance(family.weight, np.ndarray) else None)
-    for place, sign in family.ends:
-        for other, its in family.ends:
-            both = np.bincount(place * size + other, known, minlength=size * size).reshape(size, size)
-            square += sign * its * both
-    link = scores.linked(family.weight, runs, family.ends, size)
+        let_go(number, *(weight if isinstance(weight, np.ndarray) else None for weight in weights))
+    for k, m in np.ndindex(len(weights), len(weights)):
+        for place, sign in ends[k]:
+            for other, its in ends[m]:
+                both = np.bincount(place * size + other, known[k, m], minlength=size * size).reshape(size, size)
+                square += sign * its * both
+    link = sum(
+        (scores.linked(weight, runs, own_ends, size) for weight, own_ends in zip(weights, ends, strict=True)),
+        np.zeros((size, scores.size)),
+    )
     taken = link @ inverse
     efficient = plain - own @ taken.T
     information = square - taken @ link.T
     whole = max(float(np.diag(square).max()), 1e-300)
     free = np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True)
     # What an alternative does must not pass for errors that last: those are judged within spans of time.
-    lasting = persistence(efficient, blocks, int(free), spans_of(family, blocks))
+    total = efficient.sum(axis=0)
+    # Nor may what all ranges share, which a block shows by as much as it knows of it.
+    scatter = efficient - own_known * (total / np.maximum(own_known.sum(axis=0), 1e-300))
+    lasting = persistence(scatter, blocks, int(free), spans_of(family, blocks))
     return Tested(
         kind=family.kind,
         names=family.names,
-        total=efficient.sum(axis=0),
-        covariance=lasting.factor * (efficient.T @ efficient),
-        by_time=efficient.sum(axis=0),
+        total=total,
+        covariance=lasting.factor * (scatter.T @ scatter),
+        by_time=total,
         information=information,
         whole=whole,
         effects=-delays @ taken[:, : delays.shape[1]].T,
@@ -333,5 +349,10 @@ def told(finding: Finding) -> str:
         f"{worst}: clock skew is not corrected, or with the wrong sign",
         "scale": f"ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; "
         "see to the unit and the lever arms of the true distances",
+        "late": f"ranges change by {size} with the speed at which true distances change (root mean square): motion "
+        "capture and ranges are not of the same time; see to the clocks (`calib doctor` says by how much)",
     }
+    if finding.kind == "shared":
+        # Where two causes leave the same trace, both are named.
+        return "; or ".join(sentences[name] for name in finding.names if name in sentences)
     return sentences[finding.kind]

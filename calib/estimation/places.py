@@ -69,10 +69,11 @@ class OfPlaces:
         if not self.certain or not np.any(more > MATTERS**2 * np.maximum(own, 1e-30)):
             return []
         return [
-            "errors belong to places: ranges between the same two bodies are wrong together, as walls and things near "
-            f"them make it, which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are "
-            "widened for it, but what all ranges are too long by in common no range shows: it is in the delays; record "
-            "elsewhere too, or farther from walls and partitions"
+            "errors belong to places or directions: ranges between the same two bodies are wrong together, as walls "
+            "and things near them make it, or a wrong lever arm, or an antenna whose delay depends on the direction, "
+            f"which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened for "
+            "it; check the lever arms, then record elsewhere too, or farther from walls: what all ranges are too long "
+            "by in common no range shows"
         ]
 
 

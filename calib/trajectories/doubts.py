@@ -95,8 +95,9 @@ def _offsets(family: Family, kept_rows: int) -> Floats:
     """Return a family's offsets as columns over kept rows (n, k)."""
     found = np.zeros((kept_rows, len(family.names)))
     rows = np.arange(kept_rows)
-    for place, sign in family.ends:
-        found[rows, family.runs.rows(place)] += sign * family.weight
+    weights = family.weight if isinstance(family.weight, tuple) else (family.weight,) * len(family.ends)
+    for (place, sign), weight in zip(family.ends, weights, strict=True):
+        found[rows, family.runs.rows(place)] += sign * weight
     return found
 
 

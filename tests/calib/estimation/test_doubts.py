@@ -1,10 +1,14 @@
 """A fit that doubts itself: no wrong delay without a word, and no word about sound worlds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import calib
 from benchmarks.worlds import CLEAN, PLANTED, Recipe, make
+from tests.calib.estimation.fields import ranges_with_field
 
 TAGS = {"four": 4, "six": 6}
 REFUSED = {
@@ -94,3 +98,35 @@ def test_intervals_hold_where_errors_last():
         scores.append(wrong(world, calib.fit(world.ranges)))
     # Of 40 errors, 38 should be within two standard errors; blocks of time of a given length leave 25.
     assert np.mean(np.abs(scores) < 1.96) > 0.85
+
+
+def distances_late_by(ranges, seconds):
+    """Return ranges whose true distances are those of an earlier time, between the same two tags."""
+    truth, time_s = ranges.truth_m.copy(), ranges.time_ns * 1e-9
+    pair = np.minimum(ranges.initiator, ranges.target) * 100 + np.maximum(ranges.initiator, ranges.target)
+    for one in np.unique(pair):
+        rows = np.flatnonzero(pair == one)
+        truth[rows] = CubicSpline(time_s[rows], truth[rows])(time_s[rows] - seconds)
+    return replace(ranges, truth_m=truth)
+
+
+def test_late_motion_capture_is_named_and_not_walls():
+    ranges = distances_late_by(ranges_with_field(60_003, bodies=3, seconds=60)[0], 0.02)
+    (said,) = calib.fit(ranges).warnings
+    assert "true distances change" in said
+    assert "places" not in said
+
+
+def test_distances_in_a_wrong_unit_are_named():
+    ranges = ranges_with_field(60_003, seconds=60)[0]
+    said = calib.fit(replace(ranges, truth_m=0.98 * ranges.truth_m)).warnings
+    assert any("grow with the distance" in one for one in said)
+
+
+def test_a_sequential_fit_takes_the_curve_for_no_wall():
+    """The curve that is fitted after the delays is in the errors of all ranges between two bodies."""
+    ranges = ranges_with_field(60_005, bodies=3, seconds=60)[0]
+    lifted = np.mean(10 ** ((np.array([ranges.fpp1_dbm, ranges.fpp2_dbm]) + 82) / 10), axis=0)
+    ranges = replace(ranges, raw_m=ranges.raw_m + 0.15 * np.exp(-lifted / 0.4))
+    said = calib.fit(ranges, sequential=True).warnings
+    assert not any("places" in one or "with the distance" in one for one in said)
