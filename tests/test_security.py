@@ -199,6 +199,17 @@ def test_a_sweep_reaches_no_scenario_that_nobody_named(place):
     assert run("uwbsim", *words).status == 0
 
 
+@pytest.mark.parametrize("design", ["grid", "latin-hypercube"])
+def test_a_sweep_without_end_is_refused(place, design):
+    value = "[1.0, 2.0]" if design == "grid" else "{ low = 1.0, high = 2.0 }"
+    keys = "".join(f"'radio.{' ' * k}rx_noise_ps' = {value}\n" for k in range(64))  # 2 to the power of 64 points
+    head = f"scenario = 's.toml', protocols = ['ds'], design = '{design}', samples = 1000000"
+    (place / "plan.toml").write_text(f"sweep = {{ {head} }}\n[vary]\n{keys}")
+    ended = run("uwbsim", "sweep", place / "plan.toml", "-o", place / "out", "--workers", 1)
+    assert refused(ended, place / "plan.toml", 10_000_000)
+    assert not (place / "out").exists()
+
+
 # What lies beside a file of a stranger.
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -90,7 +91,7 @@ class SweepDesign:
     @property
     def points(self) -> int:
         """Return how many combinations of values there are."""
-        return len(self.rows) if self.rows is not None else int(np.prod([len(v) for v in self.axes.values()]))
+        return len(self.rows) if self.rows is not None else math.prod(len(v) for v in self.axes.values())
 
     @property
     def total(self) -> int:
@@ -251,6 +252,10 @@ def _points(
 def _hypercube(path: Path, head: Mapping[str, Any], vary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return points of which every axis has one in each of its equal parts, in an order of its own."""
     samples = _whole(path, head, "samples", 16, 1, MOST_RUNS)
+    if samples * len(vary) > MOST_RUNS:
+        raise ScenarioError(
+            f"{path}: sweep.samples: {samples} of {len(vary)} keys, at most {MOST_RUNS} values are made"
+        )
     columns: dict[str, list[Any]] = {}
     for key, span in vary.items():
         if not isinstance(span, dict) or not {"low", "high"} <= set(span) <= {"low", "high", "scale", "whole"}:
