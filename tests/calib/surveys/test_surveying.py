@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import typer
+from scipy.stats import norm
+from scipy.stats import t as student
 from typer.testing import CliRunner
 
 import calib
@@ -137,6 +139,70 @@ def test_one_pair_determines_nothing_in_whatever_arrangements(shape):
         spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(count)}
         with pytest.raises(UnanswerableError, match="determine no delay"):
             calib.survey(ranges, known=calib.Knowledge(shape=shape, spans_s=spans))
+
+
+def test_a_file_of_what_is_known_is_read_number_by_number(tmp_path):
+    path = tmp_path / "known.toml"
+    path.write_text(
+        "[[distances]]\nbetween = [4, 1]\ndistance_m = 3.06\n"
+        "[[distances]]\nbetween = [1, 2]\ndistance_m = 2\nsigma_m = 0.02\narrangement = 'B'\n"
+        "[[positions]]\ntag = 4\nposition_m = [0.5, 5.2, 2.4]\n"
+        "[[positions]]\ntag = 0\nposition_m = [1, 2, 3]\nsigma_m = 0.03\narrangement = 'A'\n"
+        "[[arrangements]]\nname = 'B'\norder = [3, 1, 4, 2]\nstart_s = 70\nend_s = 130.5\n"
+    )
+    known = load_knowledge(path)
+    assert known.distances == (KnownDistance(1, 4, 3.06, 0.005, ""), KnownDistance(1, 2, 2.0, 0.02, "B"))
+    assert known.positions == (
+        calib.KnownPosition(4, (0.5, 5.2, 2.4), 0.01, ""),
+        calib.KnownPosition(0, (1.0, 2.0, 3.0), 0.03, "A"),
+    )
+    assert known.spans_s == {"B": (70.0, 130.5)}
+    assert known.order_of(Arrangement("B", 0, 1)) == (3, 1, 4, 2)
+
+
+def test_a_distance_said_of_all_arrangements_is_one_reading():
+    world = standing_boards(5, boards=3, places=in_order(*[(1, 2, 3)] * 4), pair_error_m=0.002)
+    taped = tuple(KnownDistance(i, i + 1, d, 0.02) for i, d in ((1, 0.9), (2, 1.2)))
+    spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(4)}
+    found = calib.survey(world.ranges, known=calib.Knowledge(shape="line", spans_s=spans, distances=taped)).calibration
+    # r12 tells delays 1 and 2 together to 2 cm, thus to 0.13 ns; delay 2 is that of the middle.
+    assert found.delays_std_ns[1] == pytest.approx(2 * 0.02 / 0.2997, rel=0.25)
+
+
+def test_a_position_said_of_all_arrangements_is_one_reading():
+    world = standing_boards(5, "plane", boards=3, places=[standing_boards(5, "plane", boards=3).places[0]] * 4)
+    at = {t: tuple(place.tolist()) for t, place in enumerate(world.places[0], start=1)}
+    stds = []
+    for count in (1, 4):
+        spans = {str(k): (70.0 * k, 70.0 * k + 60) for k in range(count)}
+        known = calib.Knowledge(
+            shape="plane", spans_s=spans, positions=tuple(calib.KnownPosition(t, p, 0.02) for t, p in at.items())
+        )
+        stds.append(calib.survey(world.ranges, known=known, pair_error_m=1e-4).verdict.std[0])
+    # The same places four times are no better known.
+    assert stds[1] == pytest.approx(stds[0], rel=0.1)
+
+
+def test_errors_that_last_within_an_arrangement_widen_intervals():
+    r = standing_boards(5, places=FOUR, pair_error_m=0.0).ranges
+    slow = 0.06 * np.sin(2 * np.pi * r.time_ns / 20e9 + r.initiator * r.target)
+    quick = 0.06 * np.sin(np.arange(len(r)) * 2.4)
+    stds = [
+        calib.survey(replace(r, raw_m=r.raw_m + more), known="line", pair_error_m=1e-4).calibration.delays_std_ns[2]
+        for more in (slow, quick)
+    ]
+    assert stds[0] > 1.5 * stds[1]
+
+
+def test_few_arrangements_widen_intervals_by_students_quantile():
+    result = calib.survey(standing_boards(5, boards=3, arrangements=3).ranges, known="line")
+    # What is known of pairs' errors beforehand counts as three degrees of freedom (docs/without-motion-capture.md).
+    freedom = result.calibration.provenance["rests_on"]["freedom"] + 3
+    wider = student.ppf(0.975, freedom) / norm.ppf(0.975)
+    assert wider > 1.05
+    known = result.verdict.determined
+    found = [result.calibration.delays_std_ns[t] for t in sorted(result.calibration.delays_ns)]
+    assert found == pytest.approx(result.verdict.std[known] * wider, rel=1e-6)
 
 
 def test_known_positions_give_the_frame_and_the_mirror_is_told():
