@@ -104,6 +104,7 @@ def solve(
         mixture = _likeliest(problem, start, ridge / near.dispersion)
         parameters, success, steps = mixture.of("design"), mixture.success, steps + mixture.steps
         scores, inverse, prior = mixture.scores, mixture.covariance, mixture.precision
+        ridge = ridge / near.dispersion
     else:
         joint = robust_fit(problem.design, problem.error, robust, width, ridge, start, near=True)
         parameters, success, steps = joint.parameters, joint.success, steps + joint.steps
@@ -112,7 +113,7 @@ def solve(
     delays = problem.directions @ stated[: problem.rank]
     known = intervals(scores, inverse, prior, delays, problem.rank, problem.blocks)
     columns = len(parameters)
-    shares = [_of_curve(prior[:columns, :columns], curve) for _, curve in problem.curves()]
+    shares = [_of_curve(ridge, curve) for _, curve in problem.curves()]
     covariance = known.covariance + unsure(inverse[:columns, :columns], parameters, shares)
     residual = problem.residuals(parameters)
     return Solved(

@@ -177,3 +177,11 @@ def test_a_scale_that_is_given_is_the_scale_of_the_loss():
     wide, squares = fit(some, loss="cauchy", scale_ns=1000.0), fit(some, loss="l2")
     for tag in DELAYS_NS:
         assert wide.calibration.delays_ns[tag] == pytest.approx(squares.calibration.delays_ns[tag], abs=1e-4)
+
+
+def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeypatch):
+    some = ranges(n=3000)
+    whole = fit(some, loss="cauchy").calibration.uncertainty.bias_m2
+    monkeypatch.setattr("calib.estimation.solver.unsure", lambda covariance, *_: np.zeros_like(covariance))
+    without = fit(some, loss="cauchy").calibration.uncertainty.bias_m2
+    assert np.trace(whole) > 1.02 * np.trace(without)

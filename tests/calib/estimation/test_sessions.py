@@ -133,3 +133,22 @@ def test_sessions_without_times_are_refused():
     frozen = [replace(part, time_ns=np.full_like(part.time_ns, k)) for k, part in enumerate(parts)]
     with pytest.raises(calib.UnanswerableError, match="same time"):
         calib.fit(frozen)
+
+
+def test_intervals_hold_the_delay_of_a_session_that_is_short():
+    known, (monday, tuesday) = sessions(72, moved_ns=0.4)
+    found = calib.fit([monday, tuesday[: len(tuesday) // 4]])
+    assert between(found)
+    delays, std = found.calibration.delays_ns, found.calibration.delays_std_ns
+    error = delays[3] - known[3] - np.mean([delays[tag] - known[tag] for tag in (1, 2, 4)])
+    assert error < 0.15
+    # Wide enough for the short session's delay, which is 0.34 ns away, and not much wider.
+    assert abs(error - 0.4) < 1.96 * std[3] < 0.47
+
+
+def test_two_sound_sessions_know_more_than_one():
+    one, two = (
+        np.mean(list(calib.fit(parts).calibration.delays_std_ns.values()))
+        for parts in (sessions(6)[1][:1], sessions(6)[1])
+    )
+    assert two < 0.85 * one
