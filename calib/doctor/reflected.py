@@ -23,7 +23,7 @@ BEYOND: Final = 3.0
 FEWEST: Final = 60
 FEWEST_SPELLS: Final = 2
 LEAST_SHARE: Final = 0.02
-STICKY: Final = 0.25
+STICKY: Final = 0.35
 """By how much likelier a reflected range may be after a reflected one in a sound recording: antennas turn slowly."""
 
 SHORTEST_S: Final = 0.8
