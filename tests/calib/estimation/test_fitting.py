@@ -56,9 +56,30 @@ def test_the_same_boards_at_fainter_powers_get_the_same_delays():
         assert std < 0.03
 
 
-def test_a_reference_power_that_was_not_recorded_is_said():
-    found = fit(ranges(3000), reference_power_dbm=-60.0)
-    assert any("no ranges at the reference power of -60.0 dBm" in warning for warning in found.warnings)
+@pytest.mark.parametrize(("reference_dbm", "nearest"), [(-60.0, -80.8), (-110.0, -94.2)])
+def test_a_reference_power_that_was_not_recorded_is_said(reference_dbm, nearest):
+    found = fit(ranges(600), reference_power_dbm=reference_dbm)
+    (said,) = [warning for warning in found.warnings if "reference power" in warning]
+    assert f"{reference_dbm} dBm" in said
+    assert f"{nearest} dBm" in said
+
+
+def test_ranges_left_out_as_static_were_left_out_on_purpose():
+    some = ranges(600)
+    asked, missing = (fit(replace(some, excluded={why: 400})) for why in ("static", "no power"))
+    assert not [warning for warning in asked.warnings if "left out" in warning]
+    assert [warning for warning in missing.warnings if "left out" in warning and "no power" in warning]
+
+
+@pytest.mark.parametrize(("by_m", "way"), [(0.3, "longer"), (-0.3, "shorter")])
+def test_the_way_in_which_a_pair_reads_too_long_is_said(by_m, way):
+    some = ranges(3000, tail=0)
+    first = np.where(np.arange(len(some)) % 12 < 6, some.initiator, some.target)
+    second = some.initiator + some.target - first
+    off = by_m * ((first == 2) & (second == 7))
+    found = fit(replace(some, initiator=first, target=second, raw_m=some.raw_m + off))
+    (said,) = [warning for warning in found.warnings if warning.startswith("pair 2-7") and "initiates" in warning]
+    assert f"{way} if tag 2 initiates" in said
 
 
 def test_curves_are_held_constant_and_flagged_beyond_their_range():
@@ -181,7 +202,8 @@ def test_a_scale_that_is_given_is_the_scale_of_the_loss():
 
 def test_what_is_not_known_of_the_smoothness_is_in_the_band_of_the_curve(monkeypatch):
     some = ranges(n=3000)
-    whole = fit(some, loss="cauchy").calibration.uncertainty.bias_m2
+    whole, likely = (fit(some, loss=loss).calibration.uncertainty.bias_m2 for loss in ("cauchy", "mixture"))
+    assert 0.5 < np.trace(whole) / np.trace(likely) < 4
     monkeypatch.setattr("calib.estimation.solver.unsure", lambda covariance, *_: np.zeros_like(covariance))
     without = fit(some, loss="cauchy").calibration.uncertainty.bias_m2
     assert np.trace(whole) > 1.02 * np.trace(without)

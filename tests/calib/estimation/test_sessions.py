@@ -152,3 +152,10 @@ def test_two_sound_sessions_know_more_than_one():
         for parts in (sessions(6)[1][:1], sessions(6)[1])
     )
     assert two < 0.85 * one
+
+
+def test_the_p_value_counts_all_tests():
+    # A difference that is just named: by its own test alone, one of some fifty, it would be fifty times as unlikely.
+    _, parts = sessions(6, moved_ns=0.26, recipe=replace(RECIPE, seconds=10, per_second=60))
+    (said,) = between(calib.fit(parts))
+    assert 2e-4 < float(said.split("p = ")[1].split(")")[0]) <= 5e-3
