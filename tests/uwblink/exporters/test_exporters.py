@@ -177,3 +177,13 @@ def test_messages_have_true_distances_by_the_poses(flown, tmp_path):
     import_recording(tmp_path / "out" / "recording.mcap", tmp_path / "back.uwb")
     with Recording.open(tmp_path / "back.uwb") as recording:
         assert recording.exchanges().truth_m == pytest.approx([*BY_HAND, np.nan], abs=1e-9, nan_ok=True)
+
+
+def test_trajectories_before_1970(tmp_path):
+    """Times of a clock that began elsewhere; the second one lies within a second of zero."""
+    poses = Poses.from_arrays([-1_500_000_000, -250_000_000, 750_000_000], ["drone"] * 3, [[0.0, 0.0, 0.0]] * 3)
+    with Recording.create(tmp_path / "r.uwb") as recording:
+        recording.append_poses(poses)
+    export_recording(tmp_path / "r.uwb", tmp_path / "tum", to="tum")
+    lines = (tmp_path / "tum" / "drone.tum").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == ["-1.500000000", "-0.250000000", "0.750000000"]

@@ -493,3 +493,25 @@ def test_the_first_stamp_that_a_counter_cannot_show_is_a_fault(tmp_path, bits, c
     found = read_table(path, mapped(tmp_path, f'protocol = "ds"\nbits = {bits}\ncounter = "{counter}"\n'))
     assert len(found.exchanges) == 58
     assert [fault.detail.split(",")[0] for fault in found.faults] == ["row 7", "row 8"]
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("s", 1), ("ms", 1e3), ("us", 1e6), ("ns", 1e9), ("iso", None)])
+def test_every_unit_of_times(tmp_path, unit, scale):
+    rows = wrapped(flights())
+    for k, row in enumerate(rows):
+        row["time_s"] = f"1970-01-01T00:00:{10 + k / 4:05.2f}" if scale is None else round((10 + k / 4) * scale, 6)
+    found = read_table(write(tmp_path / "t.csv", rows), mapped(tmp_path, f'[units]\ntime = "{unit}"\n')).exchanges
+    assert found.time_ns.tolist() == [10**10 + k * 250_000_000 for k in range(60)]
+
+
+@pytest.mark.parametrize(("broken", "imported"), [(29, 31), (30, None)])
+def test_half_of_the_rows_end_an_import(tmp_path, broken, imported):
+    rows = wrapped(flights())
+    for row in rows[:broken]:
+        row["tx2"] = ""
+    path = write(tmp_path / "t.csv", rows)
+    if imported is None:
+        with pytest.raises(ImportTableError, match="row 2"):
+            read_table(path)
+    else:
+        assert len(read_table(path).exchanges) == imported
