@@ -84,3 +84,11 @@ def test_a_plan_says_what_reflections_and_a_curve_cost():
     assert reflected.to_dict()["with_curve_ns"]["common"] > plain.to_dict()["with_curve_ns"]["common"]
     with pytest.raises(ValueError, match="reflected"):
         calib.plan(4, reflected=0.4)
+
+
+def test_a_tape_counts_by_its_own_sigma():
+    common = [
+        calib.plan(3, on="line", arrangements=2, taped=2, tape_sigma_m=sigma, pair_error_m=0.02).common_ns
+        for sigma in (0.002, 0.02, 0.2)
+    ]
+    assert common[0] < 0.9 * common[1] < 0.7 * common[2]

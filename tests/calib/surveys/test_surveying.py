@@ -205,6 +205,24 @@ def test_few_arrangements_widen_intervals_by_students_quantile():
     assert found == pytest.approx(result.verdict.std[known] * wider, rel=1e-6)
 
 
+def test_delays_count_by_the_weights_of_either_end():
+    world = standing_boards(1, places=FOUR, pair_error_m=0.0, noise_m=0.0)
+    r, delay = world.ranges, np.array([0.0, *world.delays_ns.values()])
+    low, high = np.minimum(r.initiator, r.target), np.maximum(r.initiator, r.target)
+    uneven = 0.2997 * (0.2 * delay[low] - 0.2 * delay[high])
+    count = np.ones(len(r))
+    ranges = replace(
+        r,
+        initiator=low,
+        target=high,
+        raw_m=r.raw_m - uneven,
+        weight_initiator=0.7 * count,
+        weight_target=0.3 * count,
+    )
+    found = calib.survey(ranges, known="line").calibration.delays_ns
+    assert found == pytest.approx(world.delays_ns, abs=1e-3)
+
+
 def test_known_positions_give_the_frame_and_the_mirror_is_told():
     corners = np.array(
         [[0.0, 0.0, 1.0], [6.0, 0.0, 1.2], [6.0, 5.0, 0.9], [0.0, 5.0, 1.1], [2.5, 2.0, 2.4], [3.0, 4, 0.2]]
