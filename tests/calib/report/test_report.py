@@ -17,6 +17,7 @@ from calib.estimation.fitting import fit
 from calib.report.report import render
 from tests import processes
 from tests.browser import lies_well
+from tests.calib.report import page_of_numpy
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 
@@ -205,3 +206,26 @@ def test_tests_take_several_files():
     told = ["report", "a", "-o", "r", "--tests", "b", "c", "--force", "d"]
     assert spread(told) == ["report", "a", "-o", "r", "--tests", "b", "--tests", "c", "--force", "d"]
     assert spread(["fit", "a", "-o", "c"]) == ["fit", "a", "-o", "c"]
+
+
+def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
+    """Shares beyond three sigmas by side, and what filters gain, which must not change sign on its way to the page."""
+    run("calib", "fit", "train.uwb", "-o", "same.json", cwd=campaign)
+    run("uwblink", "export", "test.uwb", "--to", "csv", "-o", "csv", cwd=campaign)
+    page = page_of_numpy.corrected(campaign / "csv" / "exchanges.csv", campaign / "same.json")
+    tables = page_of_numpy.Tables((campaign / "r.html").read_text())
+    number = page_of_numpy.number
+    z = (page.full - page.truth) / page.sigma
+    for name, rows in page.groups().items():
+        cells = tables.row(name, "too long")
+        assert [number(cell) for cell in cells[1:3]] == pytest.approx(
+            [100 * np.mean(z[rows] > 3), 100 * np.mean(z[rows] < -3)], abs=0.051
+        )
+    assert number(tables.row("all", "too long")[1]) > number(tables.row("all", "too long")[2])
+    mean, against = (tables.row(name, "its spread over seeds") for name in ("mean", "against raw"))
+    tracked = [row for row in tables.having("its spread over seeds") if row[0].startswith("test.uwb")]
+    for place in range(1, len(mean)):
+        assert number(mean[place]) == pytest.approx(np.mean([number(row[place]) for row in tracked]), abs=1.1e-3)
+    for place in range(2, len(mean)):
+        change = 100 * (number(mean[place]) / number(mean[1]) - 1)
+        assert number(against[place]) == pytest.approx(change, abs=1.0)
