@@ -229,3 +229,11 @@ def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):
     for place in range(2, len(mean)):
         change = 100 * (number(mean[place]) / number(mean[1]) - 1)
         assert number(against[place]) == pytest.approx(change, abs=1.0)
+    text = re.sub(r"<[^>]*>", "", (campaign / "r.html").read_text())
+    told = re.search(r"the mean NIS is .*? pass the gate", text, re.DOTALL)[0]
+    nis, one, _, low, high, _, nees, three, nees_low, nees_high, *_ = map(float, re.findall(r"\d+(?:\.\d+)?", told))
+    # Bounds of a mean of squares lie about what is expected of it: one of a range, three of a position.
+    assert (one, three) == (1, 3)
+    assert low < 1 < high < 2 < nees_low < 3 < nees_high
+    assert 0 < nis < 10
+    assert nees > 0
