@@ -109,7 +109,7 @@ def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[T
         "its positions": lambda factor: ranges - distances(factor, 1.0),
         "lever arms": lambda factor: ranges - distances(1.0, factor),
         "its positions and the lever arms": lambda factor: ranges - distances(factor, factor),
-        "the ranges": lambda factor: factor * ranges - distances(1.0, 1.0),
+        "the ranges": lambda factor: ranges - distances(1.0, 1.0) / factor,
     }
     found = other_unit(errors)
     if found:

@@ -27,7 +27,10 @@ LONGEST_DELAY_M: Final = REGISTER_MAX * METRES_PER_TICK
 """How much longer or shorter ranges can be by antenna delays: all that registers hold, at both ends."""
 
 Errors = Callable[[float], Floats]
-"""Ranges less distances, in metres (n,), if some lengths are multiplied by a factor."""
+"""Ranges less distances (n,), if some lengths are multiplied by a factor, in the unit that the ranges have as they are.
+
+So noise counts alike whatever the factor; else ranges of boards that stand still would pass for ranges in feet.
+"""
 
 
 def other_unit(errors: Mapping[str, Errors]) -> tuple[str, str] | None:
@@ -99,7 +102,7 @@ def check_units(tables: StagedTables, rows: Rows, reading: Reading | None) -> No
         raise ImportTableError(f"{where['range_m']}: its ranges are {why}; say units.distance in the map")
     if reading is None:
         errors: dict[str, Errors] = {
-            "ranges": lambda f: f * ranges - true,
+            "ranges": lambda f: ranges - true / f,
             "true distances": lambda f: ranges - f * true,
         }
     else:

@@ -14,7 +14,8 @@ from uwblink.importers.poses import _READERS, _as_poses, _at_once, read_poses
 from uwblink.importers.table import Table
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
-from uwblink.twr import STAMPS
+from uwblink.recording.schema import Tag
+from uwblink.twr import STAMPS, Exchanges
 from uwbsim.boards.live_poses import LivePoses
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate
@@ -244,3 +245,20 @@ def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_pa
     done = processes.run("uwblink", "poses", tmp_path / "mm.uwb", *words)
     assert done.returncode == 2
     assert "ranges are in mm" in done.stderr
+
+
+def test_boards_that_stand_still_are_not_taken_for_ranges_in_another_unit(tmp_path):
+    # One distance and noise: multiplied by 0.3048 the noise is smaller, and delays could make up for the rest.
+    count, reply = 200, 20_000_000
+    flight = 640 + np.random.default_rng(4).integers(-8, 9, count)
+    zero = np.zeros(count, dtype=np.int64)
+    exchanges = Exchanges.from_arrays(
+        zero + 10, zero + 20, time_ns=np.arange(count) * 10**7, tx1=zero, rx1=zero + 640,
+        tx2=zero + 640 + reply, rx2=flight + 640 + reply,
+    )  # fmt: skip
+    seats = [Tag(10, "left", (0.0, 0.0, 0.0)), Tag(20, "right", (0.0, 0.0, 0.0))]
+    Contents(exchanges=exchanges, tags=seats).save(tmp_path / "still.uwb")
+    rows = [f"{t},{body},{x},0,0,0,0,0,1" for t in (-1, 3) for body, x in (("left", 0.0), ("right", 3.0))]
+    (tmp_path / "p.csv").write_text("time_s,body,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
+    done = processes.run("uwblink", "poses", tmp_path / "still.uwb", "--from", tmp_path / "p.csv")
+    assert done.returncode == 0, done.stderr
