@@ -36,7 +36,7 @@ SURE: Final = 0.1
 """Part of a displacement that is not known: powers, that other distances have, are not taken off."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Displaced:
     """By how much an anchor stands elsewhere (3,), its ranges' spreads in metres, p-value and gain; see `Seen`.
 
@@ -123,7 +123,15 @@ def _displaced(view: RecordingView, known: Levels, body: str, places: dict[str, 
     p_value = _beyond_tolerance(*_linear(apart + away, measured, ends), away, time_s, after)
     # A robot that moves in a plane does not see heights, so that places above and below each other are alike.
     at = [name for name, place in places.items() if name != body and _near(place - places[body], away)]
-    return Displaced(body, away, before, after, min(1.0, p_value * len(places)), gain, tuple(at))
+    return Displaced(
+        body=body,
+        away_m=away,
+        before_m=before,
+        after_m=after,
+        p_value=min(1.0, p_value * len(places)),
+        gain=gain,
+        instead=tuple(at),
+    )
 
 
 def _within(rows: Bools, good: Bools) -> Ints:

@@ -47,7 +47,7 @@ FEWEST_IN_ALL: Final = 150
 FEWEST_OF_TAG: Final = 15
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Reflected:
     """A pair's reflected ranges: their share, mean detour, how much they stick, spells, and how long these last."""
 
