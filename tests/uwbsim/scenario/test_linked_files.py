@@ -94,6 +94,26 @@ def test_a_recorded_trajectory_is_flown(tmp_path):
     np.testing.assert_allclose(path.position_m(np.array([3.0]))[0], [np.sin(1.0), 0.6, 1.0], atol=1e-6)
 
 
+def test_an_antenna_table_with_a_direction_twice_is_named(tmp_path):
+    scenario = changed(tmp_path, "reflection_loss_db = 9.0", "reflection_loss_db = 9.0")
+    table = tmp_path / "nlos_office" / "monopole.csv"
+    table.write_text(table.read_text() + table.read_text().splitlines()[-1] + "\n")
+    with pytest.raises(ScenarioError, match=r"monopole\.csv: two rows"):
+        load(scenario)
+
+
+def test_a_recorded_trajectory_begins_with_the_run_whatever_its_clock(tmp_path):
+    first = load(trajectory(tmp_path, 12)).model_dump_json()
+    rows = (tmp_path / "path.csv").read_text().splitlines()
+    later = [f"{float(row.partition(',')[0]) + 1000},{row.partition(',')[2]}" for row in rows[1:]]
+    (tmp_path / "path.csv").write_text("\n".join([rows[0], *later]) + "\n")
+    one, other = (
+        json.loads(text)["bodies"][0]["motion"] for text in (first, load(tmp_path / "s.toml").model_dump_json())
+    )
+    assert other["times_s"] == pytest.approx(one["times_s"], abs=1e-6)
+    assert other["positions_m"] == one["positions_m"]
+
+
 def test_a_trajectory_that_is_too_short_is_refused(tmp_path):
     with pytest.raises(ScenarioError, match=r"lasts 8\.0 s and does not cover the run of 10 s"):
         load(trajectory(tmp_path, 8))

@@ -162,6 +162,15 @@ def test_results_that_are_none_are_no_rows(tmp_path):
             list(store.rows())
 
 
+def test_results_of_another_version_are_not_gone_on_with(done):
+    p, out = done
+    with_sql("UPDATE identity SET value = '\"0.0.1\"' WHERE key = 'uwbcal'")(out / "results.duckdb")
+    ended = run("uwbsim", "sweep", p.path, "-o", out, "--workers", 1, "--resume")
+    assert ended.status == 2, ended
+    assert str(out) in ended.err
+    assert "0.0.1" in ended.err
+
+
 ENDLESS = "sweep = { scenario = 'noiseless', protocols = ['ds'], ranges = 20000, seeds = 100000 }\n"
 
 
