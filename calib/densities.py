@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy.special import erfcx
 
-from calib.tails import erfcx
 from uwblink.arrays import Floats
 
 ROOT_2: Final = float(np.sqrt(2))

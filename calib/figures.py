@@ -17,7 +17,7 @@ from calib.calibration.parts import CorrectedRanges
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, planted_curve
 from calib.over_power import Binned, OverPower, biases, sigmas
 from calib.ranges import Ranges
-from calib.tails import TWO_SIDED_95
+from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE
 from uwblink.pages.figures import label, legend, mark, sheet

@@ -1,4 +1,4 @@
-"""The robust spread of values, which a few outliers do not move."""
+"""How wide values spread: robustly measured, and as 95 % intervals."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats
+
+__all__ = ["SIGMA_OF_MAD", "TWO_SIDED_95", "robust_spread"]
+
+TWO_SIDED_95: Final = 1.959963984540054
+"""How many standard deviations about its mean hold 95 % of a normal distribution."""
 
 SIGMA_OF_MAD: Final = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""

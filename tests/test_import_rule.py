@@ -64,7 +64,7 @@ FLOORS = {
         ("cli",),
     ),
     "calib": (
-        ("carriers", "errors", "samples", "single_sided", "spread", "tails"),
+        ("carriers", "errors", "samples", "single_sided", "spread"),
         ("densities", "information", "long_columns", "planted", "range_columns"),
         ("error_mixture", "ranges"),
         ("recorded",),

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.calibration.model import Calibration, require_calibration
 from calib.errors import UnanswerableError
+from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -89,7 +90,7 @@ class Comparison:
 
 
 def _interval(std_ns: float) -> str:
-    return f"± {1.96 * std_ns:.4f} (95 %)" if np.isfinite(std_ns) else "standard error not stated"
+    return f"± {TWO_SIDED_95 * std_ns:.4f} (95 %)" if np.isfinite(std_ns) else "standard error not stated"
 
 
 def _or_none(value: float) -> float | None:

@@ -12,8 +12,8 @@ import numpy as np
 from calib.calibration.content import CalibrationContent
 from calib.calibration.pair_offsets import named
 from calib.calibration.parts import TagGroup
+from calib.spread import TWO_SIDED_95
 
-TWO_SIDED_95: Final = 1.959963984540054
 MOST_TAGS: Final = 40
 """Tags that are listed; of more, the first are."""
 

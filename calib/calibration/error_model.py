@@ -17,12 +17,12 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
+from scipy.special import log_ndtr, ndtr
 
 from calib.calibration.json_format import METRES, POSITIVE, SHARE, STD_M, Reader, is_tag
 from calib.calibration.power_curves import Curve
 from calib.densities import ROOT_2PI, LongDetours, densities
 from calib.errors import BadInputError
-from calib.tails import log_normal_below, normal_below
 from uwblink.arrays import Floats, Ints
 
 BISECTIONS: Final = 50
@@ -114,14 +114,14 @@ class ErrorModel:
         error = error_m - self.location_m
         noise, share = shapes.noise_m, shapes.tail_share
         away = (error - self.least_m) / noise
-        reflected = normal_below(away)
+        reflected = ndtr(away)
         for part, detour in self.long.kinds(shapes.detour_m):
             ratio = noise / detour
             reflected = reflected - part * np.exp(
-                np.minimum(ratio * (0.5 * ratio - away) + log_normal_below(away - ratio), 0.0)
+                np.minimum(ratio * (0.5 * ratio - away) + log_ndtr(away - ratio), 0.0)
             )
-        inside = (1 - share) * normal_below(error / noise) + share * reflected
-        wild = normal_below(error / max(self.outlier_m, 1e-9))
+        inside = (1 - share) * ndtr(error / noise) + share * reflected
+        wild = ndtr(error / max(self.outlier_m, 1e-9))
         return np.asarray((1 - self.outlier_share) * inside + self.outlier_share * wild)
 
     def quantiles(self, probabilities: Sequence[float], lifted: Floats, initiator: Ints, target: Ints) -> Floats:

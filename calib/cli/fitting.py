@@ -39,6 +39,7 @@ from calib.cli.arguments import (
 )
 from calib.cli.flags import with_flags
 from calib.cli.loading import STOPPED, known_calibration
+from calib.spread import TWO_SIDED_95
 from uwblink.cli.guide import add, tags_of
 from uwblink.cli.waiting import waiting
 
@@ -161,7 +162,7 @@ def delay_lines(found: calib.Calibration) -> Iterator[str]:
     if found.pair_offsets and not any(found.delays_ns.values()):
         return
     for tag, delay in sorted(found.delays_ns.items()):
-        half = 1.96 * found.delays_std_ns.get(tag, math.nan)
+        half = TWO_SIDED_95 * found.delays_std_ns.get(tag, math.nan)
         if math.isnan(half):
             yield f"  tag {tag:3d}  delay {delay:+.4f} ns  standard error not stated"
         elif math.isinf(half):
@@ -186,5 +187,5 @@ def add_tag(
     with waiting("fitting"):
         found = calib.add_tag(recording, known_calibration(calibration), tag)
     found.save(output, force=force)
-    half = 1.96 * found.delays_std_ns[tag]
+    half = TWO_SIDED_95 * found.delays_std_ns[tag]
     typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")

@@ -10,9 +10,9 @@ import numpy as np
 from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.scores import Scores
 from calib.estimation.time_blocks import TimeBlocks
+from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 
-NORMAL95: Final = 1.959963984540054
 CURVE_SERIES: Final = 5
 """So many values of a smooth curve are about independent."""
 
@@ -50,7 +50,7 @@ def intervals(
     factors = [lasting] * (rank > 0)
     if columns > rank:
         factors.append(persistence(pulls[:, rank:], blocks, CURVE_SERIES))
-    widths = [np.sqrt(each.factor) * each.quantile95 / NORMAL95 for each in factors]
+    widths = [np.sqrt(each.factor) * each.quantile95 / TWO_SIDED_95 for each in factors]
     width = np.repeat(widths, [rank, columns - rank] if rank and columns > rank else [columns])
     # Slopes at the optimum are smaller than at the truth: with information I and penalty P, the squares of so many
     # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the parameters that the ranges determine over

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.special import stdtr, stdtrit
 
 from calib.estimation.alternatives import Family, segments
 from calib.estimation.persistence import Persistence, persistence
@@ -20,7 +21,6 @@ from calib.estimation.row_order import Runs
 from calib.estimation.scores import Scores
 from calib.estimation.time_blocks import TimeBlocks
 from calib.long_columns import let_go
-from calib.tails import students_beyond, students_quantile
 from uwblink.arrays import Floats, Ints
 
 ERROR_RATE: Final = 0.005
@@ -287,7 +287,7 @@ def widening_of_pairs(result: Tested) -> Floats:
 def findings(result: Tested, several: int) -> Iterator[Finding]:
     """Yield the alternatives that stand out, one after the other, each beside those already found."""
     freedom = max(result.lasting.freedom, 3.0)
-    limit = students_quantile(freedom, 1 - ERROR_RATE / several / 2)
+    limit = float(stdtrit(freedom, 1 - ERROR_RATE / several / 2))
     total, covariance, information = result.total.copy(), result.covariance.copy(), result.information.copy()
     for _ in range(MOST_NAMED):
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
@@ -307,7 +307,7 @@ def findings(result: Tested, several: int) -> Iterator[Finding]:
             offset_m=-offset,
             deviation=float(deviation[top]),
             effect_ns=result.effects[:, top] * offset,
-            p_value=min(several * students_beyond(freedom, abs(float(deviation[top]))), 1.0),
+            p_value=min(several * 2 * float(stdtr(freedom, -abs(float(deviation[top])))), 1.0),
         )
         yield _of_session(finding, result, top, offset) if len(result.sessions) > 1 else finding
         # With this offset fitted too, the others keep what it does not explain.

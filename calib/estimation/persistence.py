@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.special import stdtrit
 
 from calib.estimation.time_blocks import TimeBlocks
 from calib.long_columns import let_go, spans
-from calib.tails import students_quantile
 from uwblink.arrays import Floats, Ints
 
 FEWEST_GROUPS: Final = 8
@@ -48,7 +48,7 @@ class Persistence:
     @property
     def quantile95(self) -> float:
         """Half the width of a 95 % interval, in standard errors."""
-        return students_quantile(self.freedom, 0.975)
+        return float(stdtrit(self.freedom, 0.975))
 
 
 def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks) -> float:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.special import ndtr
 
-from calib.estimation.intervals import NORMAL95
 from calib.estimation.misfit import Tested
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
 from calib.long_columns import let_go, spans
-from calib.tails import normal_below
+from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
 TOGETHER_S: Final = 1.0
@@ -127,7 +127,7 @@ def of_places(problem: Problem, scores: Scores, pairs: Tested | None, blocks: In
 def _as_one(likely: Floats) -> float:
     """Return the standard deviation whose 95 % interval is that of all sizes together, by their log likelihoods."""
     weight = np.exp(likely - likely.max())
-    within = 2 * normal_below(NORMAL95 * SIZES_M[:, None] / SIZES_M) - 1
+    within = 2 * ndtr(TWO_SIDED_95 * SIZES_M[:, None] / SIZES_M) - 1
     return float(np.interp(0.95, within @ (weight / weight.sum()), SIZES_M))
 
 

@@ -16,7 +16,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lifted_power
 from calib.estimation.plausibility import MEDIAN
 from calib.ranges import Ranges
-from calib.spread import robust_spread
+from calib.spread import TWO_SIDED_95, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -36,7 +36,6 @@ SURELY: Final = 4.0
 """Standard errors beyond which levels differ; readings of one place come together, so that these are a little small."""
 
 SMALLEST_NS: Final = 0.02
-NORMAL95: Final = 1.96
 
 
 def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
@@ -46,7 +45,7 @@ def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
         return
     each_ns, unlike = _ns_a_decibel(ranges, calibration), {}
     for tag, (level, std) in levels.items():
-        half_ns = NORMAL95 * calibration.delays_std_ns.get(tag, 0.0)
+        half_ns = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, 0.0)
         if (
             half_ns > 0
             and abs(level) > max(ALIKE_DB, SURELY * std)

@@ -18,8 +18,9 @@ from calib.planning.having import Having, having
 from calib.planning.procedure import named, steps, where
 from calib.planning.promise import Promise, promises
 from calib.planning.result import Halves, NextBest, Plan
+from calib.spread import TWO_SIDED_95
 from calib.surveys.network import DIMENSIONS
-from calib.surveys.scales import DELAY_SCALE_NS, M_PER_NS, TWO_SIDED, widened
+from calib.surveys.scales import DELAY_SCALE_NS, M_PER_NS, widened
 from uwblink.arrays import Floats
 
 RANGES_A_PAIR: Final = 20
@@ -100,7 +101,7 @@ def _verdict(total: Floats, tags: tuple[int, ...]) -> Verdict:
 
 def _wide(given: Having, chosen: list[Layout]) -> float:
     """Return the factor of a standard deviation that makes half an interval of 95 %."""
-    return TWO_SIDED * widened(_freedom(given, chosen))
+    return TWO_SIDED_95 * widened(_freedom(given, chosen))
 
 
 def _halves(given: Having, chosen: list[Layout], std_ns: Floats) -> dict[int, float]:

@@ -19,7 +19,7 @@ from calib.planning.foresight import Errors, Flight, Foreseen, best_tape, flight
 from calib.planning.rehearsal import Flown, rehearse
 from calib.planning.result import NextBest
 from calib.sources import Data
-from calib.surveys.scales import TWO_SIDED
+from calib.spread import TWO_SIDED_95
 from calib.trajectories.fitting import ANCHORS, usable_of
 from calib.trajectories.given import Usable
 from uwblink.arrays import Floats
@@ -184,13 +184,13 @@ def _promise(asked: _Asked, flight: Flight, flown: Flown | None) -> FlightPlan:
         ranges=len(flight.scene.time_s),
         seconds=float(np.ptp(flight.scene.time_s)),
         source=flight.scene.source,
-        half_ns={tag: TWO_SIDED * float(s) for tag, s in zip(found.tags, std, strict=True)},
+        half_ns={tag: TWO_SIDED_95 * float(s) for tag, s in zip(found.tags, std, strict=True)},
         open_ns={
-            tag: TWO_SIDED * math.sqrt(v)
+            tag: TWO_SIDED_95 * math.sqrt(v)
             for tag, v in zip(found.tags, np.diag(found.covariance_ns2).tolist(), strict=True)
         },
-        common_ns=TWO_SIDED * math.sqrt(float(common @ covariance @ common)),
-        apart_ns=TWO_SIDED * math.sqrt(float(np.trace(apart @ covariance @ apart)) / count),
+        common_ns=TWO_SIDED_95 * math.sqrt(float(common @ covariance @ common)),
+        apart_ns=TWO_SIDED_95 * math.sqrt(float(np.trace(apart @ covariance @ apart)) / count),
         verdict=found.verdict,
         next_best=tuple(sorted(_more(asked, flight, flown, found), key=lambda one: one.mean_ns)),
         taped=tuple(flight.tapes),
@@ -204,7 +204,7 @@ def _promise(asked: _Asked, flight: Flight, flown: Flown | None) -> FlightPlan:
 def _mean_ns(covariance: Floats) -> float:
     """Return the root mean square of half intervals, of which each is known to `GUESS_NS` at worst."""
     information = np.linalg.pinv(covariance, hermitian=True) + np.eye(len(covariance)) / GUESS_NS**2
-    return TWO_SIDED * float(np.sqrt(np.trace(np.linalg.inv(information)) / len(covariance)))
+    return TWO_SIDED_95 * float(np.sqrt(np.trace(np.linalg.inv(information)) / len(covariance)))
 
 
 def _more(asked: _Asked, flight: Flight, flown: Flown | None, found: Foreseen) -> Iterator[NextBest]:

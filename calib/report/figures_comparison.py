@@ -12,7 +12,7 @@ from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
 from calib.evaluation.onboard_track import OnboardTrack
 from calib.figures import keep_strays_out
-from calib.tails import TWO_SIDED_95
+from calib.spread import TWO_SIDED_95
 from uwblink.pages.colours import BLUE, INK, MUTED, VERMILION
 from uwblink.pages.figures import label, legend, mark, sheet
 

@@ -14,7 +14,7 @@ from calib.calibration.model import Calibration
 from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, PlantedComparison, pair_rows
 from calib.ranges import Ranges
 from calib.report.blocks import Block, Picture, Table, Text
-from calib.tails import TWO_SIDED_95
+from calib.spread import TWO_SIDED_95
 
 if TYPE_CHECKING:
     from calib.estimation.passive_listeners import OverheardDelay

@@ -15,7 +15,7 @@ from calib.ranges import Ranges
 from calib.report.blocks import Block
 from calib.report.grades import BAD, DOUBT, GOOD, Criterion, graded, judgement
 from calib.report.without_truth import criteria
-from calib.tails import TWO_SIDED_95
+from calib.spread import TWO_SIDED_95
 
 if TYPE_CHECKING:
     from calib.evaluation.tracking import Localization

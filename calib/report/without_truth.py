@@ -16,8 +16,8 @@ from calib.calibration.foundations import rests_on
 from calib.calibration.model import Calibration
 from calib.report.blocks import Block, Heading, Picture, Table, Text
 from calib.report.grades import Criterion, graded
+from calib.spread import TWO_SIDED_95
 from calib.surveys.surveyed import SurveyedArrangement
-from calib.tails import TWO_SIDED_95
 
 MOST_REFLECTED: Final = 0.05
 WORST_REFLECTED: Final = 0.2

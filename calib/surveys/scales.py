@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from calib.spread import TWO_SIDED_95
 from calib.surveys.adjustment import PAIR_WORTH
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -11,7 +12,6 @@ DELAY_SCALE_NS: Final = 0.5
 """How far a delay is known without any data: devices of one design differ by that."""
 
 M_PER_NS: Final = SPEED_OF_LIGHT * 1e-9
-TWO_SIDED: Final = 1.959963984540054
 
 
 def widened(freedom: float) -> float:
@@ -21,4 +21,4 @@ def widened(freedom: float) -> float:
     """
     from scipy.special import stdtrit
 
-    return float(stdtrit(max(freedom + PAIR_WORTH, 1.0), 0.975)) / TWO_SIDED
+    return float(stdtrit(max(freedom + PAIR_WORTH, 1.0), 0.975)) / TWO_SIDED_95

@@ -18,6 +18,7 @@ from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import unsure
 from calib.estimation.solver import Solved
 from calib.information import Unknown, Verdict, judge
+from calib.spread import TWO_SIDED_95
 from calib.trajectories.arrow import Factored, normal_of
 from calib.trajectories.climbing import Climbed
 from calib.trajectories.coarseness import coarseness
@@ -80,7 +81,8 @@ class Judged:
         common = np.full((1, count), 1 / count)
         apart = np.eye(count)[1:] - np.eye(count)[0]
         spread, differences = (
-            1.96 * float(np.sqrt(np.max(np.diag(rows @ self.covariance_ns2 @ rows.T)))) for rows in (common, apart)
+            TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(rows @ self.covariance_ns2 @ rows.T))))
+            for rows in (common, apart)
         )
         return [
             f"the ranges determine no delay: what all have in common is known to ± {spread:.2f} ns (95 %), and "
@@ -91,7 +93,7 @@ class Judged:
         verdict = self.verdict
         tags = [] if verdict is None else [int(unknown.of) for unknown in verdict.unknowns]
         std = [math.sqrt(self.covariance_ns2[tags.index(tag), tags.index(tag)]) for tag in free]
-        return f": known to ± {1.96 * max(std):.2f} ns (95 %) at worst"
+        return f": known to ± {TWO_SIDED_95 * max(std):.2f} ns (95 %) at worst"
 
 
 def judged(climbed: Climbed, problem: Problem, reference: float | None, curve: Calibration | None = None) -> Judged:
