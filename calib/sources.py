@@ -184,8 +184,18 @@ def load_ranges(data: Data | Iterable[Data], *, trim_static: bool = False, need_
 
 
 def load_each(data: Data | Iterable[Data], *, trim_static: bool = False, need_power: bool = True) -> list[Ranges]:
-    """Return the ranges of each recording; raises what `load_ranges` raises."""
-    parts = [_load(one, need_power) for one in each(data)]
+    """Return the ranges of each recording; raises what `load_ranges` raises.
+
+    Raises `BadInputError` where two recordings hold the same exchanges: counted twice, they would seem to tell more.
+    """
+    given = each(data)
+    parts = [_load(one, need_power) for one in given]
+    seen: dict[str, str] = {}
+    for part in (p for one, p in zip(given, parts, strict=True) if not isinstance(one, Ranges)):
+        for name, found in part.recordings:
+            if found in seen:
+                raise BadInputError(f"{name}: has the same exchanges as {seen[found]}; give each recording once")
+            seen[found] = name
     return [without_static(part) for part in parts] if trim_static else parts
 
 

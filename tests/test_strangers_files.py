@@ -64,6 +64,43 @@ def test_no_fifo_is_opened(folder, line):
 @pytest.mark.parametrize(
     "line",
     [
+        "calib export c.json --to csv --force -o",
+        "calib fit f.uwb --force -o",
+        "calib apply f.uwb -c c.json --force -o",
+        "uwblink import guess c.csv --force -o",
+    ],
+)
+def test_no_fifo_or_device_is_replaced(folder, line):
+    (folder / "c.csv").write_text("from,to,range_m\n1,2,3.0\n")
+    os.mkfifo(folder / "there")
+    refused(processes.run(*line.split(), "there", cwd=folder, timeout=60), "there", "FIFO")
+    assert (folder / "there").is_fifo()
+    (folder / "there").unlink()
+
+
+def test_a_folder_with_something_else_in_it_is_not_replaced(folder):
+    """`--force` of an export deletes what was exported before, and nothing else."""
+    export = "uwblink export f.uwb --to csv --force -o out".split()
+    assert processes.run(*export, cwd=folder).returncode == 0
+    assert processes.run(*export, cwd=folder).returncode == 0
+    (folder / "out" / "deep").mkdir()
+    (folder / "out" / "deep" / "thesis.txt").write_text("mine")
+    before = {path: path.stat().st_mtime_ns for path in (folder / "out").rglob("*")}
+    refused(processes.run(*export, cwd=folder), "out", "deep")
+    assert {path: path.stat().st_mtime_ns for path in (folder / "out").rglob("*")} == before
+
+
+@pytest.mark.parametrize("line", ["fit f.uwb f.uwb -o o.json", "evaluate g.uwb f.uwb -c c.json"])
+def test_a_recording_given_twice_is_refused(folder, line):
+    """It would count as twice the evidence, under another name, too."""
+    (folder / "g.uwb").write_bytes((folder / "f.uwb").read_bytes())
+    refused(processes.run("calib", *line.split(), cwd=folder), "f.uwb")
+    assert not (folder / "o.json").exists()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
         "calib apply f.uwb -c c.json -o c.csv",
         "calib sample -o c.parquet",
         "uwbsim run noiseless -o c.mcap",

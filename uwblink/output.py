@@ -84,8 +84,17 @@ def place_beside(path: Path) -> Iterator[Path]:
 
 
 def take_name(partial: Path, path: Path) -> None:
-    """Give a new file or folder its name; a folder that had it goes away with the place beside it."""
+    """Give a new file or folder its name; a folder that had it goes away with the place beside it.
+
+    Raises `RecordingError` where that folder holds what the new one does not replace.
+    """
     if path.is_dir() and not path.is_symlink():
+        for place in path.rglob("*"):
+            kept = place.relative_to(path)
+            if not os.path.lexists(partial / kept):
+                raise RecordingError(
+                    f"{path}: holds {kept}, which is not written again; give another name or remove it"
+                )
         path.replace(partial.with_name(".before"))
     partial.replace(path)
 
@@ -169,6 +178,8 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
         )
     if path.is_dir():
         raise RecordingError(f"{path}: is a directory, expected the name of an output file")
+    if path.exists() and not path.is_file():
+        raise RecordingError(f"{path}: is a FIFO, socket or device, expected the name of an output file")
     if path.exists() and not force:
         raise RecordingExistsError(f"{path}: exists already; give another name, or `force` to replace it")
     if not path.parent.is_dir():

@@ -92,7 +92,10 @@ def test_what_cannot_be_exported_leaves_nothing(whole, tmp_path):
     (tmp_path / "out" / "mine").write_text("mine")
     with pytest.raises(RecordingExistsError, match="exists already"):
         export_recording(whole, tmp_path / "out", to="csv")
-    assert (tmp_path / "out" / "mine").exists()
+    with pytest.raises(RecordingError, match="holds mine"):
+        export_recording(whole, tmp_path / "out", to="csv", force=True)
+    assert (tmp_path / "out" / "mine").read_text() == "mine"
+    (tmp_path / "out" / "mine").rename(tmp_path / "out" / "meta.csv")
     export_recording(whole, tmp_path / "out", to="csv", force=True)
     assert sorted(path.stem for path in (tmp_path / "out").iterdir()) == sorted(TABLES)
 
