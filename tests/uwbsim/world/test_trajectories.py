@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import uwbsim
 from uwbsim.random_streams import stream
 from uwbsim.scenario.motion import Carried, RandomFlight, Static, Waypoints
 from uwbsim.world.trajectories import sample
@@ -66,3 +67,31 @@ def test_attitudes_are_those_of_scipys_angles():
     time = np.linspace(0, 60, 500)
     expected = Rotation.from_euler("ZYX", flight.angles(time)).as_quat()
     np.testing.assert_allclose(flight.quaternion(time), expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("shape", "rounds_a_climb"), [("circle", 1), ("eight", 1), ("helix", 5)])
+def test_figures_pass_through_points_known_by_hand(shape, rounds_a_climb):
+    motion = {"model": "figure", "shape": shape, "centre_m": [1, -2, 1.5], "radius_m": 2.0, "period_s": 4.0}
+    flying = {"name": "flying", "motion": motion | {"climb_m": 0.8, "phase_deg": 90.0, "turns_per_period": 0.5}}
+    post = {"name": "post", "motion": {"model": "static", "position_m": [0, 0, 1]}}
+    tags = [{"id": 1, "body": "flying"}, {"id": 2, "body": "post"}]
+    scenario = {"run": {"duration_s": 21.0}, "ranging": {"rate_hz": 1}, "bodies": [flying, post], "tags": tags}
+    poses = uwbsim.simulate(scenario).poses
+    poses = poses[np.flatnonzero(poses.body == "flying")]
+
+    def at(seconds, columns):
+        since = (poses.time_ns - poses.time_ns[0]) * 1e-9
+        return np.column_stack([np.interp(seconds, since, column) for column in columns.T])
+
+    half = np.sqrt(2)
+    place = at([0, 0.5, 1, 1.5, 2, 3], poses.position_m - [1, -2, 1.5])
+    # A round takes 4 s, counter-clockwise, from the positive y axis; an eight crosses its centre there.
+    np.testing.assert_allclose(place[:, 0], [0, -half, -2, -half, 0, 2], atol=1e-3)
+    sideways = [0, -1, 0, 1, 0, 0] if shape == "eight" else [2, half, 0, -half, -2, 0]
+    np.testing.assert_allclose(place[:, 1], sideways, atol=1e-3)
+    # The path is at its middle height at the x axis, from where it climbs.
+    climbs = np.arange(1, 22) / 4 / rounds_a_climb
+    height = at(np.arange(21.0), poses.position_m)[:, 2]
+    np.testing.assert_allclose(height, 1.5 + 0.4 * np.sin(2 * np.pi * climbs), atol=1e-3)
+    nose = Rotation.from_quat(poses.quaternion).as_matrix()[:, :, 0]
+    np.testing.assert_allclose(at([0.0, 2.0, 4.0], nose), [(1, 0, 0), (0, 1, 0), (-1, 0, 0)], atol=1e-3)
