@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwblink import Exchanges
 from uwblink.recording.schema import Poses, Tag
@@ -11,6 +12,9 @@ from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 DELAYS_NS = {1: -0.36, 2: 0.05, 3: 0.24, 4: -0.11, 5: -0.2, 6: 0.1}
 ARM = 0.24
+MAST = np.array([0.3, -0.1, 0.2])
+"""Lever arm of an anchor's antenna."""
+
 REPLY = 20_000_000
 PAIRS = np.array([(1, 3), (2, 5), (4, 6), (1, 4), (2, 6), (3, 5), (1, 5), (2, 3), (4, 5), (1, 6), (2, 4), (3, 6)])
 
@@ -63,6 +67,11 @@ class Flight:
     antennas: Any = None
 
 
+def turned_anchor(tag):
+    """How an anchor stands: turned about all axes, each in its own way."""
+    return Rotation.from_euler("ZYX", [1.1 * tag, 0.4, -0.3])
+
+
 def bias(lifted):
     return 0.05 * np.sin(3 * lifted)
 
@@ -86,7 +95,8 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
 ):
     """A flight whose poses have noise in places, and headings and tilts that are off by sines of so many degrees.
 
-    `anchors` (k, 3) stand as tags 11 and on, with delays of their own, and range with each tag in turn. With
+    `anchors` (k, 3) are the antennas of standing bodies, tags 11 and on, with delays of their own; they range with
+    each tag in turn. With
     `height_off_m` bodies read their heights, wrong by that and by 3 cm of noise; for `standing_s` all stand.
     `shaken` bodies move beside by so many metres, so many times a second; ranges of a pair in `late_m` are too long.
     `antennas(tags, seconds)` of the flight says where antennas are.
@@ -141,7 +151,7 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
     )
     half = REPLY * TICK_S / 2
     tags = [Tag(tag, f"robot{(tag - 1) // 2}", tuple(arm(tag, arm_m))) for tag in DELAYS_NS]
-    tags += [Tag(tag, f"anchor{tag}", (0.0, 0.0, 0.0)) for tag in stand]
+    tags += [Tag(tag, f"anchor{tag}", tuple(MAST)) for tag in stand]
     # Poses say where bodies are; ranges belong to the middle of their first two messages, which `half` is.
     when = np.arange(0.0, seconds + 1.0, 0.02)
     poses_of: list[Any] = []
@@ -158,7 +168,9 @@ def flight(  # noqa: PLR0913 - what a flight may differ in
         poses_of.append((np.full(len(when), f"robot{body}"), seen, upright, when))
     for tag, here in stand.items():
         two = np.array([0.0, seconds])
-        poses_of.append((np.full(2, f"anchor{tag}"), np.tile(here, (2, 1)), np.tile([0, 0, 0, 1.0], (2, 1)), two))
+        turned = turned_anchor(tag)
+        middle, quaternion = here - turned.apply(MAST), turned.as_quat()
+        poses_of.append((np.full(2, f"anchor{tag}"), np.tile(middle, (2, 1)), np.tile(quaternion, (2, 1)), two))
     poses = Poses.from_arrays(
         np.rint(np.concatenate([r[3] for r in poses_of]) * 1e9).astype(np.int64),
         np.concatenate([r[0] for r in poses_of]),
