@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import exponnorm, norm
 
 import calib
 from calib.calibration.error_model import ErrorModel, PairErrors
@@ -89,6 +90,17 @@ def test_errors_beyond_everything_are_outliers():
     assert outlier[0] > 0.999
     assert outlier[2] == 1.0
     assert np.isfinite(tail).all()
+
+
+def test_what_an_error_was_follows_from_the_densities_of_scipy():
+    model = replace(MODEL, outlier_share=0.05, outlier_m=3.0)
+    error = np.linspace(-1, 4, 101)
+    shapes = model.shapes(np.full(101, 0.5), np.full(101, 3), np.full(101, 7))
+    core = 0.95 * 0.8 * norm.pdf(error - 0.02, scale=0.05)
+    tail = 0.95 * 0.2 * exponnorm.pdf(error - 0.02, 0.3 / 0.05, loc=0.05, scale=0.05)
+    wild = 0.05 * norm.pdf(error - 0.02, scale=3.0)
+    found = model.tail_given(error, shapes)
+    np.testing.assert_allclose(found, [tail / (core + tail + wild), wild / (core + tail + wild)], atol=1e-9)
 
 
 def test_levels_put_quantiles_right():

@@ -116,6 +116,7 @@ def test_imu_height_and_ranges_find_place_and_heading():
     assert track.used == "ranges, imu, height"
     wrong = errors_of(track, 3.0)
     assert np.sqrt(np.mean(wrong**2)) < 0.08
+    assert track.rmse_m == pytest.approx(np.sqrt(np.mean(errors_of(track) ** 2)))
     t = (track.time_ns - 10**12) * 1e-9
     off = (attitude(t).inv() * Rotation.from_quat(track.attitude)).magnitude()
     # Headings begin all around; turns and accelerations tell.
@@ -129,6 +130,8 @@ def test_it_knows_how_good_it_is(seed):
     late = track.time_ns > track.time_ns[0] + 5_000_000_000
     # Errors of the state last for a second: fifteen independent values of three, known to 15 % each way.
     assert 1.5 < np.mean(track.nees[late]) < 5.0
+    # The stated error has the size of the true one, in metres, to the same part.
+    assert np.sqrt(np.mean((errors_of(track) / track.std_m)[late] ** 2)) == pytest.approx(1.0, abs=0.35)
     settled = track.range_time_ns > track.time_ns[0] + 5_000_000_000
     assert np.mean(track.nis[settled]) == pytest.approx(1.0, abs=0.17)
     sure = replace(calibration(), errors=replace(calibration().errors, noise_m=(0.02, 0.02)))
