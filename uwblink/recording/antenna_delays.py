@@ -136,7 +136,7 @@ def load_antenna_delays(path: Path) -> dict[int | None, AntennaDelay]:
     file.known(file.table, ("antenna_delays",))
     found = read_antenna_delays(file)
     if not found:
-        raise PlanError(f"{path}: holds no [antenna_delays]; `calib export --to registers` writes one")
+        raise PlanError(f"{path}: holds no [antenna_delays]; `calib export` writes one, for registers")
     return found
 
 
