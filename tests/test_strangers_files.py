@@ -80,7 +80,7 @@ def test_no_fifo_or_device_is_replaced(folder, line):
 
 def test_a_folder_with_something_else_in_it_is_not_replaced(folder):
     """`--force` of an export deletes what was exported before, and nothing else."""
-    export = "uwblink export f.uwb --to csv --force -o out".split()
+    export = ["uwblink", "export", "f.uwb", "--to", "csv", "--force", "-o", "out"]
     assert processes.run(*export, cwd=folder).returncode == 0
     assert processes.run(*export, cwd=folder).returncode == 0
     (folder / "out" / "deep").mkdir()

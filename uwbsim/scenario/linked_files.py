@@ -73,7 +73,7 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
         raise ScenarioError(f"{where}, but there is no such file beside the scenario") from error
     if not inside:
         # Whether there is such a file is nobody's business either.
-        raise ScenarioError(f"{where}, which is not in the folder of the file that names it, or below; `allow_files` names other folders")
+        raise ScenarioError(f"{where}, which is not below the naming file's folder; `allow_files` names other folders")
     if not place.exists():
         raise ScenarioError(f"{where}, but there is no such file beside the scenario")
     if not place.is_file():
