@@ -39,7 +39,7 @@ FILE_KEYS: Final = tuple(
     for name, meaning in (
         ("tx", "Transmit antenna delay register of {}."),
         ("rx", "Receive antenna delay register of {}."),
-        ("reply", "What the firmware of {} adds to the stamps of its delayed replies; 16436, or as `tx`."),
+        ("reply", "What the firmware of {} adds to the stamps of its delayed replies; 16436, or that of tx."),
     )
 )
 
