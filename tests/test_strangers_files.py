@@ -90,6 +90,23 @@ def test_a_folder_with_something_else_in_it_is_not_replaced(folder):
     assert {path: path.stat().st_mtime_ns for path in (folder / "out").rglob("*")} == before
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "uwbsim validate deep.toml",
+        "uwbsim run noiseless -o o.uwb --set run.seed=" + "[" * 3000,
+        "uwbsim sweep deep.toml -o o",
+        "uwbsim serve noiseless --faults deep.toml",
+        "uwblink import csv c.csv --map deep.toml -o o.uwb",
+        "calib survey f.uwb --known deep.toml -o o.json",
+    ],
+)
+def test_toml_that_is_nested_too_deeply_is_refused(folder, line):
+    (folder / "c.csv").write_text("from,to,range_m\n1,2,3.0\n")
+    (folder / "deep.toml").write_text("a = " + "[" * 5000 + "]" * 5000)
+    refused(processes.run(*line.split(), cwd=folder, timeout=60), "deep.toml" if "deep" in line else "run.seed")
+
+
 @pytest.mark.parametrize("line", ["fit f.uwb f.uwb -o o.json", "evaluate g.uwb f.uwb -c c.json"])
 def test_a_recording_given_twice_is_refused(folder, line):
     """It would count as twice the evidence, under another name, too."""

@@ -36,7 +36,7 @@ class TomlReader:
         self.text = read_text(path, error, what)
         try:
             self.table: dict[str, Any] = tomllib.loads(self.text)
-        except tomllib.TOMLDecodeError as problem:
+        except (tomllib.TOMLDecodeError, RecursionError) as problem:
             raise error(f"{path}: not valid TOML: {problem}") from problem
 
     def known(self, table: dict[str, Any], names: Iterable[str], prefix: str = "") -> None:

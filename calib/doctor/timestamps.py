@@ -75,7 +75,7 @@ def with_itself(view: RecordingView) -> Iterator[Seen]:
 def doubled(view: RecordingView) -> Iterator[Seen]:
     """Rows that repeat another one: two robots log an exchange, and both logs were imported."""
     if view.doubled:
-        told = f"{view.doubled} of {view.doubled + len(view.exchanges)} rows repeat the stamps of another"
+        told = f"{view.doubled} of {view.doubled + len(view.exchanges)} rows repeat another one"
         yield Seen("doubled exchanges", told)
 
 

@@ -98,7 +98,7 @@ def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise ScenarioError(f"{path}: {where}: {first['msg'][0].lower()}{first['msg'][1:]}") from error
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScenarioError(f"{path}: cannot be read as a file of faults (.toml): {error}") from error
     for number, fault in enumerate(faults.faults):
         tag = getattr(fault, "tag", None)

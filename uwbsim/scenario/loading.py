@@ -93,7 +93,7 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
 def _toml(text: str, path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScenarioError(f"{path}: not valid TOML: {error}") from error
 
 
@@ -106,7 +106,7 @@ def _split(text: str) -> tuple[str, Any]:
         )
     try:
         return key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return key, value.strip()  # a word without quotes is meant as text
 
 

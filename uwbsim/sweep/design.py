@@ -183,7 +183,7 @@ def _parse(path: Path) -> tuple[dict[str, Any], str]:
     text = read_text(path, ScenarioError, "file of a sweep (.toml)")
     try:
         return tomllib.loads(text), text
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScenarioError(f"{path}: not valid TOML: {error}") from error
 
 
