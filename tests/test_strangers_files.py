@@ -262,7 +262,7 @@ def test_evaluating_ranges_of_the_first_calibrated_tags_only(tmp_path):
     known = calib.fit(flight).calibration
     planted = {"knots": [0.0] * 4 + [2.0] * 4, "coefficients": [0.0, 0.01, 0.02, 0.03], "degree": 3}
     ranges = calib.load_ranges(flight)
-    ranges = replace(ranges, planted=ranges.planted | {"bias_curve": planted})
+    ranges = replace(ranges, planted={**(ranges.planted or {}), "bias_curve": planted})
     some = ranges[(ranges.initiator <= 2) & (ranges.target <= 2)]
     full = calib.evaluate(ranges, known).planted
     assert calib.evaluate(some, known).planted.delay_error_ns == full.delay_error_ns

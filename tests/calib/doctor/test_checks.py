@@ -12,7 +12,7 @@ import pytest
 
 import calib
 from benchmarks import doctor as planted
-from benchmarks.flights import Plan, fly
+from benchmarks.flights import Flight, Plan, fly
 from calib.doctor.checks import BUDGET, exceeds
 from calib.doctor.table import CHECKS, LEVEL, rows
 from tests import processes
@@ -23,6 +23,13 @@ from uwblink.recording.file import Recording
 SHORT = Plan(seconds=40, per_second=80)
 RIG = replace(SHORT, bodies=1, anchors=6)
 RNG = np.random.default_rng
+
+
+def rows_of(tar, name):
+    """The rows of a table in an archive, by its headers."""
+    file = tar.extractfile(name)
+    assert file is not None
+    return list(DictReader(TextIOWrapper(file)))
 
 
 def faults(*flights):
@@ -226,7 +233,7 @@ def starloc():
 
         def table(name):
             (path,) = [one for one in tar.getnames() if one.endswith(name)]
-            return list(DictReader(TextIOWrapper(tar.extractfile(path))))
+            return rows_of(tar, path)
 
         markers = {int(row[""]): [row[k] for k in "xyz"] for row in table("uwb_markers_v1.csv")}
         return table("loop-2d-fast_s1/uwb.csv"), markers
@@ -265,7 +272,7 @@ def test_markers_that_are_other_radios_are_seen(starloc, tmp_path, marker_of, wr
 def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
     with tarfile.open(shared("miluv_cirObstacles_3_random_0.tar.xz")) as tar:
         logs = [one for one in tar.getnames() if one.endswith("uwb_range.csv")]
-        logged = [row for one in logs for row in DictReader(TextIOWrapper(tar.extractfile(one)))]
+        logged = [row for one in logs for row in rows_of(tar, one)]
     stamps = [f"{way}{k}" for k in (1, 2, 3) for way in ("tx", "rx")]
     names = {"time_s": "timestamp", **{name: f"{name}_raw" for name in stamps}, "range_m": "range_raw"}
     names |= {name: name for name in ("from_id", "to_id", "fpp1", "fpp2", "skew1", "skew2", "gt_range")}
@@ -282,5 +289,5 @@ def test_logs_of_both_robots_are_doubled_exchanges(tmp_path):
     assert len(once) == len(logged) - 123
     assert calib.examine(tmp_path / "t.uwb") == []
     twice = once[np.sort(np.concatenate([np.arange(len(once)), np.arange(123)]))]
-    (found,) = calib.examine(planted.Flight(twice, fly(SHORT, 1).poses[:0], []))
+    (found,) = calib.examine(Flight(twice, fly(SHORT, 1).poses[:0], []))
     assert found.evidence.startswith("123 of 440 rows")

@@ -61,7 +61,7 @@ def test_a_pause_within_a_recording_changes_nothing():
     np.testing.assert_allclose(paused.calibration.delays_ns[1], whole.calibration.delays_ns[1], rtol=1e-9)
     # Two hundred blocks of time begin a step elsewhere after the pause: each is one more draw of the same variance.
     widths = [list(found.calibration.delays_std_ns.values()) for found in (whole, paused)]
-    np.testing.assert_allclose(*widths, rtol=0.25)
+    np.testing.assert_allclose(widths[0], widths[1], rtol=0.25)
     assert len(paused.warnings) == len(whole.warnings)
 
 

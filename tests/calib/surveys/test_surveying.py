@@ -5,6 +5,7 @@ import math
 import re
 import tomllib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -451,7 +452,8 @@ def test_an_error_of_the_command_names_only_flags_that_it_has(recording, capsys)
     with pytest.raises(SystemExit) as ended:
         run(app, BadInputError, arguments=["survey", recording[0], recording[0], "-o", "c.json"], flags=FLAGS)
     assert ended.value.code == 2
-    options = {option for one in typer.main.get_command(app).commands["survey"].params for option in one.opts}
+    commands: Any = typer.main.get_command(app)
+    options = {option for one in commands.commands["survey"].params for option in one.opts}
     assert set(re.findall(r"--[a-z-]+", capsys.readouterr().err)) <= options
 
 

@@ -11,13 +11,15 @@ import pytest
 
 import uwblink
 from tests import processes
+from uwblink.boards.progress import Progress
 from uwblink.boards.pseudo_terminals import Terminal
 from uwblink.boards.recorder import Recorder
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
 
+END = 2**32 - 1
 TITLE = b"\x1b]0;owned\x07\x1b[2J\x1b[31m"
-RANGE = m.RangeReport(2, 3.0, *range(1, 7), -85.0, -86.0, 1.0, -1.0)
+RANGE = m.RangeReport(2, 3.0, 1, 2, 3, 4, 5, 6, -85.0, -86.0, 1.0, -1.0)
 SAID = [
     TITLE + b"\r\n",
     b"R03|0|1|" + TITLE + b"|1|1.0000|\x02\x00ab\r\n",
@@ -29,7 +31,7 @@ SAID = [
     b"S10|1|2|" + b"1|" * 5000,
     b"R00\r\n" * 2000,
     encode(m.IdReport(77)) * 20,
-    encode(m.TargetRangeReport(255, -999.0, *[2**32 - 1] * 6, 0.0, 0.0, 0.0, 0.0)) * 20,
+    encode(m.TargetRangeReport(255, -999.0, END, END, END, END, END, END, 0.0, 0.0, 0.0, 0.0)) * 20,
     encode(m.OverheardNothing(255, 255)),
     encode(RANGE),
 ]
@@ -42,6 +44,7 @@ def hostile(board, link, said):
     terminal, over, got, answers = Terminal(link), threading.Event(), [], itertools.cycle(said)
 
     def serve():
+        assert terminal.fileno is not None
         while not over.is_set():
             if select.select([terminal.fileno], [], [], 0.05)[0]:
                 got.append(terminal.read())
@@ -140,7 +143,7 @@ class FloodingPort:
 
 def test_zeros_without_an_end_are_faults_and_no_memory():
     """Nothing is written here, so that only the loop is measured."""
-    ports, seen = Flooding(), uwblink.boards.Progress()
+    ports, seen = Flooding(), Progress()
     recorder = Recorder({1: "1", 2: "2"}, uwblink.RangingPlan(((1, 2),)), ((1, 2),), [seen], ports=ports)
     tracemalloc.start()
     try:

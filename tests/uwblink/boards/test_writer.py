@@ -85,7 +85,12 @@ def test_rows_are_committed_while_a_long_log_is_put_into_the_file(live, monkeypa
     """DuckDB does that within a commit where nobody did it before, and what comes meanwhile is not in the file."""
     begun, over = threading.Event(), threading.Event()
     monkeypatch.setattr(writing, "LONG_LOG", 20_000)
-    monkeypatch.setattr(Recording, "shorten_log", lambda _: begun.set() or over.wait(60))
+
+    def shorten_log(_):
+        begun.set()
+        over.wait(60)
+
+    monkeypatch.setattr(Recording, "shorten_log", shorten_log)
     log, written = Path(f"{live.path}.wal"), []
     with RecordingWriter(live) as writer:
         writer.on_bytes(1, "port", "in", bytes(30_000))

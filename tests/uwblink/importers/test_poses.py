@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -239,8 +240,8 @@ def test_lever_arms_and_ranges_in_other_units_are_refused(flight, copied, tmp_pa
     done = processes.run("uwblink", "poses", copied, *words, "--tags", tmp_path / "tags.toml")
     assert done.returncode == 2
     assert "lever arms are in mm" in done.stderr
-    none = np.zeros(len(held), dtype=np.int64)
-    bare = replace(held, range_m=1000 * held.range_m, **dict.fromkeys(STAMPS, none))
+    none: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(len(held), dtype=np.int64))
+    bare = replace(held, range_m=1000 * held.range_m, **none)
     Contents(exchanges=bare, tags=tags).save(tmp_path / "mm.uwb")
     done = processes.run("uwblink", "poses", tmp_path / "mm.uwb", *words)
     assert done.returncode == 2

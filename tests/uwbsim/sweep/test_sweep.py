@@ -153,6 +153,7 @@ def test_a_process_that_dies_is_replaced(alone, tmp_path, monkeypatch):
             if self._pool not in pools and len(killed) < 2:
                 pools.append(self._pool)
                 victim = next(process for process in self._pool._processes.values() if process.is_alive())
+                assert victim.pid is not None
                 killed.append(victim.pid)
                 os.kill(victim.pid, signal.SIGKILL)
 
