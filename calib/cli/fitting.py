@@ -39,7 +39,6 @@ from calib.cli.arguments import (
 )
 from calib.cli.flags import with_flags
 from calib.cli.loading import STOPPED, known_calibration
-from calib.spread import TWO_SIDED_95
 from uwblink.cli.guide import add, tags_of
 from uwblink.cli.waiting import waiting
 
@@ -156,6 +155,8 @@ def _tell(output: Path, result: calib.FitResult) -> None:
 
 def delay_lines(found: calib.Calibration) -> Iterator[str]:
     """Yield a line a pair that has a constant and a line a tag: the constant or delay, and its 95 % interval."""
+    from calib.spread import TWO_SIDED_95
+
     for pair, offset in sorted(found.pair_offsets.items()):
         half = 196 * offset.std_m
         yield f"  pair {pair[0]:3d} {pair[1]:3d}  ranges {100 * offset.offset_m:+.2f} cm too long  ± {half:.2f} (95 %)"
@@ -181,6 +182,7 @@ def add_tag(
 ) -> None:
     """Fit the delay of one more tag from its ranges with calibrated ones, and leave everything else as it is."""
     import calib
+    from calib.spread import TWO_SIDED_95
     from uwblink.output import check_output
 
     check_output(output, force=force)
