@@ -43,7 +43,7 @@ CONFINED = {
 # The rooms by floor, the ground first: a room imports only rooms of lower floors, so two on one floor never meet.
 FLOORS = {
     "uwblink": (
-        ("arrays", "display", "errors", "lazy", "text_files"),
+        ("arrays", "display", "errors", "interrupts", "lazy", "text_files"),
         ("columns", "database", "output", "pages", "plugins", "ticks", "toml"),
         ("protocols",),
         ("twr",),

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from uwblink.errors import RecordingError
+from uwblink.interrupts import interrupts_held
 
 if TYPE_CHECKING:
     import duckdb
@@ -46,7 +47,8 @@ def connect(
     It keeps `memory_mb` in memory, by default most of what there is, and the rest in the folder `temporary`. Raises
     what DuckDB raises, and what `check_log` raises.
     """
-    import duckdb
+    with interrupts_held():  # one within its import ends the process in C++
+        import duckdb
 
     if path is not None:
         check_log(path)

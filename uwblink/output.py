@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Final, TextIO
 
 from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError, UwblinkError
+from uwblink.interrupts import interrupts_held
 
 __all__: Final = [
     "check_apart",
@@ -79,7 +80,9 @@ def place_beside(path: Path) -> Iterator[Path]:
     if len(os.fsencode(prefix)) > LONGEST_PREFIX:
         prefix = "."
     # It goes at the end of the process at the latest, wherever an interrupt hits.
-    with TemporaryDirectory(PARTIAL, prefix, path.absolute().parent, ignore_cleanup_errors=True) as folder:
+    with interrupts_held():  # one between making the folder and knowing of it would leave it behind
+        made = TemporaryDirectory(PARTIAL, prefix, path.absolute().parent, ignore_cleanup_errors=True)
+    with made as folder:
         yield Path(folder) / path.name
 
 
