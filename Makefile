@@ -41,7 +41,7 @@ docs: setup ## build the documentation site into docs/_build/html; warnings are 
 coverage: setup ## run the whole test suite and measure what it reaches (10 minutes); fails below 92 %
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder --cov --cov-report=term-missing
 
-rooms: setup ## draw the rooms into docs/architecture.md from the imports
+rooms: setup ## print which room imports which, floor by floor
 	$(BIN)/python -m tests.rooms
 
 lowest newest: ## run the whole test suite on the lowest versions that pyproject.toml allows, or on the newest
