@@ -16,6 +16,7 @@ import calib
 import uwbsim
 from calib.cli.commands import app as calib_app
 from calib.cli.reporting import spread
+from tests import processes
 from uwblink.cli.commands import app as uwblink_app
 from uwbsim.cli.commands import app as uwbsim_app
 
@@ -71,6 +72,15 @@ def test_help_fits_80_columns_and_loses_no_word(words, command, capsys):
         missing = [word for word in words_of(told or "") if word not in seen]
         assert missing == [], told
     assert not re.search(r"\\\[", text)
+    assert "<bool>" not in text, "a flag takes no value"
+
+
+@pytest.mark.parametrize(("words", "old", "new"), [("calib sample", "--anchors", "--with-anchors")])
+def test_old_names_of_options_are_answered_with_the_new_ones(words, old, new, tmp_path):
+    done = processes.run(*words.split(), old, "-o", tmp_path / "x.uwb")
+    assert done.returncode == 2
+    assert done.stderr == f"error: {old} is now {new}\n"
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("words", "command"), EVERY, ids=NAMES)

@@ -8,15 +8,14 @@ from typing import Annotated, Final
 import typer
 
 from uwblink.cli.guide import choice, tags_of
+from uwblink.cli.options import AsJson as AsJson
+from uwblink.cli.options import CalibrationFile as CalibrationFile
+from uwblink.cli.options import Figures as Figures
+from uwblink.cli.options import Force as Force
+from uwblink.cli.options import output
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recordings with true distances (.uwb).")]
-CalibrationFile = Annotated[Path, typer.Option("-c", "--calibration", help="Calibration (.json).")]
-NewCalibration = Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")]
-Figures = Annotated[
-    Path | None, typer.Option(help="Folder for the figures as PDF and SVG, at a column's and a page's width.")
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print all figures as JSON, in SI units and ns.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
+NewCalibration = Annotated[Path, output("Calibration to write (.json).")]
 WEIGHTS: Final = "How errors count"
 MODEL: Final = "What is fitted"
 UNKNOWN: Final = "Without known distances (--truth ranges)"

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from calib import Calibration
     from calib.evaluation import Evaluation
 
-from calib.cli.arguments import CalibrationFile, Figures, Force, Recordings
+from calib.cli.arguments import AsJson, CalibrationFile, Figures, Force, Recordings
 from calib.cli.loading import known_calibration
 from uwblink.cli.guide import add, choice
 from uwblink.cli.starting import keep_imported
@@ -49,9 +49,7 @@ def evaluate(
         Path | None, typer.Option(help="Report of the evaluation to write, one page (.html) or pages (.pdf).")
     ] = None,
     figures: Figures = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print all figures as JSON, in metres and ns, instead of a table.")
-    ] = False,
+    as_json: AsJson = False,
     force: Force = False,
 ) -> None:
     """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
@@ -123,7 +121,7 @@ def localize(
         Path | None, typer.Option(help="Folder for the estimated trajectories, one file a body and filter (.tum).")
     ] = None,
     figures: Figures = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    as_json: AsJson = False,
     force: Force = False,
 ) -> None:
     """Track each moving body by its ranges, with and without calibration, and print the RMSE in m."""
@@ -184,7 +182,7 @@ def doctor(
     recordings: Annotated[
         list[Path], typer.Argument(help="Recordings (.uwb); of several, what changed between them is said, too.")
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Name the faults in recordings, each with what shows it and what to do about it, and compare clocks by pair."""
     from dataclasses import asdict, replace
@@ -227,7 +225,7 @@ def compare(
     first: Annotated[Path, typer.Argument(help="Calibration to compare with (.json).")],
     second: Annotated[Path, typer.Argument(help="Calibration whose differences are told (.json).")],
     figures: Figures = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    as_json: AsJson = False,
     force: Force = False,
 ) -> None:
     """Say whether two calibrations' delays differ by more than their standard errors explain (differences in ns)."""

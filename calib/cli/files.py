@@ -10,6 +10,7 @@ import typer
 from calib.cli.arguments import CalibrationFile, Force
 from calib.cli.loading import known_calibration
 from uwblink.cli.guide import add, choice, epilog
+from uwblink.cli.options import Group
 from uwblink.cli.waiting import waiting
 
 PANEL: Final = "Use"
@@ -20,6 +21,7 @@ WITHOUT_ERRORS: Final = ("miluv", "ros-yaml", "c-header")
 MILUV: Final = "calib import miluv uwb_calib.json -o calibration.json"
 
 imports = typer.Typer(
+    cls=Group,
     help="Turn calibrations of other programs into ones that apply and evaluate take.",
     epilog=epilog(MILUV),
     no_args_is_help=True,

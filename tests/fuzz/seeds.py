@@ -89,7 +89,7 @@ ALONE: Final = (
     "calib plan 1,2,3,4,5 --on space --anchors 1,2,3,4 --anchor-sigma 0.01 --pair-error 0.02 --rate 50 --json",
     "calib plan 3 --on line --arrangements 3 --size 5",
     "calib sample -o {out} -n 50 --seed 2",
-    "calib sample -o {out} -n 50 --anchors",
+    "calib sample -o {out} -n 50 --with-anchors",
     "uwbsim scenarios icra2023 -o {out}",
     "uwbsim scenarios --json",
     "uwbsim schema",

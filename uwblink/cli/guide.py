@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import Field, fields, is_dataclass
 from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, get_type_hints
 
 import typer
+
+from uwblink.cli.options import Command
 
 COMMA: Final = ","
 """What separates names in one word."""
@@ -20,10 +24,70 @@ WIDEST: Final = 20
 
 
 def add(
-    app: typer.Typer, command: Callable[..., None], *examples: str, panel: str | None = None, name: str | None = None
+    app: typer.Typer,
+    command: Callable[..., None],
+    *examples: str,
+    panel: str | None = None,
+    name: str | None = None,
+    renamed: Mapping[str, str] | None = None,
 ) -> None:
-    """Register a command in a panel of the list of commands, with examples below its own help."""
-    app.command(name, rich_help_panel=panel, epilog=epilog(*examples))(apart(command))
+    """Register a command in a panel of the list of commands, with examples below its own help.
+
+    A parameter that is a dataclass of settings (`uwblink.settings`) becomes one option a field. `renamed` maps old
+    names of options to what the command answers: "--old is now --new".
+    """
+    kind = type("RenamedCommand", (Command,), {"renamed": renamed}) if renamed else Command
+    app.command(name, cls=kind, rich_help_panel=panel, epilog=epilog(*examples))(apart(with_settings(command)))
+
+
+def with_settings(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that takes the fields of its dataclasses of settings as parameters of their own."""
+    hints = get_type_hints(command, include_extras=True)
+    settings = {name: hints[name] for name in signature(command).parameters if is_dataclass(hints[name])}
+    if not settings:
+        return command
+    parameters = []
+    for name, one in signature(command).parameters.items():
+        if name not in settings:
+            parameters.append(one.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
+            continue
+        types = get_type_hints(settings[name])
+        for field in fields(settings[name]):
+            if field.metadata:
+                parameters.append(_parameter(field, types[field.name]))
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        for name, kind in settings.items():
+            values = {field: given.pop(field.name) for field in fields(kind) if field.metadata}
+            given[name] = kind(**{field.name: _parsed(field, value) for field, value in values.items()})
+        command(**given)
+
+    run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return run
+
+
+def _parameter(field: Field[Any], kind: Any) -> Parameter:
+    """Return the option of a field of settings as a parameter of a command."""
+    how = dict(field.metadata)
+    shown = dict(how["shown"])
+    if how["names"]:
+        shown |= choice(*how["names"], more=how["more"])
+    if how["tags"]:
+        shown["autocompletion"] = tags_of(how["tags"])
+    flag = how["flag"] or f"--{field.name.replace('_', '-')}"
+    default = None if how["parse"] else field.default
+    option = typer.Option(flag, help=how["help"], **shown)
+    typed: Any = how["kind"] or kind
+    return Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[typed, option])
+
+
+def _parsed(field: Field[Any], value: Any) -> Any:
+    parse = field.metadata["parse"]
+    if parse is None:
+        return value
+    return field.default if value in (None, [], ()) else parse(value)
 
 
 def apart(command: Callable[..., None]) -> Callable[..., None]:

@@ -8,9 +8,9 @@ from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from uwblink.cli.guide import apart, epilog, plain
+from uwblink.cli.options import Command, Group
 from uwblink.cli.shared import Force
 from uwblink.cli.waiting import waiting
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Output = Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")]
 
 
-class ImportGroup(TyperGroup):
+class ImportGroup(Group):
     """A group whose commands are the importers, those of other distributions included."""
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -47,7 +47,7 @@ def _command(row: Importer) -> Any:
 
 def _made(name: str, text: str, function: Callable[..., None], example: str) -> Any:
     app = typer.Typer(add_completion=False)
-    app.command(name, help=plain(text), epilog=epilog(example))(apart(function))
+    app.command(name, cls=Command, help=plain(text), epilog=epilog(example))(apart(function))
     return typer.main.get_command(app)
 
 

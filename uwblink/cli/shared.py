@@ -15,11 +15,11 @@ from typing import Annotated, Any, Final, NoReturn
 import typer
 
 from uwblink import __version__
+from uwblink.cli.options import AsJson as AsJson
+from uwblink.cli.options import Force as Force
+from uwblink.cli.options import Group
 from uwblink.cli.starting import INTERRUPTED as INTERRUPTED
 from uwblink.errors import PluginWarning, UwblinkError
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 
 FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--duration"}
 """Parameters of uwblink whose flag is called otherwise; all others are spelt alike, with dashes."""
@@ -41,7 +41,7 @@ MISTAKE: Final = 2
 
 def new_app(text: str) -> typer.Typer:
     """Return a command without sub-commands yet, whose help begins with `text`, and which knows `--version`."""
-    app = typer.Typer(help=text, no_args_is_help=True, pretty_exceptions_enable=False)
+    app = typer.Typer(cls=Group, help=text, no_args_is_help=True, pretty_exceptions_enable=False)
 
     @app.callback(invoke_without_command=True)
     def top(
