@@ -1,0 +1,1 @@
+"""One estimator: unknowns, rows, one loop, one covariance."""

@@ -1,0 +1,134 @@
+"""The one loop: from a start to the top of the log likelihood of all rows and priors.
+
+Steps are Newton's with the information of the rows (squared slopes of a likelihood), shortened or lengthened by how
+much of what their slope promised they kept; the weights of priors that data determine are estimated along.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from calib.estimator.rows import Rows, sum_rows
+from calib.estimator.unknowns import Layout, Priors
+from uwblink.arrays import Floats, Ints
+
+SETTLED = 1e-2
+"""A step that promises less log likelihood than this moves no unknown by more than a tenth of its standard error."""
+
+EVIDENCE_STEPS = 12
+"""Steps in which weights of priors are estimated: they converge as fast as the unknowns do, and then stand."""
+
+CHANGE = 0.05
+"""Relative change of a weight below which it has settled."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimum:
+    """Where a search ended: unknowns `x` (p,), inverse of information and priors, and the rows' own information."""
+
+    layout: Layout
+    priors: Priors
+    x: Floats
+    covariance: Floats
+    information: Floats
+    value: float
+    steps: int
+    success: bool
+
+    def of(self, kind: str) -> Floats:
+        """Return the unknowns of a kind."""
+        return self.x[self.layout.where[kind]]
+
+
+def maximize(
+    rows: Sequence[Rows],
+    priors: Priors,
+    x: Floats,
+    *,
+    steps: int = 60,
+    tolerance: float = SETTLED,
+    evidence_steps: int = EVIDENCE_STEPS,
+    longest: Callable[[Floats], float] | None = None,
+) -> Optimum:
+    """Climb from unknowns (p,) to the likeliest ones; `longest` returns by how much a step (p,) must be shortened.
+
+    A likelihood that falls halves the step. Squared slopes are not quite the curvature: a step to the top keeps half of
+    what its slope promises, one that keeps nearly all was short, and the next one is taken longer.
+    """
+    layout, free = priors.layout, priors.layout.free()
+    best, top, step, shorter, length, promised = -np.inf, x, np.zeros_like(x), 0, 1.0, 0.0
+    sums, covariance = None, np.zeros((len(x),) * 2)
+    for taken in range(1, steps + 1):
+        found = sum_rows(rows, x)
+        value = found.value + priors.value(x)
+        if value < best - tolerance and shorter < 8:
+            step, shorter, promised = 0.3 * step, shorter + 1, 0.0
+            x = top + step
+            continue
+        if promised > 0:
+            kept = (value - best) / promised
+            length = min(2 * length, 8.0) if kept > 0.8 else max(length / 2, 0.25) if kept < 0.3 else length
+        sums, shorter = found, 0
+        covariance = inverse_of(sums.information + priors.precision(), free)
+        slope = sums.gradient + priors.pull(x)
+        step = covariance @ slope
+        gain = float(slope @ step)
+        settled = gain < tolerance
+        if taken <= evidence_steps:
+            before = list(priors.weights)
+            priors.update(x, covariance)
+            moved = [abs(np.log(a / b)) for a, b in zip(priors.weights, before, strict=True)]
+            settled = settled and max(moved, default=0.0) < CHANGE
+            best = sums.value + priors.value(x)
+        else:
+            best = value
+        if settled:
+            return Optimum(
+                layout=layout,
+                priors=priors,
+                x=x,
+                covariance=covariance,
+                information=sums.information,
+                value=value,
+                steps=taken,
+                success=True,
+            )
+        step *= min(length, 1.0 if longest is None else longest(step))
+        promised = float(slope @ step) if taken > evidence_steps else 0.0
+        top, x = x, x + step
+    return Optimum(
+        layout=layout,
+        priors=priors,
+        x=top,
+        covariance=covariance,
+        information=sums.information if sums else covariance,
+        value=best,
+        steps=steps,
+        success=False,
+    )
+
+
+def inverse_of(matrix: Floats, free: Ints) -> Floats:
+    """Return the inverse (p, p) of a positive definite matrix among the free unknowns, zero elsewhere.
+
+    Unknowns are scaled to the same size first; what neither rows nor priors determine is held by a share of 1e-13.
+    """
+    found = np.zeros_like(matrix)
+    if not len(free):
+        return found
+    own = matrix[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.maximum(np.diag(own), 1e-300))
+    unit = own * scale[:, None] * scale
+    unit[np.diag_indices_from(unit)] += 1e-13
+    try:
+        factor = linalg.cho_factor(unit, lower=True, check_finite=False)
+        inverse = linalg.cho_solve(factor, np.eye(len(free)), check_finite=False)
+    except linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(unit)
+        inverse = (vectors / np.maximum(np.abs(values), 1e-13)) @ vectors.T
+    found[np.ix_(free, free)] = inverse * scale[:, None] * scale
+    return found

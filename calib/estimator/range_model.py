@@ -1,0 +1,381 @@
+"""What ranges depend on beside their distances: delays, curves over power, offsets, and what their errors are made of.
+
+`RangeModel.of` makes unknowns and parts of these for any ranges; known distances, surveys and flights share it, and
+differ only in where distances come from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lifted_power, populated
+from calib.errors import BadInputError
+from calib.estimation.pairs import Pairs, pairs_of
+from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
+from calib.estimator.rows import NormalRows
+from calib.estimator.unknowns import Layout, Prior, Unknown
+from calib.ranges import Ranges
+from calib.spread import robust_spread
+from uwblink.arrays import Bools, Floats, Ints
+from uwblink.ticks import SPEED_OF_LIGHT
+
+METRES_A_NS = SPEED_OF_LIGHT * 1e-9
+DELAY_NS = 2.0
+"""How far a delay may be from what was configured, before anything is measured: published ones differ by 0.6 ns."""
+
+CURVE_M = 0.5
+"""How large a bias over power may be: published curves reach 0.2 m (DW1000 user manual, APS011)."""
+
+NOISE_M, NOISE_WORTH = 0.06, 20.0
+"""Noise of a range before anything is measured, and how many ranges that knowledge is worth.
+
+Two stamps of a DW1000 have 0.15 ns each in the open (its user manual, 8.3), 3 to 10 cm of a range.
+"""
+
+SEGMENTS_A_FOLD, SEGMENTS = 4.5, (10, 28)
+"""Pieces of a bias curve where lifted power grows e-fold, and bounds of their number; roughness is estimated, so that
+more change nothing (the study of `make accuracy`)."""
+
+SAME_POWER = 1e-6
+"""Lifted powers that differ by no more are one."""
+
+SHORTEST_DETOUR = 3.0
+"""Least mean of the first kind of detour, in spreads of the residuals: below, it would explain a core that is not
+normal. In a fit without a curve, whose errors follow power, it moves delays by 0.14 ns from 1.8 spreads, and none
+from 2.5."""
+
+ODDS = -2.2
+"""Log odds of a reflection before anything is measured: one range in ten."""
+
+LONG_ODDS = -1.1
+"""Log odds that a reflection is of the longer kind: one in four, between 11 and 48 % in two cases of three."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spline:
+    """Cubic B-splines at lifted powers (n,): the four that are not zero, `values` (n, 4), from number `first` (n,)."""
+
+    knots: Floats
+    values: Floats
+    first: Ints
+
+    @classmethod
+    def at(cls, lifted: Floats, knots: Floats) -> Spline:
+        """Return the splines of `knots` at lifted powers, clamped to their span."""
+        inside = np.clip(lifted, knots[0], knots[-1])
+        values = BSpline.design_matrix(inside, knots, DEGREE).data.reshape(-1, DEGREE + 1)
+        first = np.clip(np.searchsorted(knots, inside, side="right") - 1, DEGREE, len(knots) - DEGREE - 2) - DEGREE
+        return cls(knots=knots, values=values, first=first.astype(np.int32))
+
+    @property
+    def columns(self) -> Ints:
+        """Return the numbers of the four splines (n, 4)."""
+        return np.asarray(self.first[:, None] + np.arange(DEGREE + 1, dtype=np.int32))
+
+    @property
+    def size(self) -> int:
+        """Return the number of splines."""
+        return len(self.knots) - DEGREE - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeModel:
+    """Unknowns and parts of `ranges` (n,), whose curves lie over `lifted` powers between those of `span`.
+
+    `unknowns` hold delays, curves and offsets; `error_unknowns` what errors are made of, begun by `start_errors`.
+    `gauged` are the groups whose curve is zero at `reference`; the others keep a constant that pinned delays fix.
+    """
+
+    ranges: Ranges
+    lifted: Floats
+    powered: Bools
+    span: tuple[float, float]
+    pairs: Pairs
+    tags: list[int]
+    groups: Mapping[str, tuple[int, ...]]
+    curve: Spline | None
+    noise: Spline | None
+    unknowns: tuple[Unknown, ...]
+    parts: tuple[Part, ...]
+    rows: tuple[NormalRows, ...]
+    gauged: tuple[bool, ...]
+    reference: float | None
+    constants: str
+
+    @classmethod
+    def of(  # noqa: PLR0913 - keyword-only settings of one fit
+        cls,
+        ranges: Ranges,
+        *,
+        lift: str,
+        alpha_dbm: float,
+        fixed_ns: Mapping[int, float],
+        groups: Mapping[str, tuple[int, ...]],
+        curve: bool,
+        constants: str = "tag",
+        reference: float | None = 1.0,
+        offsets: bool = True,
+        trimmed: bool = True,
+    ) -> RangeModel:
+        """Return the model of ranges; `reference` is the lifted power at which curves are zero, if they are.
+
+        With `trimmed`, ranges at the half per cent of powers at either end are left out: what a curve is there is not
+        for them to say. Raises `BadInputError` for tags and groups that are not in the ranges.
+        """
+        lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
+        powered = np.isfinite(lifted)
+        # What has no power stands at the middle of the others, where it bends nothing.
+        lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
+        ordered = np.sort(lifted)
+        low, high = populated(ordered)
+        varied = high - low > SAME_POWER
+        curve = curve and varied
+        if curve and trimmed:
+            inside = (lifted >= low) & (lifted <= high)
+            ranges, lifted, powered = ranges[inside], lifted[inside], powered[inside]
+            ordered = ordered[np.searchsorted(ordered, low) : np.searchsorted(ordered, high, side="right")]
+        tags = ranges.tags()
+        _check_tags(ranges, tags, fixed_ns, groups)
+        pairs = pairs_of(ranges.initiator, ranges.target, tags)
+        unknowns, parts = _constants(ranges, pairs, tags, fixed_ns, constants)
+        bias = noise = None
+        rows: list[NormalRows] = []
+        gauged: list[bool] = []
+        if curve:
+            bias = Spline.at(lifted, _knots(ordered, low, high))
+            for name, share in _shares(ranges, groups):
+                kind = f"curve {name}".strip()
+                unknowns.append(_curve(kind, bias))
+                values = -bias.values if share is None else -share[:, None] * bias.values
+                parts.append(Part(parameter=RESIDUAL, kind=kind, columns=bias.columns, values=values))
+                gauged.append(constants == "pair" or _delays_absorb(pairs, tags, fixed_ns, groups.get(name)))
+        if powered.all() and varied:
+            noise = Spline.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
+        if offsets:
+            _add_offsets(ranges, pairs, tags, unknowns, parts)
+        return cls(
+            ranges=ranges,
+            lifted=lifted,
+            powered=powered,
+            span=(low, high),
+            pairs=pairs,
+            tags=tags,
+            groups=groups,
+            curve=bias,
+            noise=noise,
+            unknowns=tuple(unknowns),
+            parts=tuple(parts),
+            rows=tuple(rows),
+            gauged=tuple(gauged),
+            reference=reference,
+            constants=constants,
+        )
+
+    def curve_kinds(self) -> list[str]:
+        """Return the kinds of unknowns that are curves, one a group."""
+        return [block.kind for block in self.unknowns if block.kind.split(" ")[0] == "curve"]
+
+    def key(self) -> Ints:
+        """Return numbers (n,) of which equal ones stand for the same unknowns."""
+        key = self.pairs.number.astype(np.int64)
+        if self.ranges.sessions[1:]:
+            key = key * (int(self.ranges.session.max()) + 1) + self.ranges.session
+        for spline in (self.curve, self.noise):
+            if spline is not None:
+                key = key * spline.size + spline.first
+        return key
+
+    def gauge_rows(self, layout: Layout) -> list[NormalRows]:
+        """Return rows that hold curves at zero at the reference power, where delays make up for a constant."""
+        if self.curve is None or self.reference is None:
+            return []
+        at = Spline.at(np.array([self.reference]), self.curve.knots)
+        return [
+            NormalRows(
+                value=np.zeros(1),
+                std=np.full(1, 1e-5),
+                entries=at.values,
+                columns=at.columns + layout.where[kind].start,
+            )
+            for kind, gauged in zip(self.curve_kinds(), self.gauged, strict=True)
+            if gauged
+        ]
+
+    def error_model(self, residual: Floats) -> tuple[Errors, tuple[Unknown, ...], tuple[Part, ...]]:
+        """Return the mixture with its unknowns and parts, begun at robust spreads of residuals (n,)."""
+        spread = max(robust_spread(residual), 1e-3)
+        names = tuple(f"{a}-{b}" for a, b in self.pairs.ends.tolist())
+        everyone = np.zeros((1, 1), dtype=np.int64)
+        by_pair = self.pairs.number[:, None]
+        unknowns = [
+            _scalar(
+                "noise level", np.log(0.9 * spread), Prior.of_deviation((2 * NOISE_WORTH) ** -0.5, np.log(NOISE_M))
+            ),
+            _scalar("odds level", ODDS, Prior.of_deviation(2.0, ODDS)),
+            _scalar("detour level", np.log(spread), Prior.of_deviation(1.0, np.log(spread))),
+            _scalar("least detour", np.log(0.5 * spread), Prior.of_deviation(2**0.5, np.log(0.5 * spread))),
+            _scalar("outliers", -6.0, Prior.of_deviation(3.0, -6.0)),
+            _scalar("long detours", LONG_ODDS, Prior.of_deviation(1.0, LONG_ODDS)),
+            _of_pairs("noise of pair", names, (0.1, 0.01, 2.0)),
+            _of_pairs("odds of pair", names, (0.7, 0.03, 2.0)),
+            _of_pairs("detour of pair", names, (0.2, 0.03, 0.7)),
+        ]
+        level = (("noise", "noise level"), ("odds", "odds level"), ("detour", "detour level"))
+        alone = (("least", "least detour"), ("outliers", "outliers"), ("long", "long detours"))
+        parts = [Part(parameter=name, kind=kind, columns=everyone) for name, kind in (*level, *alone)]
+        parts += [Part(parameter=name, kind=f"{name} of pair", columns=by_pair) for name, _ in level]
+        if self.noise is not None:
+            rough = curvature(self.noise.knots)
+            several = tuple(map(str, range(self.noise.size)))
+            start = np.zeros(self.noise.size)
+            unknowns += [
+                Unknown(
+                    kind="noise curve",
+                    names=several,
+                    start=start,
+                    priors=(Prior(weight=1.0, structure=rough, bounds=(1e-3, 1e6)), Prior.of_deviation(1.0)),
+                ),
+                Unknown(
+                    kind="odds curve",
+                    names=several,
+                    start=start,
+                    priors=(Prior(weight=1.0, structure=rough, bounds=(1e-3, 1e6)), Prior.of_deviation(0.7)),
+                ),
+            ]
+            parts += [
+                Part(parameter=name, kind=f"{name} curve", columns=self.noise.columns, values=self.noise.values)
+                for name in ("noise", "odds")
+            ]
+        return Mixture(shortest_m=SHORTEST_DETOUR * spread), tuple(unknowns), tuple(parts)
+
+    def build(
+        self,
+        residual: Floats,
+        errors: Errors,
+        more: Sequence[Unknown] = (),
+        parts: Sequence[Part] = (),
+        geometry: Geometry | None = None,
+        only: Sequence[str] | None = None,
+    ) -> tuple[Layout, RangeRows]:
+        """Return the layout of all unknowns and the rows of ranges with such residuals (n,) less unknown distances."""
+        unknowns = [u for u in self.unknowns if only is None or u.kind in only]
+        kinds = {u.kind for u in unknowns}
+        layout = Layout((*unknowns, *more))
+        used = [*(p for p in self.parts if p.kind in kinds), *parts]
+        return layout, RangeRows.of(residual, self.key(), used, errors, layout, geometry)
+
+
+def _scalar(kind: str, start: float, prior: Prior) -> Unknown:
+    return Unknown(kind=kind, names=("",), start=np.array([start]), priors=(prior,))
+
+
+def _of_pairs(kind: str, names: tuple[str, ...], spread: tuple[float, float, float]) -> Unknown:
+    return Unknown(kind=kind, names=names, start=np.zeros(len(names)), priors=(Prior.of_spread(*spread),))
+
+
+def _constants(
+    ranges: Ranges, pairs: Pairs, tags: list[int], fixed_ns: Mapping[int, float], constants: str
+) -> tuple[list[Unknown], list[Part]]:
+    """Return delays of tags, or constants of pairs, in ns."""
+    if constants == "pair":
+        names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
+        values = np.full((len(ranges), 1), METRES_A_NS)
+        block = Unknown(kind="delay", names=names, start=np.zeros(len(names)), priors=(Prior.of_deviation(DELAY_NS),))
+        return [block], [Part(parameter=RESIDUAL, kind="delay", columns=pairs.number[:, None], values=values)]
+    known = np.array([tag in fixed_ns for tag in tags])
+    start = np.array([fixed_ns.get(tag, 0.0) for tag in tags])
+    block = Unknown(
+        kind="delay", names=tuple(map(str, tags)), start=start, known=known, priors=(Prior.of_deviation(DELAY_NS),)
+    )
+    columns = np.searchsorted(tags, pairs.ends)[pairs.number]
+    lower_first = (ranges.initiator < ranges.target)[:, None]
+    weights = np.column_stack([ranges.weight_initiator, ranges.weight_target])
+    values = METRES_A_NS * np.where(lower_first, weights, weights[:, ::-1])
+    return [block], [Part(parameter=RESIDUAL, kind="delay", columns=columns, values=values)]
+
+
+def _curve(kind: str, spline: Spline) -> Unknown:
+    rough = Prior(weight=1e2, structure=curvature(spline.knots), bounds=(1e-3, 1e9))
+    return Unknown(
+        kind=kind,
+        names=tuple(map(str, range(spline.size))),
+        start=np.zeros(spline.size),
+        scale=CURVE_M,
+        priors=(rough, Prior.of_deviation(CURVE_M)),
+    )
+
+
+OFFSETS = (0.01, 1e-4, 1.0)
+"""Standard deviation of what else is constant in the ranges of a pair, such as a wall: start, least and most, m."""
+
+
+def _add_offsets(ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[Unknown], parts: list[Part]) -> None:
+    """Add what is constant in the ranges of a pair, and of pairs and tags in one of several sessions."""
+    names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
+    number = pairs.number[:, None]
+    unknowns.append(_of_pairs("offset of pair", names, OFFSETS))
+    parts.append(Part(parameter=RESIDUAL, kind="offset of pair", columns=number))
+    count = len(ranges.sessions)
+    if count < 2:
+        return
+    session = ranges.session[:, None].astype(np.int64)
+    ends = np.searchsorted(tags, pairs.ends)[pairs.number]
+    for kind, whose, columns, values in (
+        ("offset of pair in session", names, number * count + session, None),
+        ("offset of tag in session", tuple(map(str, tags)), ends * count + session, np.full((len(ranges), 2), 0.5)),
+    ):
+        several = tuple(f"{name} in {where}" for name in whose for where in ranges.sessions)
+        unknowns.append(_of_pairs(kind, several, OFFSETS))
+        parts.append(Part(parameter=RESIDUAL, kind=kind, columns=columns.astype(np.int32), values=values))
+
+
+def _check_tags(
+    ranges: Ranges, tags: list[int], fixed: Mapping[int, float], groups: Mapping[str, tuple[int, ...]]
+) -> None:
+    unknown = sorted(set(fixed) - set(tags))
+    if unknown:
+        raise BadInputError(f"found tag {unknown[0]}, the tags are {', '.join(map(str, tags))}", parameter="fixed_ns")
+    member = {tag for own in groups.values() for tag in own}
+    lonely = [tag for tag in tags if groups and tag not in member]
+    if lonely:
+        raise BadInputError(f"tag {lonely[0]} is in no group; the groups are {', '.join(groups)}", parameter="groups")
+    unused = [name for name, own in groups.items() if not set(own) & set(tags)]
+    if unused:
+        raise BadInputError(f"no tag of group {unused[0]!r} ranges in {ranges.source}", parameter="groups")
+
+
+def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple[str, Floats | None]]:
+    """Return for each group its share of the curve in each range (n,): a half for each end; None for all of it."""
+    if not groups:
+        return [("", None)]
+    return [
+        (name, 0.5 * np.isin(ranges.initiator, own) + 0.5 * np.isin(ranges.target, own)) for name, own in groups.items()
+    ]
+
+
+def _delays_absorb(pairs: Pairs, tags: list[int], fixed: Mapping[int, float], group: tuple[int, ...] | None) -> bool:
+    """Return whether delays that are free can make up for a constant of a group's curve."""
+    free = [tag for tag in tags if tag not in fixed]
+    if not free:
+        return False
+    aim = np.ones(len(pairs.ends)) if group is None else 0.5 * np.isin(pairs.ends, group).sum(axis=1)
+    ends = 0.5 * (pairs.ends[:, :, None] == np.array(free)).sum(axis=1)
+    left = aim - ends @ np.linalg.lstsq(ends, aim, rcond=None)[0]
+    return bool(left @ left < 1e-4 * (aim @ aim))
+
+
+def _knots(ordered: Floats, low: float, high: float) -> Floats:
+    """Return clamped knots from `low` to `high`, halfway between equal counts and equal lengths, both of square roots.
+
+    Curves are steep where lifted power is small: there the roots lie dense, and few ranges do not spread them.
+    """
+    segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *SEGMENTS))
+    counts = np.interp(np.linspace(0, len(ordered) - 1, segments + 1), np.arange(len(ordered)), ordered)
+    roots = np.sqrt(np.clip(counts, low, high)) + np.linspace(np.sqrt(low), np.sqrt(high), segments + 1)
+    inner = roots**2 / 4
+    inner[[0, -1]] = low, high
+    return np.concatenate([[low] * DEGREE, inner, [high] * DEGREE])

@@ -1,0 +1,264 @@
+"""Ranges as rows: an error density for each range, whose parameters are sums of unknowns times known weights.
+
+The residual of a range (measured less predicted, with what is unknown of delays, curve and offsets), the logarithm of
+its noise, the log odds that it is reflected and the logarithm of the detour are such sums. What else a range may depend
+on is one more `Part` of one of them: an unknown for each tag, pair, session, direction or degree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from calib.estimator.rows import ROWS_AT_ONCE, Terms
+from calib.estimator.unknowns import Layout
+from calib.range_errors.density import OUTLIERS_OVER_M, error_slopes
+from uwblink.arrays import Floats, Ints
+
+RESIDUAL = "residual"
+"""The parameter that delays, curves and offsets add to."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A share of one parameter of each range: the unknowns `columns` (n, k) of a `kind` times `values` (n, k).
+
+    Columns count within the kind's block. `values` None stands for 1. Ranges with the same `key` have the same columns.
+    """
+
+    parameter: str
+    kind: str
+    columns: Ints
+    values: Floats | None = None
+
+
+class Geometry(Protocol):
+    """Distances that are unknown: of places that are searched for, of bodies that move."""
+
+    columns: Ints
+    """Indices (n, k) into all unknowns that each distance depends on."""
+
+    def distances(self, x: Floats, rows: Ints) -> tuple[Floats, Floats]:
+        """Return the distances (m,) of some ranges at unknowns (p,), metres, and their derivatives (m, k)."""
+        ...
+
+
+class Errors(Protocol):
+    """What errors are made of, as a density of residuals."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Return which parameters it has beside the residual, for which there are parts."""
+        ...
+
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
+        """Return log densities (n,), slopes by each parameter (n,) and what a residual tells (n,), or None.
+
+        None stands for the square of the slope.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mixture:
+    """Direct, reflected or an outlier (`calib.range_errors.density`): the likelihood of ranges."""
+
+    shortest_m: float
+    span_m: float = OUTLIERS_OVER_M
+    parameters: tuple[str, ...] = ("noise", "odds", "detour", "least", "outliers", "long")
+
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
+        """Return log densities (n,) and slopes by each parameter (n,)."""
+        found = error_slopes(values[RESIDUAL], values, shortest_m=self.shortest_m, span_m=self.span_m)
+        return found.log_density, found.by, None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Robust:
+    """A robust loss of residuals over `scale_m`; `weights` maps residuals over scale to weights and slopes.
+
+    With `reweighted` what a residual tells is its weight, which descends from anywhere; else the loss's curvature.
+    """
+
+    weights: Callable[[Floats], tuple[Floats, Floats]]
+    scale_m: float
+    reweighted: bool = True
+    parameters: tuple[str, ...] = ()
+
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
+        """Return minus half the weighted squares (n,), the slope by the residual (n,) and what each tells (n,)."""
+        u = values[RESIDUAL] / self.scale_m
+        weight, slope = self.weights(u)
+        tells = (weight if self.reweighted else slope) / self.scale_m**2
+        return -0.5 * weight * u * u, {RESIDUAL: -weight * u / self.scale_m}, tells
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeRows:
+    """Ranges whose residuals are `residual` (n,) plus the parts of the unknowns, less what `geometry` makes of them.
+
+    Rows are kept sorted by `key`; `order` (n,) says which of the given rows each is.
+    """
+
+    residual: Floats
+    errors: Errors
+    layout: Layout
+    order: Ints
+    starts: Ints
+    parts: tuple[Part, ...]
+    geometry: Geometry | None = None
+
+    @classmethod
+    def of(
+        cls,
+        residual: Floats,
+        key: Ints,
+        parts: Sequence[Part],
+        errors: Errors,
+        layout: Layout,
+        geometry: Geometry | None = None,
+    ) -> RangeRows:
+        """Return rows from residuals (n,) and keys (n,), given in any order."""
+        order = np.argsort(key, kind="stable")
+        ordered = key[order]
+        steps = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1
+        starts = np.concatenate([[0], steps, [len(order)]])
+        long = np.diff(starts) > ROWS_AT_ONCE
+        if long.any():
+            more = [np.arange(a, b, ROWS_AT_ONCE) for a, b in zip(starts[:-1][long], starts[1:][long], strict=True)]
+            starts = np.unique(np.concatenate([starts, *more]))
+        kept = tuple(_sorted(part, order, starts) for part in parts)
+        return cls(
+            residual=residual[order],
+            errors=errors,
+            layout=layout,
+            order=order,
+            starts=starts,
+            parts=kept,
+            geometry=geometry,
+        )
+
+    def with_errors(self, errors: Errors, layout: Layout) -> RangeRows:
+        """Return the same rows under another density of errors."""
+        return replace(self, errors=errors, layout=layout)
+
+    def __len__(self) -> int:
+        """Return the number of ranges."""
+        return len(self.residual)
+
+    def sample(self, chosen: Ints) -> RangeRows:
+        """Return some of the given rows."""
+        keep = np.zeros(len(self), dtype=bool)
+        keep[chosen] = True
+        rows = np.flatnonzero(keep[self.order])
+        starts = np.searchsorted(rows, self.starts)
+        there = np.diff(starts) > 0
+        parts = tuple(
+            replace(
+                part,
+                columns=part.columns if len(part.columns) == 1 else part.columns[there],
+                values=None if part.values is None else np.ascontiguousarray(part.values[:, rows]),
+            )
+            for part in self.parts
+        )
+        return replace(
+            self,
+            residual=self.residual[rows],
+            order=self.order[rows],
+            starts=np.append(starts[:-1][there], len(rows)),
+            parts=parts,
+        )
+
+    def terms(self, x: Floats) -> Iterator[Terms]:
+        """Yield all ranges, some blocks at a time."""
+        for blocks, rows, values, moved in self._pieces(x):
+            log_density, by, tells = self.errors.slopes(values)
+            yield self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
+
+    def residuals(self, x: Floats) -> Floats:
+        """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""
+        found = np.concatenate([values[RESIDUAL] for _, _, values, _ in self._pieces(x, (RESIDUAL,))])
+        return found[np.argsort(self.order)]
+
+    def values(self, x: Floats) -> dict[str, Floats]:
+        """Return every parameter of every range (n,), in the order in which rows were given."""
+        found = {name: np.empty(len(self)) for name in (RESIDUAL, *self.errors.parameters)}
+        for _, rows, values, _ in self._pieces(x):
+            for name, column in found.items():
+                column[self.order[rows]] = values[name]
+        return found
+
+    def _pieces(self, x: Floats, only: tuple[str, ...] = ()) -> Iterator[tuple[slice, slice, dict[str, Floats], Any]]:
+        """Yield blocks, rows, parameters and derivatives of distances, for as many rows as are worked on at once."""
+        names = only or (RESIDUAL, *self.errors.parameters)
+        edges, first = self.starts, 0
+        while first < len(edges) - 1:
+            last = max(int(np.searchsorted(edges, edges[first] + ROWS_AT_ONCE, side="right")) - 1, first + 1)
+            blocks, rows = slice(first, last), slice(int(edges[first]), int(edges[last]))
+            counts = np.diff(edges[first : last + 1])
+            values: dict[str, Any] = dict.fromkeys(names, 0.0)
+            values[RESIDUAL] = self.residual[rows]
+            for part in self.parts:
+                if part.parameter in names:
+                    values[part.parameter] = values[part.parameter] + self._sum(part, x, blocks, rows, counts)
+            moved = None
+            if self.geometry is not None:
+                distance, moved = self.geometry.distances(x, self.order[rows])
+                values[RESIDUAL] = values[RESIDUAL] - distance
+            yield blocks, rows, values, moved
+            first = last
+
+    def _sum(self, part: Part, x: Floats, blocks: slice, rows: slice, counts: Ints) -> Floats:
+        own = x[self.layout.where[part.kind]]
+        if part.columns.shape[0] == 1 and part.values is None:
+            return np.asarray(own[part.columns[0]])
+        unknown = own[part.columns[blocks]]
+        if part.values is None:
+            return np.repeat(unknown.sum(axis=1), counts)
+        found = np.zeros(rows.stop - rows.start)
+        for weights, value in zip(unknown.T, part.values[:, rows], strict=True):
+            found += np.repeat(weights, counts) * value
+        return found
+
+    def _as_terms(
+        self, blocks: slice, rows: slice, value: float, by: dict[str, Floats], tells: Floats | None, moved: Any
+    ) -> Terms:
+        count, several = rows.stop - rows.start, blocks.stop - blocks.start
+        parts = [part for part in self.parts if part.parameter in by]
+        columns = [
+            np.broadcast_to(part.columns + self.layout.where[part.kind].start, (1, part.columns.shape[1]))
+            if len(part.columns) == 1
+            else part.columns[blocks] + self.layout.where[part.kind].start
+            for part in parts
+        ]
+        columns = [np.broadcast_to(own, (several, own.shape[1])) for own in columns]
+        entries = [np.ones((1, count)) if part.values is None else part.values[:, rows] for part in parts]
+        slopes = [by[part.parameter] * own for part, own in zip(parts, entries, strict=True)]
+        starts = self.starts[blocks.start : blocks.stop + 1] - rows.start
+        if moved is not None and self.geometry is not None:
+            own = self.geometry.columns[self.order[rows]]
+            columns = [np.repeat(one, np.diff(starts), axis=0) for one in columns] + [own]
+            starts = np.arange(count + 1)
+            entries.append(-moved.T)
+            slopes.append(by[RESIDUAL] * entries[-1])
+        stacked = np.concatenate(slopes)
+        told = None if tells is None else np.concatenate(entries)
+        return Terms(
+            value=value,
+            slopes=stacked,
+            columns=np.concatenate(columns, axis=1),
+            starts=starts,
+            weight=tells,
+            entries=told,
+        )
+
+
+def _sorted(part: Part, order: Ints, starts: Ints) -> Part:
+    """Return a part in the rows' own order, with columns by block; one row of columns serves all ranges."""
+    if len(part.columns) == 1:
+        return part
+    values = None if part.values is None else np.ascontiguousarray(part.values[order].T)
+    return replace(part, columns=part.columns[order[starts[:-1]]], values=values)

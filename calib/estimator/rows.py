@@ -1,0 +1,150 @@
+"""Rows of a fit: what was measured, as a log likelihood with its slopes by the unknowns.
+
+A kind of row is a class with a method `terms` that yields, for some rows at a time, their log likelihood and slopes.
+All else (the search, the covariance, score tests) sums over these. Ranges are one kind (`calib.estimator.range_rows`);
+measurements with normal errors (tapes, anchors, poses, heights) are the other, `NormalRows`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy import sparse
+
+from calib.estimator.unknowns import Layout
+from uwblink.arrays import Floats, Ints
+
+ROWS_AT_ONCE = 16_384
+"""Rows that are worked on together, so that what leads to sums stays in the processor's cache."""
+
+LONG_BLOCKS = 8
+"""Rows a block from which a dense product for each block is faster than a sparse one of all rows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Terms:
+    """Some rows (n,) of which each touches K unknowns: blocks of rows that follow each other touch the same ones.
+
+    `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K); `starts`
+    (blocks + 1,) bound the blocks. What rows know of the unknowns is the sum of `weight` (n,) times outer squares of
+    `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974).
+    """
+
+    value: float
+    slopes: Floats
+    columns: Ints
+    starts: Ints
+    weight: Floats | None = None
+    entries: Floats | None = None
+
+    def as_matrix(self, values: Floats, size: int) -> sparse.csr_matrix:
+        """Return values (K, n) at the rows' columns as a sparse matrix (n, size)."""
+        count = values.shape[1]
+        columns = np.repeat(self.columns, np.diff(self.starts), axis=0)
+        bounds = np.arange(count + 1) * len(values)
+        return sparse.csr_matrix((values.T.ravel(), columns.ravel(), bounds), shape=(count, size))
+
+
+class Rows(Protocol):
+    """A kind of row."""
+
+    def terms(self, x: Floats) -> Iterable[Terms]:
+        """Yield all rows at unknowns (p,), some at a time."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Sums:
+    """Log likelihood of all rows, its slope (p,), and what the rows know of the unknowns (p, p)."""
+
+    value: float
+    gradient: Floats
+    information: Floats
+
+
+def sum_rows(rows: Sequence[Rows], x: Floats, *, information: bool = True) -> Sums:
+    """Sum over all rows at unknowns (p,); without `information` that is zero."""
+    size, value = len(x), 0.0
+    gradient, square = np.zeros(size), np.zeros(size * size if information else 0)
+    loose: list[sparse.csr_matrix] = []
+    for kind in rows:
+        for terms in kind.terms(x):
+            value += terms.value
+            sums = np.add.reduceat(terms.slopes, terms.starts[:-1], axis=1)
+            gradient += np.bincount(terms.columns.ravel(), sums.T.ravel(), size)
+            if not information:
+                continue
+            entries = terms.slopes if terms.entries is None else terms.entries
+            weighed = entries if terms.weight is None else entries * terms.weight
+            if entries.shape[1] >= LONG_BLOCKS * len(terms.columns):
+                products = _block_products(weighed, entries, terms.starts)
+                place = terms.columns[:, :, None] * size + terms.columns[:, None, :]
+                np.add.at(square, place.ravel(), products.ravel())
+            else:
+                loose.append(terms.as_matrix(weighed, size).T @ terms.as_matrix(entries, size))
+    found = square.reshape((size, size) if information else (0, 0))
+    for part in loose:
+        found += part.toarray()
+    return Sums(value, gradient, found)
+
+
+def _block_products(left: Floats, right: Floats, starts: Ints) -> Floats:
+    bounds = starts.tolist()
+    found = np.empty((len(bounds) - 1, len(left), len(left)))
+    for k in range(len(bounds) - 1):
+        own = slice(bounds[k], bounds[k + 1])
+        np.matmul(left[:, own], right[:, own].T, out=found[k])
+    return found
+
+
+def projected(rows: Rows, x: Floats, reach: Floats) -> Iterator[Floats]:
+    """Yield the slopes of rows times `reach` (p, k), (n, k) for some rows at a time: how each pulls k combinations."""
+    for terms in rows.terms(x):
+        counts = np.diff(terms.starts)
+        found = np.zeros((terms.slopes.shape[1], reach.shape[1]))
+        for slope, column in zip(terms.slopes, terms.columns.T, strict=True):
+            found += slope[:, None] * np.repeat(reach[column], counts, axis=0)
+        yield found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NormalRows:
+    """Linear measurements with normal errors: `value` (n,) = sum of `entries` (n, K) times the unknowns, +- `std` (n,).
+
+    `columns` (n, K) are indices into all unknowns. A kind that is not linear is a class of its own that yields `Terms`.
+    """
+
+    value: Floats
+    std: Floats
+    entries: Floats
+    columns: Ints
+
+    def terms(self, x: Floats) -> Iterator[Terms]:
+        """Yield all rows."""
+        if len(self.value):
+            left = self.value - np.sum(self.entries * x[self.columns], axis=1)
+            yield normal_terms(left, self.std, self.entries.T, self.columns)
+
+
+def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -> Terms:
+    """Return rows with normal errors from what is `left` (n,): measured less predicted.
+
+    `derivative` (K, n) is that of the prediction by the unknowns `columns` (n, K), `std` (n,) the standard deviations.
+    """
+    z = left / std
+    return Terms(
+        value=-0.5 * float(z @ z),
+        slopes=derivative * (z / std),
+        columns=columns,
+        starts=np.arange(len(left) + 1),
+        entries=derivative / std,
+    )
+
+
+def matrix_of(rows: Sequence[Rows], x: Floats, layout: Layout) -> sparse.csr_matrix:
+    """Return the slopes of all rows (n, p) as one sparse matrix, for tests and small problems."""
+    parts = [terms.as_matrix(terms.slopes, layout.size) for kind in rows for terms in kind.terms(x)]
+    return sparse.csr_matrix(sparse.vstack(parts))

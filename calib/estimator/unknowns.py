@@ -1,0 +1,178 @@
+"""The unknowns of a fit: blocks of numbers of one kind, what is known of them beforehand, and where they stand.
+
+A block is a named vector with a start, a scale (how far an ignorant guess is off, by which `calib.information.judge`
+decides what data determine), and Gaussian priors. The weight of a prior may be estimated with the unknowns, by the
+fixed point of Fellner and Schall as Wood and Fasiolo (Biometrics 2017) generalise it: the roughness of a curve, the
+variance of offsets between pairs and between sessions, and the spread of error models between pairs are one mechanism.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import sparse
+
+from calib.errors import BadInputError
+from calib.information import Unknown as NamedUnknown
+from uwblink.arrays import Bools, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prior:
+    """A Gaussian prior with the precision `weight` times `structure` (k, k), about `centre` (k,).
+
+    `structure` None is the identity. With `bounds` the weight is estimated between them, starting at `weight`.
+    """
+
+    weight: float
+    structure: Floats | None = None
+    centre: Floats | float = 0.0
+    bounds: tuple[float, float] | None = None
+
+    @classmethod
+    def of_deviation(cls, deviation: float, centre: Floats | float = 0.0) -> Prior:
+        """Return independent priors with one standard deviation."""
+        return cls(weight=deviation**-2, centre=centre)
+
+    @classmethod
+    def of_spread(cls, start: float, least: float, most: float) -> Prior:
+        """Return independent priors about zero, whose standard deviation is estimated between `least` and `most`."""
+        return cls(weight=start**-2, bounds=(most**-2, least**-2))
+
+    @property
+    def rank(self) -> int | None:
+        """Return the rank of the structure, None for the identity."""
+        return None if self.structure is None else int(np.linalg.matrix_rank(self.structure, hermitian=True))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unknown:
+    """A block of unknowns: `names` (k,) say of what each is, `start` (k,) where a search begins.
+
+    `known` (k,) marks those that keep their start. `scale` is what a guess without any data is good to.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    start: Floats
+    priors: tuple[Prior, ...] = ()
+    scale: float = 1.0
+    known: Bools | None = None
+
+    def __post_init__(self) -> None:
+        """Raise `BadInputError` where start and names differ in length."""
+        if len(self.start) != len(self.names):
+            raise BadInputError(f"{self.kind}: {len(self.start)} values for {len(self.names)} names")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Blocks of unknowns side by side in one vector of `size` numbers."""
+
+    blocks: tuple[Unknown, ...]
+    where: dict[str, slice] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Lay the blocks out; raises `BadInputError` where two are of one kind."""
+        where: dict[str, slice] = {}
+        at = 0
+        for block in self.blocks:
+            if block.kind in where:
+                raise BadInputError(f"two blocks of unknowns are called {block.kind!r}")
+            where[block.kind] = slice(at, at + len(block.start))
+            at += len(block.start)
+        object.__setattr__(self, "where", where)
+
+    @property
+    def size(self) -> int:
+        """Return the number of unknowns."""
+        return sum(len(block.start) for block in self.blocks)
+
+    def start(self) -> Floats:
+        """Return where a search begins (p,)."""
+        return np.concatenate([np.asarray(block.start, dtype=np.float64) for block in self.blocks])
+
+    def free(self) -> Ints:
+        """Return the indices of the unknowns that are not known already."""
+        known = [np.zeros(len(b.start), bool) if b.known is None else b.known for b in self.blocks]
+        return np.flatnonzero(~np.concatenate(known))
+
+    def indices(self, kinds: Sequence[str]) -> Ints:
+        """Return the indices of some kinds, in the order given; kinds that are not there have none."""
+        found = [np.arange(self.where[kind].start, self.where[kind].stop) for kind in kinds if kind in self.where]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *found])
+
+    def named(self) -> list[NamedUnknown]:
+        """Return every unknown with its name and scale, for `calib.information.judge`."""
+        return [NamedUnknown(block.kind, name, block.scale) for block in self.blocks for name in block.names]
+
+
+class Priors:
+    """The priors of a layout with their present weights."""
+
+    def __init__(self, layout: Layout, weights: Sequence[float] | None = None) -> None:
+        """Take the priors' own weights, or others in the order of blocks and priors."""
+        self.layout = layout
+        self.all = [(layout.where[block.kind], prior) for block in layout.blocks for prior in block.priors]
+        self.weights = [prior.weight for _, prior in self.all] if weights is None else list(weights)
+        self._ranks = [prior.rank for _, prior in self.all]
+
+    def precision(self) -> Floats:
+        """Return the precision of all priors (p, p)."""
+        found = np.zeros((self.layout.size,) * 2)
+        for weight, (where, prior) in zip(self.weights, self.all, strict=True):
+            found[where, where] += weight * _structure(prior, where)
+        return found
+
+    def sparse_precision(self) -> sparse.csc_matrix:
+        """Return the same as a sparse matrix, for many unknowns."""
+        blocks = {block.kind: sparse.csc_matrix((len(block.start),) * 2) for block in self.layout.blocks}
+        at = iter(self.weights)
+        for block in self.layout.blocks:
+            for prior in block.priors:
+                own = sparse.eye(len(block.start)) if prior.structure is None else sparse.csc_matrix(prior.structure)
+                blocks[block.kind] = blocks[block.kind] + next(at) * own
+        return sparse.csc_matrix(sparse.block_diag(list(blocks.values()), format="csc"))
+
+    def value(self, x: Floats) -> float:
+        """Return the log density of the priors at unknowns (p,), less its constant."""
+        found = 0.0
+        for weight, (where, prior) in zip(self.weights, self.all, strict=True):
+            away = x[where] - prior.centre
+            found -= 0.5 * weight * float(away @ _times(prior, away))
+        return found
+
+    def pull(self, x: Floats) -> Floats:
+        """Return the slope of the log density of the priors at unknowns (p,)."""
+        found = np.zeros(len(x))
+        for weight, (where, prior) in zip(self.weights, self.all, strict=True):
+            found[where] -= weight * _times(prior, x[where] - prior.centre)
+        return found
+
+    def update(self, x: Floats, covariance: Floats) -> None:
+        """Estimate the weights that may be, from unknowns (p,) and their covariance (p, p)."""
+        for k, (where, prior) in enumerate(self.all):
+            if prior.bounds is None:
+                continue
+            own, away = covariance[where, where], x[where] - prior.centre
+            structure = _structure(prior, where)
+            rank = len(away) if self._ranks[k] is None else self._ranks[k]
+            used = max(float(rank or 0) - self.weights[k] * float(np.sum(own * structure)), 1e-2)
+            size = max(float(away @ structure @ away), 1e-300)
+            self.weights[k] = float(np.clip(used / size, *prior.bounds))
+
+    def deviation(self, kind: str) -> float:
+        """Return the standard deviation that the last prior of a kind has now."""
+        where = self.layout.where[kind]
+        weights = [weight for weight, (own, _) in zip(self.weights, self.all, strict=True) if own == where]
+        return float(weights[-1] ** -0.5)
+
+
+def _structure(prior: Prior, where: slice) -> Floats:
+    return np.eye(where.stop - where.start) if prior.structure is None else prior.structure
+
+
+def _times(prior: Prior, values: Floats) -> Floats:
+    return values if prior.structure is None else np.asarray(prior.structure @ values)

@@ -1,0 +1,1 @@
+"""The one model of what a range's error is made of."""
