@@ -128,8 +128,8 @@ def simulating(*settings: str, passive: bool = False, contention: bool = True) -
 
 def fitting(recording: Path) -> float:
     """Return the time to fit what is already in memory, in seconds."""
+    from calib.data.sources import load_ranges
     from calib.estimation.fitting import fit
-    from calib.sources import load_ranges
 
     ranges = load_ranges(recording)
     return timed(lambda: fit(ranges))

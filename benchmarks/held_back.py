@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import calib
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 
 Floats = NDArray[np.float64]
 Chosen = NDArray[np.bool_]

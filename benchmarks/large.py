@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from calib.ranges import Ranges
+    from calib.data.ranges import Ranges
 
 SIZES = (38_000, 380_000, 3_800_000)
 RATE_HZ = 160
@@ -80,7 +80,7 @@ def peak_mb() -> float:
 
 def flight(size: int):  # type: ignore[no-untyped-def]
     """Return poses, tags and ranges of three bodies with two tags each, with planted delays, curve and tail."""
-    from calib.ranges import Ranges
+    from calib.data.ranges import Ranges
     from uwblink.recording.distances import distances_m
     from uwblink.recording.schema import Poses, Tag
     from uwblink.ticks import SPEED_OF_LIGHT

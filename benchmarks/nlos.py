@@ -19,7 +19,7 @@ from sklearn.preprocessing import StandardScaler
 
 import uwbsim
 from calib.calibration.formats import read_miluv
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.importers import import_recording
 from uwblink.recording.contents import Contents, load

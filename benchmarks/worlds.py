@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 
 Floats = NDArray[np.float64]
 

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from calib.calibration.formats import export
     from calib.calibration.model import Calibration, load_calibration
     from calib.calibration.parts import CorrectedRanges
+    from calib.data.ranges import Ranges
+    from calib.data.samples import sample_flight
+    from calib.data.sources import load_ranges
     from calib.doctor.examine import examine
     from calib.errors import BadInputError, CalibError, UnanswerableError
     from calib.estimation.fitting import fit
@@ -29,12 +32,9 @@ if TYPE_CHECKING:
     from calib.planning.flight_result import FlightPlan
     from calib.planning.flights import plan_flight
     from calib.planning.result import Plan
-    from calib.ranges import Ranges
     from calib.report.campaign import run_campaign
     from calib.report.layout import register_report_section
     from calib.report.report import write_report
-    from calib.samples import sample_flight
-    from calib.sources import load_ranges
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
     from calib.surveys.samples import sample_arrangements
@@ -89,7 +89,7 @@ _HOMES: Final = {
     "KnownPosition": "calib.surveys.knowledge",
     "OnboardSettings": "calib.evaluation.onboard_track",
     "Plan": "calib.planning.result",
-    "Ranges": "calib.ranges",
+    "Ranges": "calib.data.ranges",
     "SurveyResult": "calib.surveys.result",
     "UnanswerableError": "calib.errors",
     "add_tag": "calib.estimation.new_tag",
@@ -101,7 +101,7 @@ _HOMES: Final = {
     "fit": "calib.estimation.fitting",
     "fit_from_ranges": "calib.trajectories.fitting",
     "load_calibration": "calib.calibration.model",
-    "load_ranges": "calib.sources",
+    "load_ranges": "calib.data.sources",
     "localize": "calib.evaluation.localization",
     "localize_onboard": "calib.evaluation.onboard",
     "plan": "calib.planning.arranging",
@@ -110,7 +110,7 @@ _HOMES: Final = {
     "register_report_section": "calib.report.layout",
     "run_campaign": "calib.report.campaign",
     "sample_arrangements": "calib.surveys.samples",
-    "sample_flight": "calib.samples",
+    "sample_flight": "calib.data.samples",
     "survey": "calib.surveys.surveying",
     "write_report": "calib.report.report",
 }

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, planted_curve
 from calib.over_power import Binned, OverPower, biases, sigmas
-from calib.ranges import Ranges
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE

@@ -10,9 +10,9 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
 from calib.error_mixture import fit_error_mixtures
 from calib.evaluation.statistics import pair_rows
-from calib.ranges import Ranges
 from uwblink.arrays import Floats
 
 BINS: Final = 20

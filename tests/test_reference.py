@@ -92,5 +92,5 @@ def test_the_pages_of_commands_have_every_option(package):
 def test_aliases_of_types_are_shown_by_their_names():
     event = ("app", "function", "calib.x", len, None, "(a: TypeAliasForwardRef('Floats') | None = None)", None)
     assert doors.plain_aliases(*event) == ("(a: Floats | None = None)", None)
-    other = (*event[:5], "(a: ~calib.ranges.Ranges, b: dict = <factory>)", "~calib.Fit")
+    other = (*event[:5], "(a: ~calib.data.ranges.Ranges, b: dict = <factory>)", "~calib.Fit")
     assert doors.plain_aliases(*other) == ("(a: Ranges, b: dict = ...)", "Fit")

@@ -11,8 +11,8 @@ from calib.calibration.content import CalibrationContent
 from calib.calibration.pair_offsets import offsets_m
 from calib.calibration.parts import CorrectedRanges
 from calib.calibration.power_curves import ends, lift
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from calib.ranges import Ranges
 from uwblink.arrays import Floats
 
 OUTLIER: Final = 0.5

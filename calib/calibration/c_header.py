@@ -11,7 +11,7 @@ from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve as PowerCurve
 from calib.calibration.runtime import PiecewiseCurve
-from calib.range_columns import FAINTEST_DBM, LOUDEST_DBM
+from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM
 
 _HEAD: Final = """\
 /* Calibration of ranging tags: antenna delays, and bias and standard deviation of ranges by first-path power.

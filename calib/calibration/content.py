@@ -11,7 +11,7 @@ from calib.calibration.error_model import ErrorModel
 from calib.calibration.pair_offsets import PairOffset
 from calib.calibration.parts import TagGroup, Uncertainty
 from calib.calibration.power_curves import Curve, lifted_power
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import AntennaDelays
 

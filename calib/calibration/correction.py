@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from calib.ranges import Ranges
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
 from uwblink.recording.file import Recording

@@ -14,8 +14,8 @@ from calib.calibration.c_header import c_header
 from calib.calibration.json_format import is_tag
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
+from calib.data.sources import antenna_delays_in
 from calib.errors import BadInputError
-from calib.ranges import antenna_delays_in
 from uwblink.output import write_text
 from uwblink.recording.antenna_delays import (
     REGISTER_MAX,

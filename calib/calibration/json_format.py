@@ -7,8 +7,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from calib.calibration.power_curves import Curve
+from calib.data.ranges import MAX_RANGE_M
 from calib.errors import BadInputError
-from calib.ranges import LONGEST_M
 from uwblink.recording.antenna_delays import REGISTER_MAX
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import LARGEST_ID
@@ -40,8 +40,8 @@ POSITIVE: Final = Bounds(1e-100, LARGEST, "a number above 0")
 SHARE: Final = Bounds(0.0, 1.0, "a share, 0 to 1")
 DELAY_NS: Final = Bounds(-LARGEST_DELAY_NS, LARGEST_DELAY_NS, f"nanoseconds, up to ±{LARGEST_DELAY_NS:g}")
 STD_NS: Final = Bounds(0.0, LARGEST_DELAY_NS, f"nanoseconds, 0 to {LARGEST_DELAY_NS:g}")
-METRES: Final = Bounds(-LONGEST_M, LONGEST_M, f"metres, up to ±{LONGEST_M:g}, the longest range that is read")
-STD_M: Final = Bounds(0.0, LONGEST_M, f"metres, 0 to {LONGEST_M:g}")
+METRES: Final = Bounds(-MAX_RANGE_M, MAX_RANGE_M, f"metres, up to ±{MAX_RANGE_M:g}, the longest range that is read")
+STD_M: Final = Bounds(0.0, MAX_RANGE_M, f"metres, 0 to {MAX_RANGE_M:g}")
 POWER_DBM: Final = Bounds(-200.0, 100.0, "dBm, -200 to 100: the noise in a bandwidth of 500 MHz is -87 dBm")
 REGISTER: Final = Bounds(0, REGISTER_MAX, f"ticks of a register of 16 bits, 0 to {REGISTER_MAX}")
 LIGHT: Final = Bounds(

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from calib.calibration.model import load_calibration
 from calib.calibration.runtime import CorrectedColumns
-from calib.range_columns import columns_of
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges, columns_of
 from uwblink.arrays import Floats
 from uwblink.twr import Exchanges
 

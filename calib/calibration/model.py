@@ -18,8 +18,8 @@ from calib.calibration.document import fields_of, text_of
 from calib.calibration.parts import CorrectedRanges
 from calib.calibration.power_curves import basis
 from calib.calibration.runtime import CorrectedColumns, CorrectedRange, RangeCorrector
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.ranges import HALVES, Ranges
 from uwblink.arrays import Floats
 from uwblink.output import write_text
 from uwblink.text_files import read_text
@@ -115,7 +115,7 @@ class Calibration(CalibrationContent):
         initiator: Any,
         target: Any,
         *,
-        weights: tuple[Any, Any] = HALVES,
+        weights: tuple[Any, Any] = (0.5, 0.5),
     ) -> CorrectedRange | CorrectedColumns:
         """Correct one range, or arrays of them (n,): the corrected range and its standard deviations, in metres.
 

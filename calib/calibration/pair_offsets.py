@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from calib.calibration.json_format import METRES, STD_M, Reader, is_tag
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from calib.ranges import Ranges
 from uwblink.arrays import Floats
 
 BETWEEN: Final = "-"

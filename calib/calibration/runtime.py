@@ -18,8 +18,8 @@ from calib.calibration.error_model import ErrorsAtOnce
 from calib.calibration.pair_offsets import offset_of
 from calib.calibration.parts import CorrectedRanges
 from calib.calibration.power_curves import Curve
+from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM
 from calib.errors import BadInputError
-from calib.range_columns import FAINTEST_DBM, LOUDEST_DBM
 from uwblink.arrays import Bools, Floats
 from uwblink.display import as_text, excerpt
 

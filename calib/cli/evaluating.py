@@ -54,7 +54,7 @@ def evaluate(
 ) -> None:
     """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
     import calib
-    from calib.sources import load_each
+    from calib.data import load_each
 
     if report or figures:
         from calib.report import check_places

@@ -13,12 +13,12 @@ from typing import Final
 
 import numpy as np
 
+from calib.data.sources import Data, each, opened
 from calib.doctor import anchors, clocks, closures, pairs, radio, reflected, several, steps, surveys, timestamps, units
 from calib.doctor.base import Finding, RecordingView, chosen
 from calib.doctor.checks import Check, Seen
 from calib.doctor.long_recordings import Looked, looked_at
 from calib.doctor.table import BETWEEN, CHECKS, GEOMETRY, GROSS, LEVEL, RADIO, ROWS, STRUCTURE, SURVEYS, certain
-from calib.sources import Data, each, opened
 from uwblink.recording.distances import distances_m
 from uwblink.recording.target_reports import differences, repeated_rows, single_reports
 from uwblink.twr import raw_range

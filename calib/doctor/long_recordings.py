@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.sources import RecordedSource, Source, no_poses
+from calib.data.sources import RecordedSource, Source, no_poses
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.ticks import TICK_S

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
+from calib.data.ranges import measured_powers
 from calib.doctor.base import RecordingView, pair_ids
 from calib.doctor.checks import Seen
-from calib.range_columns import measured_powers
 from uwblink.arrays import Floats, Ints
 
 CONFOUNDED: Final = "power confounded with distance"

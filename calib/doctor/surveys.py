@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
+from calib.data.sources import Data
 from calib.doctor.checks import Seen
 from calib.errors import UnanswerableError
-from calib.sources import Data
 from calib.surveys.gathering import gather
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.power import NARROWEST_DB, in_dbm

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
+from calib.data.ranges import measured_powers
 from calib.doctor.base import PLAUSIBLE_M, RecordingView
 from calib.doctor.checks import MATERIAL, Seen
-from calib.range_columns import measured_powers
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.twr import without_stamps

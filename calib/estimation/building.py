@@ -15,6 +15,7 @@ from calib.calibration.power_curves import (
     lifted_power,
     populated,
 )
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.design import PIECES_AT_ONCE, Design
 from calib.estimation.identifiability import identifiable_directions, require_determined
@@ -25,7 +26,6 @@ from calib.estimation.spacing import bins_of, splines
 from calib.estimation.time_blocks import in_order, time_blocks
 from calib.estimation.unknowns import Unknowns
 from calib.long_columns import EVERY, computed, empty, let_go, picked, put
-from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 

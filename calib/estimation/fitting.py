@@ -20,6 +20,8 @@ import uwblink
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
+from calib.data.ranges import COLUMNS, Ranges
+from calib.data.sources import Data, load_ranges
 from calib.estimation.arguments import check_fit
 from calib.estimation.building import build_problem
 from calib.estimation.doubts import doubts
@@ -36,8 +38,6 @@ from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
 from calib.long_columns import computed, empty, let_go, put, spans, std_of
-from calib.ranges import COLUMNS, Ranges
-from calib.sources import Data, load_ranges
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 

@@ -6,8 +6,8 @@ import os
 from collections.abc import Iterable
 
 from calib.calibration.model import Calibration, load_calibration, require_calibration
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from calib.ranges import Ranges
 
 
 def imported(source: Calibration | str | os.PathLike[str] | None, parameter: str = "delays_from") -> Calibration | None:

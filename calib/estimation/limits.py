@@ -8,12 +8,11 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
+from calib.data.clocks import LeftSkew, corrected
+from calib.data.ranges import NO_STAMPS, Ranges
 from calib.estimation.confounding import explained_by_distance, some_of
 from calib.estimation.pairs import pairs_of
 from calib.estimation.problem import Problem
-from calib.range_columns import NO_STAMPS
-from calib.ranges import Ranges
-from calib.single_sided import LeftSkew, corrected
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
 from uwblink.ticks import SPEED_OF_LIGHT

@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
+from calib.data.ranges import STATIC, Ranges
 from calib.errors import UnanswerableError
 from calib.estimation.pairs import pairs_of
 from calib.estimation.row_order import stable_order
 from calib.long_columns import computed, let_go, picked
-from calib.ranges import STATIC, Ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import TICK_S

@@ -12,12 +12,12 @@ from calib.calibration.power_curves import (
     Bins,
     curvature,
 )
+from calib.data.ranges import COLUMNS, Ranges
 from calib.estimation.design import Design
 from calib.estimation.pairs import Pairs
 from calib.estimation.time_blocks import TimeBlocks
 from calib.estimation.unknowns import Unknowns
 from calib.long_columns import computed, let_go
-from calib.ranges import COLUMNS, Ranges
 from uwblink.arrays import Bools, Floats, Ints
 
 CELLS: Final = 8

@@ -8,7 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from calib.calibration.model import Calibration
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from uwblink.arrays import Bools, Floats
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
+from calib.data.ranges import Ranges
 from calib.long_columns import let_go
-from calib.ranges import Ranges
 from uwblink.arrays import Bools, Floats, Ints
 
 MOST_BLOCKS: Final = 1000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from calib.ranges import STATIC, Ranges
+from calib.data.ranges import STATIC, Ranges
 from uwblink.recording.antenna_delays import known_delays
 
 MANY_MISSING: Final = 0.05

@@ -13,12 +13,12 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.model import Calibration, require_calibration
+from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
 from calib.evaluation.tracking import FixedStd, Localization, Settings
 from calib.evaluation.tracking_filters import filter_ranges, run_filters
 from calib.evaluation.tracking_problem import Noise, problems
 from calib.evaluation.tracking_runs import FilterRanges, Run
-from calib.sources import Data, Flight, load_flight, require_times
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 """Mean over six scenarios (ICRA 2023, its only table): flights of its own, another filter's noise."""

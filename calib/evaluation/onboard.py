@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.model import Calibration, require_calibration
+from calib.data.sources import Data
 from calib.errors import UnanswerableError
 from calib.evaluation.onboard_data import Readings, readings
 from calib.evaluation.onboard_events import SPAN_S, events, still_spans
@@ -27,7 +28,6 @@ from calib.evaluation.onboard_start import (
 )
 from calib.evaluation.onboard_track import OnboardSettings, OnboardTrack
 from calib.evaluation.tracking_problem import nearest_attitude
-from calib.sources import Data
 from uwblink.arrays import Floats
 from uwblink.recording.distances import bodies_m
 

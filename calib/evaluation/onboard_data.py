@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.calibration.model import Calibration
+from calib.data.ranges import MAX_RANGE_M, Ranges, require_some
+from calib.data.sources import Data, opened, require_times
 from calib.errors import UnanswerableError
 from calib.evaluation.range_updates import RangeErrors
-from calib.ranges import LONGEST_M, Ranges, require_some
-from calib.sources import Data, opened, require_times
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Poses
 from uwblink.recording.target_reports import single_reports
@@ -62,7 +62,7 @@ def readings(data: Data, calibration: Calibration) -> list[Readings]:
         imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
     ranges = Ranges.from_exchanges(exchanges, source=name)
     powered = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm) | (not calibration.needs_power)
-    possible = np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < LONGEST_M)
+    possible = np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < MAX_RANGE_M)
     excluded = {"no power": int(np.sum(~powered)), "impossible stamps": int(np.sum(powered & ~possible))}
     require_some(name, len(ranges), excluded, "")
     ranges = ranges[powered & possible]

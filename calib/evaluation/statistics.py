@@ -11,10 +11,10 @@ from scipy.interpolate import BSpline
 
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
+from calib.data.sources import Data, load_ranges
 from calib.evaluation.display import as_html, as_text
 from calib.evaluation.error_statistics import ErrorStatistics, Stats
-from calib.ranges import Ranges
-from calib.sources import Data, load_ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT

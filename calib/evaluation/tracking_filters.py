@@ -10,13 +10,13 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
 from calib.errors import UnanswerableError
 from calib.evaluation.multilateration import multilaterate
 from calib.evaluation.range_updates import Heard, RangeErrors, gated, weighed
 from calib.evaluation.tracking import ROBUST, Settings, Track
 from calib.evaluation.tracking_problem import Problem
 from calib.evaluation.tracking_runs import Beside, FilterRanges, Run
-from calib.ranges import Ranges
 from uwblink.arrays import Bools, Floats, Ints
 
 FEWEST_IN_WINDOW: Final = 12

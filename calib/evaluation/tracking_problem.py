@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.data.sources import Flight
 from calib.evaluation.tracking import Settings
-from calib.sources import Flight
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 from uwblink.recording.schema import Poses

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM
+from calib.data.sources import Data
 from calib.errors import UnanswerableError
 from calib.estimation.gauge import stating
 from calib.estimation.problem import Problem
@@ -21,7 +22,6 @@ from calib.estimation.reflections import Shape, expected
 from calib.estimation.robust import QuadraticModel
 from calib.estimation.smoothing import reml_penalty
 from calib.information import Verdict
-from calib.sources import Data
 from calib.trajectories.arrow import Factored, normal_of
 from calib.trajectories.attitudes import Attitude
 from calib.trajectories.fitting import Asked, problem_of

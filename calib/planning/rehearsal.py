@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.samples import stamped
+from calib.data.samples import stamped
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges

@@ -13,6 +13,8 @@ from typing import Any, Final, Unpack
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges, concatenate
+from calib.data.sources import Data, each, held_open, load_each, opened
 from calib.doctor.base import Finding
 from calib.doctor.examine import examine
 from calib.errors import UnanswerableError
@@ -25,9 +27,7 @@ from calib.evaluation.consistency import summarize
 from calib.evaluation.localization import localize
 from calib.evaluation.statistics import Evaluation, evaluate
 from calib.evaluation.tracking import Localization
-from calib.ranges import Ranges, concatenate
 from calib.report.origin import Origin, origin_of
-from calib.sources import Data, each, held_open, load_each, opened
 
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
 """Scales of the loss, over the chosen one, for which a campaign is fitted again."""

@@ -9,11 +9,11 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
 from calib.error_mixture import fit_error_mixtures
 from calib.evaluation.error_statistics import ErrorStatistics
 from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, pair_rows
 from calib.over_power import FEWEST_IN_BIN, biases, sigmas
-from calib.ranges import Ranges
 from calib.report.blocks import Block, Heading, Picture, Table, Text
 
 OUTLIER_SIGMAS: Final = 3.0

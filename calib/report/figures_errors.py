@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
 from calib.evaluation.statistics import pair_rows
 from calib.figures import cumulative, histogram
-from calib.ranges import Ranges
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, INK, MUTED, PALE
 from uwblink.pages.figures import NARROW_IN, label, legend, sheet

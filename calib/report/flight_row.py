@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from calib.data.sources import Data, load_ranges
 from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate
-from calib.sources import Data, load_ranges
 
 
 def evaluate_flight(flight: Data) -> Mapping[str, Any]:

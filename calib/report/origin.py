@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from calib.sources import Data
+from calib.data.sources import Data
 
 BLOCK: Final = 1 << 20
 

@@ -7,8 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from calib.calibration.model import Calibration, require_calibration
+from calib.data.ranges import Ranges, concatenate
+from calib.data.sources import Data, each, load_each
 from calib.evaluation.statistics import Evaluation, evaluate
-from calib.ranges import Ranges, concatenate
 from calib.report import error_sections, sections
 from calib.report.blocks import Document, Heading, Text
 from calib.report.origin import Origin, origin_of
@@ -16,7 +17,6 @@ from calib.report.provenance import provenance, warnings
 from calib.report.verdict import Judged, verdict
 from calib.report.without_truth import foundations
 from calib.report.writing import check_places, html_of, write_document
-from calib.sources import Data, each, load_each
 
 
 def render(data: Data | Iterable[Data], calibration: Calibration) -> str:

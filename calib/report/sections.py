@@ -11,8 +11,8 @@ import numpy as np
 
 from calib.calibration.display import pair_rows as offset_rows
 from calib.calibration.model import Calibration
+from calib.data.ranges import Ranges
 from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, PlantedComparison, pair_rows
-from calib.ranges import Ranges
 from calib.report.blocks import Block, Picture, Table, Text
 from calib.spread import TWO_SIDED_95
 

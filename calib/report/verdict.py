@@ -10,8 +10,8 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges
 from calib.evaluation.statistics import Evaluation
-from calib.ranges import Ranges
 from calib.report.blocks import Block
 from calib.report.grades import BAD, DOUBT, GOOD, Criterion, graded, judgement
 from calib.report.without_truth import criteria

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
+from calib.data.ranges import Ranges, concatenate
+from calib.data.sources import Data, antenna_delays_of, each, opened
 from calib.errors import BadInputError, UnanswerableError
-from calib.ranges import Ranges, concatenate
-from calib.sources import Data, antenna_delays_of, each, opened
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.pair_means import PairMeans, pair_means
 from calib.surveys.result import Contradiction

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 

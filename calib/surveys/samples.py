@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 DELAYS_NS: Final = {1: -0.3, 2: 0.1, 3: -0.1, 4: 0.2}

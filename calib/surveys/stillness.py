@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 

@@ -12,8 +12,8 @@ from typing import Final
 from threadpoolctl import threadpool_limits
 
 from calib.calibration.model import Calibration
+from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
-from calib.sources import Data
 from calib.surveys.adjustment import Adjusted, averaged
 from calib.surveys.assembling import assembled
 from calib.surveys.doubts import misplaced, worst

@@ -16,6 +16,7 @@ import uwblink
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
+from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.arguments import check_choice, check_fit
 from calib.estimation.building import build_problem
@@ -28,7 +29,6 @@ from calib.estimation.result import FitResult
 from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
-from calib.sources import Data
 from calib.trajectories.beginning import beginning
 from calib.trajectories.climbing import Climbed, climb
 from calib.trajectories.given import Usable, scene_from

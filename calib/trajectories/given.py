@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from calib.data.ranges import Ranges
+from calib.data.sources import Data, Source, antenna_delays_of, opened
 from calib.errors import UnanswerableError
-from calib.ranges import Ranges
-from calib.sources import Data, Source, antenna_delays_of, opened
 from calib.trajectories.attitudes import Attitude, matrices
 from calib.trajectories.heights import heights_of, no_heights
 from calib.trajectories.inertial import Readings, integrated, windows

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from calib.trajectories.attitudes import Attitude
 from calib.trajectories.heights import Heights, no_heights
 from calib.trajectories.inertial import Inertial

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 DELAYS_NS = {1: -0.36, 2: 0.05, 3: 0.24, 7: -0.11}

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["calib.calibration", "calib.planted", "uwblink.recording.intake"]):
+with atheris.instrument_imports(include=["calib.calibration", "calib.data.planted", "uwblink.recording.intake"]):
     from calib.calibration.formats import read_miluv
     from calib.calibration.model import Calibration
+    from calib.data.planted import check_planted
     from calib.errors import CalibError
-    from calib.planted import check_planted
     from uwblink.errors import UwblinkError
     from uwblink.recording.intake import decode_json
 

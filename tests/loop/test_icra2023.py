@@ -9,8 +9,8 @@ import pytest
 from scipy.interpolate import BSpline
 
 from calib.calibration.model import Calibration, load_calibration
-from calib.ranges import concatenate
-from calib.sources import load_ranges
+from calib.data.ranges import concatenate
+from calib.data.sources import load_ranges
 from tests import processes
 from tests.shared_data import shared
 from uwblink.recording.file import Recording

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.data.sources import load_ranges
 from calib.errors import UnanswerableError
 from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate, pair_rows
-from calib.sources import load_ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate

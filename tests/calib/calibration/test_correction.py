@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.samples import sample_flight
+from calib.data.samples import sample_flight
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
 from uwblink.twr import COLUMNS

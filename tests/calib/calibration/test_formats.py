@@ -15,10 +15,10 @@ import pytest
 import calib
 from calib.calibration.formats import FORMATS, programmed, read_miluv, registers
 from calib.calibration.model import Calibration
+from calib.data.ranges import Ranges
+from calib.data.samples import sample_flight
 from calib.errors import BadInputError
 from calib.estimation.fitting import fit
-from calib.ranges import Ranges
-from calib.samples import sample_flight
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import shared
 from uwblink.importers import read_source

@@ -10,8 +10,8 @@ from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.calibration.model import Calibration
 from calib.calibration.parts import TagGroup
 from calib.calibration.power_curves import Curve
+from calib.data.ranges import Ranges
 from calib.errors import BadInputError
-from calib.ranges import Ranges
 
 TAGS = [1, 2, 5, 40]
 

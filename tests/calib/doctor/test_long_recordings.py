@@ -7,8 +7,8 @@ import pytest
 
 import calib
 from benchmarks.flights import Plan, fly
+from calib.data.sources import RecordedSource
 from calib.doctor import examined_part, long_recordings
-from calib.sources import RecordedSource
 from uwblink import Contents, Recording
 from uwblink.recording.distances import distances_m
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.ranges import Ranges
+from calib.data.ranges import Ranges
 
 LIGHT_M_PER_NS = 0.299702547
 

@@ -7,8 +7,8 @@ import pytest
 
 import calib
 from calib import long_columns
+from calib.data.samples import sample_flight
 from calib.estimation import mixture_slopes, pair_mixture
-from calib.samples import sample_flight
 
 ROWS = 700
 SAME = 1e-8

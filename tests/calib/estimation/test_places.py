@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.ranges import concatenate
+from calib.data.ranges import concatenate
 from tests.calib.estimation.fields import ranges_with_field
 
 

@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from calib.calibration.comparison import compare
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import basis, curvature, lifted_power
+from calib.data.ranges import without_static
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation import solver
 from calib.estimation.building import build_problem
@@ -18,7 +19,6 @@ from calib.estimation.pair_mixture import described
 from calib.estimation.robust import quadratic_model, robust_fit
 from calib.estimation.smoothing import reml_penalty
 from calib.estimation.solver import solve
-from calib.ranges import without_static
 from tests.calib.synthetic import DELAYS_NS, bias_m, design, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 

@@ -9,6 +9,8 @@ import pytest
 
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
+from calib.data.samples import sample_flight
+from calib.data.sources import Flight, load_flight
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.fitting import fit
 from calib.evaluation.consistency import summarize
@@ -19,8 +21,6 @@ from calib.evaluation.tracking_filters import AT_ONCE, filter_ranges, run_filter
 from calib.evaluation.tracking_problem import Noise, problems
 from calib.evaluation.tracking_runs import Run
 from calib.report.figures_tracks import rmse_bars
-from calib.samples import sample_flight
-from calib.sources import Flight, load_flight
 from uwblink.pages.figures import style
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate

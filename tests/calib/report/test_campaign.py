@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 import calib
+from calib.data.samples import sample_flight
 from calib.report.blocks import Heading, Text
 from calib.report.layout import SECTIONS
-from calib.samples import sample_flight
 from tests import processes
 from uwblink.recording.file import Recording
 

@@ -5,9 +5,9 @@ import shutil
 import pytest
 
 import calib
+from calib.data.samples import sample_flight
 from calib.report.blocks import Document, Picture
 from calib.report.writing import check_places, write_document
-from calib.samples import sample_flight
 from tests import processes
 from uwblink.pages.figures import sheet
 from uwblink.recording.file import Recording

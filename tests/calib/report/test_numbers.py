@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import calib
-from calib.samples import stamped
+from calib.data.samples import stamped
 from tests import processes
 from tests.calib.report.page_of_numpy import LIGHT, TICK_S, Tables, columns, corrected, curve, number
 from uwblink import Contents, Tag

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.carriers import clocks_apart
+from calib.data.clocks import clocks_apart
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 PPM = np.array([0.0, 4.0, -3.0, 1.5])

@@ -1,18 +1,15 @@
 """Ranges read some exchanges at a time are those of all exchanges and all poses, to the last bit."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
 import pytest
 
-from calib import long_columns
-from calib.errors import UnanswerableError
-from calib.long_columns import empty, joined, let_go, picked
-from calib.ranges import APART, COLUMNS, Ranges
-from calib.recorded import read_ranges
-from calib.samples import sample_flight
-from calib.sources import fingerprint
+from calib.data import sources
+from calib.data.ranges import COLUMNS, Ranges
+from calib.data.samples import sample_flight
 from uwblink.recording import AntennaDelay, blocks, target_reports
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
@@ -38,7 +35,7 @@ def of_all(path):
             poses=recording.poses(),
             tags=recording.tags(),
             planted=recording.meta()["planted"],
-            source="it",
+            source="it.uwb",
             antenna_delays={None: AntennaDelay()},
         )
     return found.usable()
@@ -47,7 +44,7 @@ def of_all(path):
 def assert_same(one, other):
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-    for name in set(APART) - {"recordings"}:
+    for name in {field.name for field in fields(Ranges)} - {*COLUMNS, "recordings"}:
         assert repr(getattr(one, name)) == repr(getattr(other, name)), name
 
 
@@ -88,21 +85,9 @@ def test_blocks_of_any_size_make_the_ranges_of_the_whole(tmp_path, monkeypatch):
     assert whole.left_skew is not None
     monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**7)
     monkeypatch.setattr(blocks, "POSES_AT_ONCE", 300)
-    with Recording.open(path) as recording:
-        for rows in (37, ROWS - 1, 10 * ROWS):
-            assert_same(read_ranges(recording, "it", need_power=True, rows=rows), whole)
-
-
-def test_columns_of_files_are_those_of_memory(tmp_path, monkeypatch):
-    path = written(tmp_path / "it.uwb", *awkward())
-    whole = of_all(path)
-    monkeypatch.setattr(long_columns, "MANY", 10)
-    monkeypatch.setattr(long_columns, "ROWS_AT_ONCE", 7)
-    with Recording.open(path, memory_mb=64) as recording:
-        found = read_ranges(recording, "it", need_power=True, rows=20)
-    assert found is not None
-    assert_same(found, whole)
-    assert_same(found[np.arange(len(found)) % 3 > 0], whole[np.arange(len(whole)) % 3 > 0])
+    for rows in (37, ROWS - 1, 10 * ROWS):
+        monkeypatch.setattr(sources, "EXCHANGES_AT_ONCE", rows)
+        assert_same(sources.load_ranges(path), whole)
 
 
 def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
@@ -135,9 +120,7 @@ def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeyp
         return found
 
     monkeypatch.setattr(blocks.PoseWindows, "window", watched)
-    with Recording.open(path) as recording:
-        found = read_ranges(recording, "it", need_power=True)
-    assert found is not None
+    found = sources.load_ranges(path)
     assert len(found) == 3000
     assert_same(found, whole)
     assert len(held) > 10
@@ -168,50 +151,13 @@ def test_of_two_reports_one_counts_wherever_blocks_and_stretches_end(tmp_path, m
             poses=recording.poses(),
             tags=recording.tags(),
             planted=recording.meta()["planted"],
-            source="it",
+            source="it.uwb",
             antenna_delays={None: AntennaDelay()},
         ).usable()
-        monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", 23)
-        found = read_ranges(recording, "it", need_power=True, rows=rows)
-    assert found is not None
+    monkeypatch.setattr(target_reports, "ROWS_AT_ONCE", 23)
+    monkeypatch.setattr(sources, "EXCHANGES_AT_ONCE", rows)
+    found = sources.load_ranges(path)
     assert reports.repeated > ROWS / 3
     assert_same(found, whole)
-    assert found.recordings == (("it", fingerprint(alone)),)
-
-
-def test_why_no_range_can_be_used_is_a_matter_of_all(tmp_path):
-    flight = sample_flight(ROWS)
-    with Recording.open(written(tmp_path / "it.uwb", flight.exchanges, flight.poses[:0], flight.tags)) as recording:
-        assert read_ranges(recording, "it", need_power=True) is None
-
-
-def test_long_columns_are_arrays_like_any_other(monkeypatch):
-    monkeypatch.setattr(long_columns, "MANY", 4)
-    monkeypatch.setattr(long_columns, "ROWS_AT_ONCE", 2)
-    column = empty(9)
-    column[:] = np.arange(9.0)
-    let_go(column, column[3:], None, np.zeros(3))
-    rows = column % 2 == 0
-    np.testing.assert_array_equal(column, np.arange(9.0))
-    np.testing.assert_array_equal(picked(column, rows), [0, 2, 4, 6, 8])
-    np.testing.assert_array_equal(picked(column, np.array([8, 1, 1, 5, 0])), [8, 1, 1, 5, 0])
-    np.testing.assert_array_equal(joined([column, column[:2]]), [*range(9), 0, 1])
-    one = np.broadcast_to(np.array("ds"), 9)
-    assert picked(one, rows).strides == (0,)
-    assert picked(one, rows).tolist() == ["ds"] * 5
-    pair = empty(5, np.int32, each=(2,))
-    pair[1] = 7
-    assert pair.shape == (2, 5)
-    assert pair[1].tolist() == [7] * 5
-
-
-def test_a_full_disk_is_said_before_anything_is_computed(monkeypatch):
-    def full(file, size):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(long_columns, "MANY", 4)
-    monkeypatch.setattr(long_columns, "_take_room", full)
-    with pytest.raises(
-        UnanswerableError, match=r"no room for .* GB of columns \(No space left on device\); set TMPDIR"
-    ):
-        empty(9)
+    fingerprint = sha256(alone.time_ns.tobytes() + alone.range_m.tobytes()).hexdigest()[:32]
+    assert found.recordings == (("it.uwb", fingerprint),)

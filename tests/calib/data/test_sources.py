@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import calib
+from calib.data.ranges import COLUMNS, Ranges
+from calib.data.samples import DELAYS_NS, sample_flight
+from calib.data.sources import load_flight, load_ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.ranges import COLUMNS, Ranges
-from calib.samples import DELAYS_NS, sample_flight
-from calib.sources import load_flight, load_ranges
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag

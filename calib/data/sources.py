@@ -1,11 +1,16 @@
-"""Where ranges come from: recordings, open ones, simulations in memory, or several of them; the only reader in here."""
+"""Where ranges come from: recordings, open ones, simulations in memory, or several of them.
+
+Recordings are read some exchanges at a time, with only the poses around them in memory; a source in memory is one such
+block. What comes out is what `Ranges.from_exchanges` makes of all exchanges and all poses, without unusable ranges.
+"""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -14,35 +19,40 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.data.clocks import ClockSample, left_skew_of, skew_terms
+from calib.data.planted import check_planted
+from calib.data.ranges import (
+    COLUMNS,
+    FAINTEST_DBM,
+    IN_MEMORY,
+    LOUDEST_DBM,
+    Ranges,
+    bodies_of,
+    columns_of,
+    concatenate,
+    require_some,
+    usable_rows,
+    without_static,
+)
 from calib.errors import BadInputError, UnanswerableError
-from calib.planted import check_planted
-from calib.range_columns import FAINTEST_DBM, LOUDEST_DBM
-from calib.ranges import IN_MEMORY, Ranges, antenna_delays_in, concatenate, without_static
-from calib.recorded import FINGERPRINT, read_ranges
-from uwblink.recording.antenna_delays import AntennaDelays
+from uwblink.arrays import Floats
+from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
-from uwblink.recording.target_reports import single_reports
-from uwblink.twr import Exchanges
+from uwblink.recording.target_reports import single_exchange_blocks, single_reports
+from uwblink.recording.tracks import Tracks
+from uwblink.twr import Exchanges, names_in
 
-__all__: Final = ["load_each"]
-
-
-READING_MB: Final = 256
-"""Of a file that is read some rows at a time so much is kept in memory."""
-
-
-def no_poses() -> Poses:
-    """Return poses of nothing."""
-    return Poses(np.zeros(0, np.int64), np.zeros(0, np.str_), np.zeros((0, 3)), np.zeros((0, 4)))
+EXCHANGES_AT_ONCE: Final = 131_072
+"""Exchanges of a file that are read together: about 30 MB of columns."""
 
 
 @runtime_checkable
 class Source(Protocol):
     """What anything may hand over instead of a file: exchanges, poses of bodies, and the tags on them.
 
-    A simulation's result has these attributes. Used where they are there, too: `planted`, what a simulation put in,
-    which is shown and never used (or `meta` with that entry, and with what was programmed); `faults`; `overheard`,
+    A simulation's result has these attributes. Used where they exist: `planted`, what a simulation put in, which is
+    shown and never used (or `meta` with that entry, and with the programmed antenna delays); `faults`; `overheard`,
     columns of the recording's table.
     """
 
@@ -63,11 +73,16 @@ Data = str | os.PathLike[str] | Recording | Source | Exchanges | Ranges
 """One recording: its path, an open one, a `Source`, exchanges with their distances, or ranges loaded before."""
 
 
+def no_poses() -> Poses:
+    """Return poses of no body."""
+    return Poses(np.zeros(0, np.int64), np.zeros(0, np.str_), np.zeros((0, 3)), np.zeros((0, 4)))
+
+
 class RecordedSource:
     """An open recording as a `Source`, which reads each table when it is asked for."""
 
     def __init__(self, recording: Recording) -> None:
-        """Read from a recording, which must stay open."""
+        """Take a recording, which must stay open."""
         self.recording = recording
 
     @cached_property
@@ -214,38 +229,96 @@ def each(data: Data | Iterable[Data]) -> list[Data]:
 def _load(data: Data, need_power: bool) -> Ranges:
     if isinstance(data, Ranges):
         return data.usable(need_power=need_power)
-    if isinstance(data, str | os.PathLike | Recording):
-        with _recording(data) as recording:
-            found = read_ranges(recording, recording.path.name, need_power=need_power)
-        if found is not None:
-            return found
-    with opened(data) as (name, source):
-        exchanges = single_reports(source.exchanges).exchanges
-        complete = len(exchanges) and np.isfinite(exchanges.truth_m).all()
-        poses, tags = None if complete else source.poses, source.tags
-        planted, delays = _planted(source, name), antenna_delays_of(source, name)
-    ranges = Ranges.from_exchanges(
-        exchanges, poses=poses, tags=tags, planted=planted, source=name, antenna_delays=delays
+    with held_open(data) as held, opened(held) as (name, source):
+        return _read(name, source, need_power=need_power)
+
+
+def _read(name: str, source: Source, *, need_power: bool) -> Ranges:
+    """Return the usable ranges of a source; of an exchange that both ends reported one report counts.
+
+    Raises `BadInputError` for planted values or antenna delays that cannot be read, `UnanswerableError` where no range
+    can be used.
+    """
+    planted, delays, tags = _planted(source, name), antenna_delays_of(source, name), source.tags
+    columns: dict[str, list[Any]] = {column: [] for column in COLUMNS if column != "session"}
+    excluded, count, times, measured_m = Counter[str](), 0, sha256(), list[Floats]()
+    terms, clocks = list[tuple[Floats, Floats]](), ClockSample()
+    for block, with_poses in _blocks(source):
+        for part, poses in with_poses:
+            some = Ranges(source="", excluded={}, planted=None, **columns_of(part, part.truth_m, poses, tags))
+            usable, left_out = usable_rows(some, need_power=need_power)
+            excluded.update(left_out)
+            for column, rows in columns.items():
+                # A copy where all rows are usable: the block itself must not stay in memory.
+                rows.append(_words(usable.protocol) if column == "protocol" else np.array(getattr(usable, column)))
+        count += len(block)
+        times.update(np.ascontiguousarray(block.time_ns).data)
+        measured_m.append(block.range_m)
+        terms.append(skew_terms(block))
+        clocks.add(block)
+    if sum(excluded.values()) == count:
+        require_some(name, count, excluded, _why_no_truth(source), _why_no_power(source.exchanges))
+    for one in measured_m:
+        times.update(np.ascontiguousarray(one).data)
+    protocol = _joined_words(columns.pop("protocol"))
+    joined: dict[str, Any] = {column: np.concatenate(columns.pop(column)) for column in list(columns)}
+    return Ranges(
+        source=name,
+        excluded={reason: number for reason, number in excluded.items() if number},
+        planted=dict(planted) if planted else None,
+        left_skew=left_skew_of(terms),
+        clocks_apart=clocks.farthest_pair(),
+        bodies=bodies_of(tags),
+        antenna_delays=delays,
+        recordings=((name, times.hexdigest()[:32]),),
+        protocol=protocol,
+        **joined,
     )
-    ranges = replace(ranges, recordings=((name, fingerprint(exchanges)),))
-    return ranges.usable(_why_no_truth(ranges, poses, tags), _why_no_power(exchanges), need_power=need_power)
 
 
-def _recording(data: str | os.PathLike[str] | Recording) -> AbstractContextManager[Recording]:
-    return nullcontext(data) if isinstance(data, Recording) else Recording.open(data, memory_mb=READING_MB)
+Parts = Iterable[tuple[Exchanges, Poses | Tracks | None]]
+
+
+def _blocks(source: Source) -> Iterator[tuple[Exchanges, Parts]]:
+    """Yield the exchanges of a source block by block, each with its parts and the poses around each part."""
+    if not isinstance(source, RecordedSource):
+        exchanges = single_reports(source.exchanges).exchanges
+        complete = len(exchanges) > 0 and bool(np.isfinite(exchanges.truth_m).all())
+        yield exchanges, [(exchanges, None if complete else source.poses)]
+        return
+    windows = source.recording.pose_windows()
+    for block in single_exchange_blocks(source.recording, EXCHANGES_AT_ONCE):
+        if len(block):
+            complete = bool(np.isfinite(block.truth_m).all())
+            yield block, [(block, None)] if complete else windows.tracks_beside(block)
+
+
+def _words(protocol: NDArray[np.str_]) -> NDArray[np.str_]:
+    """Return protocols of ranges (n,), without a copy for each where all are the same."""
+    names = names_in(protocol)
+    return np.broadcast_to(np.array(names[0]), len(protocol)) if len(names) == 1 else protocol
+
+
+def _joined_words(parts: list[NDArray[np.str_]]) -> NDArray[np.str_]:
+    parts = [part for part in parts if len(part)]
+    if all(part.strides == (0,) for part in parts) and len({str(part[0]) for part in parts}) == 1:
+        return np.broadcast_to(parts[0][0], sum(map(len, parts)))
+    return np.concatenate(parts)
 
 
 def held_open(data: Data) -> AbstractContextManager[Data]:
     """Return a context in which a file is open, for those who read it more than once; raises what opening it raises."""
-    return _recording(data) if isinstance(data, str | os.PathLike) else nullcontext(data)
+    if isinstance(data, str | os.PathLike):
+        return Recording.open(data, memory_mb=256)  # more does not read blocks any faster
+    return nullcontext(data)
 
 
-def fingerprint(exchanges: Exchanges) -> str:
-    """Return what tells exchanges from all others, whatever their file is called: a hash of their times and ranges."""
-    found = sha256()
-    for column in (exchanges.time_ns, exchanges.range_m):
-        found.update(np.ascontiguousarray(column).data)
-    return found.hexdigest()[:FINGERPRINT]
+def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
+    """Return what a recording's `meta` says was programmed; raises `BadInputError` where it cannot be understood."""
+    try:
+        return delays_in_meta(meta)
+    except ValueError as error:
+        raise BadInputError(f"{source}: {error}") from error
 
 
 def antenna_delays_of(source: Source, name: str) -> AntennaDelays:
@@ -262,7 +335,7 @@ def _planted(source: Source, name: str) -> Mapping[str, Any] | None:
 
 
 def _why_no_power(exchanges: Exchanges) -> str:
-    """Say which powers cannot be received ones, where there are any: nothing is received at more than a milliwatt."""
+    """Return which powers cannot be received ones, if there are any: nothing is received at more than a milliwatt."""
     given = np.concatenate([exchanges.fpp1_dbm, exchanges.fpp2_dbm])
     given = given[np.isfinite(given) & (given != 0)]
     if not len(given):
@@ -273,9 +346,10 @@ def _why_no_power(exchanges: Exchanges) -> str:
     )
 
 
-def _why_no_truth(ranges: Ranges, poses: Poses | None, tags: Sequence[Tag]) -> str:
-    """Say how poses and exchanges lie in time, where no exchange has a true distance although there are poses."""
-    if poses is None or not len(poses) or not len(ranges) or np.isfinite(ranges.truth_m).any():
+def _why_no_truth(source: Source) -> str:
+    """Return how poses and exchanges lie in time, where no exchange has a true distance although there are poses."""
+    poses, tags, time_ns = source.poses, source.tags, source.exchanges.time_ns
+    if not len(poses) or not len(time_ns):
         return ""
     if not tags:
         return "it does not say which tag sits on which body; give tags with 'uwblink poses --tags'"
@@ -283,7 +357,7 @@ def _why_no_truth(ranges: Ranges, poses: Poses | None, tags: Sequence[Tag]) -> s
     if missing:
         return f"no poses of body {missing[0]}"
     start = int(poses.time_ns[0])
-    spans = [((int(t.min()) - start) * 1e-9, (int(t.max()) - start) * 1e-9) for t in (poses.time_ns, ranges.time_ns)]
+    spans = [((int(t.min()) - start) * 1e-9, (int(t.max()) - start) * 1e-9) for t in (poses.time_ns, time_ns)]
     return (
         f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s, its exchanges {spans[1][0]:.1f} to "
         f"{spans[1][1]:.1f} s after the first pose; shift the poses with 'uwblink poses --offset'"

@@ -1,52 +1,69 @@
-"""Ranges as the columns a calibration works with; the one place where exchanges or arrays become them."""
+"""Ranges with their true distances, as the columns that a calibration works with."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.carriers import ClocksApart, clocks_apart, farthest
+from calib.data.clocks import ClocksApart, LeftSkew, clocks_apart, left_skew
 from calib.errors import BadInputError, UnanswerableError
-from calib.long_columns import joined, let_go, picked, spans
-from calib.range_columns import columns_of, measured_powers
-from calib.single_sided import LeftSkew, left_skew, worst
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of, delays_in_meta
+from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of
+from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import Poses, Tag
-from uwblink.twr import Exchanges
+from uwblink.recording.tracks import Tracks
+from uwblink.twr import Exchanges, delay_weights, middle_ns, raw_range, without_stamps
 
 IN_MEMORY: Final = "memory"
 """The source of ranges that come from no file."""
 
+NO_STAMPS: Final = "range"
+"""The protocol of a range that came without stamps."""
 
-HALVES: Final = (0.5, 0.5)
+STATIC: Final = "static"
+"""The reason for which `without_static` leaves ranges out."""
 
-LONGEST_M: Final = 1e4
+MAX_RANGE_M: Final = 1e4
+"""Ranges beyond this come from impossible stamps: no ultra-wideband radio reaches a tenth of it."""
 
-CLOCK_NS: Final = 1_000_000_000 * 86_400 * 365 * 20
-"""Times beyond this are those of a host's clock, in ns since 1970 (`uwblink record`), and others count from a start."""
+FAINTEST_DBM, LOUDEST_DBM = -140.0, -30.0
+"""Received powers lie between these bounds; a board that cannot tell a strong power prints 0."""
+
+COLUMNS: Final = (
+    "time_ns",
+    "initiator",
+    "target",
+    "protocol",
+    "raw_m",
+    "truth_m",
+    "weight_initiator",
+    "weight_target",
+    "fpp1_dbm",
+    "fpp2_dbm",
+    "session",
+)
+"""The fields of `Ranges` that have one value per range."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranges:
-    """Ranges with their truth as columns of length n; `from_exchanges` and `from_arrays` make them.
+    """Ranges with their true distances as columns of length n; `from_exchanges` and `from_arrays` make them.
 
-    `raw_m` is the range recomputed from the stamps, `truth_m` the distance between the antennas;
-    `weight_initiator` and `weight_target` are the derivatives of the calibrated time of flight with
-    respect to the two tags' antenna delays. `protocol` is "range" where a range came without stamps.
-    `excluded` counts by reason what was left out; `planted` is what a simulation put in, for display only;
-    `recordings` are name and `fingerprint` of each that they come from, empty where they come from none;
-    `left_skew` says what clock skew may have left in single-sided ranges, None where there are none; `bodies` are tags
-    with the body that carries each, as far as it is known; `antenna_delays` is what was programmed into tags when they
-    ranged, as far as that is known. `session` numbers the sessions (n,), whose names are
-    `sessions`: recordings that are joined, of which those that ran at the same time count as one.
+    `raw_m` is the range recomputed from the stamps, `truth_m` the distance between the antennas; `weight_initiator` and
+    `weight_target` are the derivatives of the calibrated time of flight by the antenna delays of the two tags.
+    `protocol` is "range" where a range came without stamps. `session` numbers the sessions (n,), whose names are
+    `sessions`: joined recordings, of which those that ran at the same time count as one.
+
+    `excluded` counts by reason the ranges that were left out; `planted` is what a simulation put in, for display only;
+    `recordings` are names and fingerprints of the recordings, empty for ranges of arrays; `left_skew` is what clock
+    skew may have left in single-sided ranges, None without any; `bodies` are tags with the body that carries each;
+    `antenna_delays` are those programmed into the tags, as far as known.
     """
 
     source: str
@@ -71,7 +88,7 @@ class Ranges:
     antenna_delays: AntennaDelays = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Put all ranges into one session where nothing else is said."""
+        """Put all ranges into one session where none are given."""
         if len(self.session) != len(self.time_ns):
             object.__setattr__(self, "session", np.broadcast_to(np.int32(0), len(self.time_ns)))
 
@@ -89,7 +106,7 @@ class Ranges:
     ) -> Ranges:
         """Return a row for every exchange, usable or not (`usable` leaves out those that a fit cannot use).
 
-        True distances are `truth_m` (n,), or those of the exchanges; where there is neither they come from `poses` and
+        True distances are `truth_m` (n,), or those of the exchanges; where neither is finite they come from `poses` and
         the lever arms of `tags`. A power that cannot have been measured is NaN. Raises `BadInputError` where `truth_m`
         has another length than the exchanges.
         """
@@ -119,15 +136,15 @@ class Ranges:
         truth_m: ArrayLike = math.nan,
         time_ns: ArrayLike = 0,
         protocol: str = "ds",
-        weights: tuple[ArrayLike, ArrayLike] = HALVES,
+        weights: tuple[ArrayLike, ArrayLike] = (0.5, 0.5),
         source: str = IN_MEMORY,
     ) -> Ranges:
         """Return a row for every range of arrays (n,), metres and dBm; a single number serves all rows.
 
-        `truth_m` and `time_ns` are needed to fit, and not to correct. Where there is one power only it is `fpp1_dbm`.
-        `weights` are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as if both clocks ran
-        alike, which no range notices by more than a hundredth of a millimetre. Raises `BadInputError` where the arrays
-        do not fit each other.
+        `truth_m` and `time_ns` are needed to fit, and not to correct. A single power per range is `fpp1_dbm`. `weights`
+        are those of the two delays (`uwblink.twr.delay_weights`): by default halves, as if both clocks ran alike, which
+        changes no range by more than a hundredth of a millimetre. Raises `BadInputError` where the arrays do not fit
+        each other.
 
         >>> from calib import Ranges
         >>> len(Ranges.from_arrays([3.1, 4.2], initiator=1, target=[2, 3], fpp1_dbm=-85.0))
@@ -137,7 +154,7 @@ class Ranges:
             raise BadInputError(f"found {protocol!r:.40}, allowed: {', '.join(PROTOCOLS)}", parameter="protocol")
         if len(weights) != 2:
             raise BadInputError(f"found {len(weights)}, expected those of initiator and target", parameter="weights")
-        columns = {
+        floats = {
             "raw_m": range_m,
             "truth_m": truth_m,
             "fpp1_dbm": fpp1_dbm,
@@ -145,22 +162,22 @@ class Ranges:
             "weight_initiator": weights[0],
             "weight_target": weights[1],
         }
-        ids = {"initiator": initiator, "target": target, "time_ns": time_ns}
+        ints = {"initiator": initiator, "target": target, "time_ns": time_ns}
         try:
-            floats = [np.asarray(column, dtype=np.float64) for column in columns.values()]
-            ints = [np.asarray(column).astype(np.int64, casting="same_kind") for column in ids.values()]
-            rows = np.broadcast_arrays(*np.atleast_1d(*floats, *ints))
+            arrays = [np.asarray(column, dtype=np.float64) for column in floats.values()]
+            arrays += [np.asarray(column).astype(np.int64, casting="same_kind") for column in ints.values()]
+            rows = np.broadcast_arrays(*np.atleast_1d(*arrays))
         except (TypeError, ValueError) as error:
             raise BadInputError(f"arrays of ranges do not fit each other: {error}") from error
         if rows[0].ndim != 1:
             raise BadInputError(f"has shape {np.shape(range_m)}, expected one dimension", parameter="range_m")
-        filled: dict[str, Any] = dict(zip([*columns, *ids], rows, strict=True))
-        if np.any(filled["initiator"] == filled["target"]):
-            row = int(np.argmax(filled["initiator"] == filled["target"]))
-            raise BadInputError(f"row {row} is of tag {filled['target'][row]} with itself", parameter="target")
-        filled |= {name: measured_powers(filled[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
-        kind = np.full(len(rows[0]), protocol)
-        return cls(source=source, protocol=kind, excluded={}, planted=None, **filled)
+        columns: dict[str, Any] = dict(zip([*floats, *ints], rows, strict=True))
+        itself = columns["initiator"] == columns["target"]
+        if itself.any():
+            row = int(np.argmax(itself))
+            raise BadInputError(f"row {row} is of tag {columns['target'][row]} with itself", parameter="target")
+        columns |= {name: measured_powers(columns[name]) for name in ("fpp1_dbm", "fpp2_dbm")}
+        return cls(source=source, protocol=np.full(len(rows[0]), protocol), excluded={}, planted=None, **columns)
 
     def __len__(self) -> int:
         """Return the number of ranges."""
@@ -168,7 +185,7 @@ class Ranges:
 
     def __getitem__(self, rows: Bools | Ints | slice) -> Ranges:
         """Return the chosen rows, in their order."""
-        columns: dict[str, Any] = {name: picked(getattr(self, name), rows) for name in COLUMNS}
+        columns: dict[str, Any] = {name: _rows_of(getattr(self, name), rows) for name in COLUMNS}
         return replace(self, **columns)
 
     def __repr__(self) -> str:
@@ -179,55 +196,89 @@ class Ranges:
     def tags(self) -> list[int]:
         """Return the ids of the tags that range, in order."""
         counts = [np.bincount(ids) > 0 for ids in (self.initiator, self.target)]
-        let_go(self.initiator, self.target)
         return sorted({*np.flatnonzero(counts[0]).tolist(), *np.flatnonzero(counts[1]).tolist()})
 
     def usable(self, why_no_truth: str = "", why_no_power: str = "", *, need_power: bool = True) -> Ranges:
-        """Leave out what is of a tag with itself, has no true distance, no power or impossible stamps, and count it.
+        """Leave out and count ranges of a tag with itself, without true distance, without power, of impossible stamps.
 
-        Without `need_power`, ranges without any stay. Raises `UnanswerableError` where nothing is left, with
+        Without `need_power`, ranges without power stay. Raises `UnanswerableError` where nothing is left, with
         `why_no_truth` or `why_no_power` where that is the reason.
         """
-        found = usable_rows(self, need_power=need_power)
-        require_some(self.source, len(self), found.excluded, why_no_truth, why_no_power)
-        if found.keep.all():
-            return self
-        return replace(self[found.keep], excluded=self.excluded | {r: n for r, n in found.excluded.items() if n})
+        found, excluded = usable_rows(self, need_power=need_power)
+        require_some(self.source, len(self), excluded, why_no_truth, why_no_power)
+        return found
 
 
-@dataclass(frozen=True, slots=True)
-class Usable:
-    """Which ranges can be used, (n,), and how many not for which reason, in the order in which they are looked for."""
-
-    keep: Bools
-    excluded: dict[str, int]
-
-
-def usable_rows(ranges: Ranges, *, need_power: bool) -> Usable:
-    """Return which of some ranges can be used, and how many not for which reason."""
-    keep, excluded = np.ones(len(ranges), dtype=bool), Counter[str]()
-    for rows in spans(len(ranges)):
-        for reason, good in _good(ranges, rows, need_power=need_power):
-            excluded[reason] += int(np.count_nonzero(keep[rows] & ~good))
-            keep[rows] &= good
-        let_go(ranges.initiator, ranges.target, ranges.truth_m, ranges.fpp1_dbm, ranges.fpp2_dbm, ranges.raw_m)
-    return Usable(keep, dict(excluded))
+def _rows_of(column: NDArray[Any], rows: Bools | Ints | slice) -> NDArray[Any]:
+    """Return rows of a column (n,); one value that stands for all rows is not copied."""
+    if column.strides == (0,) and len(column):
+        return np.broadcast_to(column[0], np.empty(len(column), np.bool_)[rows].shape)
+    return np.asarray(column[rows])
 
 
-def _good(ranges: Ranges, rows: slice, *, need_power: bool) -> Iterator[tuple[str, Bools]]:
-    """Yield what some ranges may lack, and which of them do not."""
-    yield "a tag with itself", ranges.initiator[rows] != ranges.target[rows]
-    yield "no true distance", np.isfinite(ranges.truth_m[rows])
-    powers = np.isfinite(ranges.fpp1_dbm[rows]) | np.isfinite(ranges.fpp2_dbm[rows])
-    yield "no power", np.asarray(powers | (not need_power))
-    raw = ranges.raw_m[rows]
-    yield "impossible stamps", np.isfinite(raw) & (np.abs(raw) < LONGEST_M)
+def measured_powers(fpp_dbm: Floats) -> Floats:
+    """Return first-path powers (n,) in dBm, NaN where the number cannot be one."""
+    with np.errstate(invalid="ignore"):
+        return np.where((fpp_dbm < LOUDEST_DBM) & (fpp_dbm > FAINTEST_DBM), fpp_dbm, np.nan)
+
+
+def columns_of(
+    exchanges: Exchanges, given_m: Floats, poses: Poses | Tracks | None, tags: Sequence[Tag]
+) -> dict[str, Any]:
+    """Return exchanges as the columns of ranges, with true distances `given_m` (n,), from poses where they are NaN.
+
+    The stamps of some exchanges at a time are worked on, so that what leads to ranges stays small beside them.
+    """
+    at_once = 65_536
+    raw, initiator, target = (np.empty(len(exchanges)) for _ in range(3))
+    middle = np.empty(len(exchanges), dtype=np.int64)
+    for begin in range(0, len(exchanges), at_once):
+        rows = slice(begin, begin + at_once)
+        some = exchanges[rows]
+        raw[rows], (initiator[rows], target[rows]) = raw_range(some), delay_weights(some)
+        middle[rows] = middle_ns(some)
+    known, truth = np.isfinite(given_m), given_m
+    if not known.all() and poses is not None and len(poses):
+        # A range belongs to the middle of its first two messages.
+        truth = np.where(known, given_m, distances_m(poses, tags, exchanges.initiator, exchanges.target, middle))
+    bare = without_stamps(exchanges)
+    return {
+        "time_ns": exchanges.time_ns,
+        "initiator": exchanges.initiator,
+        "target": exchanges.target,
+        "protocol": np.where(bare, NO_STAMPS, exchanges.protocol) if bare.any() else exchanges.protocol,
+        "raw_m": raw,
+        "truth_m": truth,
+        "weight_initiator": initiator,
+        "weight_target": target,
+        "fpp1_dbm": measured_powers(exchanges.fpp1_dbm),
+        "fpp2_dbm": measured_powers(exchanges.fpp2_dbm),
+    }
+
+
+def usable_rows(ranges: Ranges, *, need_power: bool) -> tuple[Ranges, dict[str, int]]:
+    """Return the ranges that a fit can use, and how many not for which reason; a range counts for the first one."""
+    raw = ranges.raw_m
+    powers = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm)
+    good = {
+        "a tag with itself": ranges.initiator != ranges.target,
+        "no true distance": np.isfinite(ranges.truth_m),
+        "no power": powers | (not need_power),
+        "impossible stamps": np.isfinite(raw) & (np.abs(raw) < MAX_RANGE_M),
+    }
+    keep, excluded = np.ones(len(ranges), dtype=bool), dict[str, int]()
+    for reason, rows in good.items():
+        excluded[reason] = int(np.count_nonzero(keep & ~rows))
+        keep &= rows
+    if keep.all():
+        return ranges, excluded
+    return replace(ranges[keep], excluded=ranges.excluded | {r: n for r, n in excluded.items() if n}), excluded
 
 
 def require_some(
     source: str, count: int, excluded: Mapping[str, int], why_no_truth: str, why_no_power: str = ""
 ) -> None:
-    """Raise `UnanswerableError` where there are no ranges, or all of so many were left out, and say for what."""
+    """Raise `UnanswerableError` that gives the reason where there are no ranges, or all of `count` were left out."""
     if not count:
         raise UnanswerableError(f"{source}: holds no exchanges")
     if sum(excluded.values()) < count:
@@ -244,50 +295,27 @@ def require_some(
     raise UnanswerableError(f"{source}: none of its {count} exchanges can be used: {most}{hint}")
 
 
-APART: Final = (
-    "source",
-    "excluded",
-    "planted",
-    "left_skew",
-    "clocks_apart",
-    "recordings",
-    "bodies",
-    "sessions",
-    "antenna_delays",
-)
-"""What is no column."""
-
-COLUMNS = tuple(f.name for f in fields(Ranges) if f.name not in APART)
-
-
 def concatenate(parts: Sequence[Ranges]) -> Ranges:
     """Join the ranges of several recordings, in their order.
 
     Raises `BadInputError` where other antenna delays were programmed into a tag in one of them than in another.
     """
-    columns: dict[str, Any] = {name: joined([getattr(p, name) for p in parts]) for name in COLUMNS}
+    columns: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS}
     columns["session"], names = _sessions(parts)
-    reasons = sorted({reason for p in parts for reason in p.excluded})
+    skews = [part.left_skew for part in parts if part.left_skew]
+    apart = [part.clocks_apart for part in parts if part.clocks_apart]
     return Ranges(
         source=", ".join(p.source for p in parts),
-        excluded={r: sum(p.excluded.get(r, 0) for p in parts) for r in reasons},
+        excluded={r: sum(p.excluded.get(r, 0) for p in parts) for r in sorted({r for p in parts for r in p.excluded})},
         planted=parts[0].planted,
-        left_skew=worst([p.left_skew for p in parts]),
-        clocks_apart=farthest(p.clocks_apart for p in parts),
+        left_skew=max(skews, key=lambda one: one.bound_m, default=None),
+        clocks_apart=max(apart, key=lambda one: one.moves_m, default=None),
         recordings=tuple(one for p in parts for one in p.recordings),
         bodies=_bodies_of_all(parts),
         sessions=names,
         antenna_delays=_antenna_delays_of_all(parts),
         **columns,
     )
-
-
-def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
-    """Return what a recording's `meta` says was programmed; raises `BadInputError` where it cannot be understood."""
-    try:
-        return delays_in_meta(meta)
-    except ValueError as error:
-        raise BadInputError(f"{source}: {error}") from error
 
 
 def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:
@@ -310,12 +338,14 @@ def _antenna_delays_of_all(parts: Sequence[Ranges]) -> AntennaDelays:
 def _sessions(parts: Sequence[Ranges]) -> tuple[Ints, tuple[str, ...]]:
     """Return the session of each range of recordings that are joined (n,), and the names of the sessions.
 
-    Recordings that ran at the same time, by the hosts' clocks, are one session.
+    Recordings that ran at the same time, by the clocks of their hosts, are one session.
     """
+    # Times of a host's clock count from 1970 (`uwblink record`): they are beyond 20 years. Others count from a start.
+    of_host_ns = 20 * 365 * 86_400 * 1_000_000_000
     number, names, ends = list[Ints](), list[str](), list[tuple[int, int]]()
     for part in parts:
         begin, end = (int(part.time_ns.min()), int(part.time_ns.max())) if len(part) else (0, 0)
-        together = [k for k, (first, last) in enumerate(ends) if begin > CLOCK_NS and begin <= last and first <= end]
+        together = [k for k, (first, last) in enumerate(ends) if begin > of_host_ns and begin <= last and first <= end]
         if together and len(part.sessions) < 2:
             k = together[0]
             names[k], ends[k] = f"{names[k]}, {part.source}", (min(ends[k][0], begin), max(ends[k][1], end))
@@ -333,31 +363,26 @@ def bodies_of(tags: Iterable[Tag]) -> tuple[tuple[int, str], ...]:
 
 
 def _bodies_of_all(parts: Sequence[Ranges]) -> tuple[tuple[int, str], ...]:
-    """Return the bodies of tags that sit on the same ones in all recordings; none where some tag changes its body."""
+    """Return the bodies of tags that sit on the same ones in all recordings; none where a tag changes its body."""
     every = {one for part in parts for one in part.bodies}
     return tuple(sorted(every)) if len({tag for tag, _ in every}) == len(every) else ()
 
 
-STATIC = "static"
-STATIC_S = 2.0
-STATIC_M = 0.02
-
-
-def without_static(ranges: Ranges) -> Ranges:
+def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.02) -> Ranges:
     """Leave out spans of two seconds in which a pair's distance stays within two centimetres.
 
     A flight that waits on the ground repeats one geometry, and with it one error. Raises `UnanswerableError` where
     nothing ever moves.
     """
     low, high = np.minimum(ranges.initiator, ranges.target), np.maximum(ranges.initiator, ranges.target)
-    span = (ranges.time_ns - ranges.time_ns.min()) // int(STATIC_S * 1e9)
+    span = (ranges.time_ns - ranges.time_ns.min()) // int(span_s * 1e9)
     order = np.lexsort((span, high, low))
     keys = np.column_stack([low, high, span])[order]
     starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=keys[:1] - 1) != 0, axis=1))
     truth = ranges.truth_m[order]
     reach = np.maximum.reduceat(truth, starts) - np.minimum.reduceat(truth, starts)
     moves = np.empty(len(ranges), dtype=bool)
-    moves[order] = np.repeat(reach > STATIC_M, np.diff(starts, append=len(ranges)))
+    moves[order] = np.repeat(reach > within_m, np.diff(starts, append=len(ranges)))
     if not moves.any():
         raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` leaves nothing")
     count = int(np.count_nonzero(~moves))
