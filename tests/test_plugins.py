@@ -140,7 +140,7 @@ def test_without_the_distribution_its_recordings_say_what_is_missing(run, tmp_pa
     words = [str(Path(sys.executable).parent / "uwblink"), "show", str(tmp_path / "t.uwb")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {tmp_path / 't.uwb'}: exchanges of an unknown protocol; known are ds, ")
+    assert done.stderr.startswith(f"error: {tmp_path / 't.uwb'}: exchanges of an unknown protocol; known are ss, ")
 
 
 @pytest.mark.parametrize("command", ["uwblink", "uwbsim", "calib"])

@@ -357,7 +357,7 @@ def test_live_poses_go_through_no_planted_link(tmp_path):
 
 
 def test_a_snapshot_goes_through_no_planted_link(tmp_path):
-    from uwblink.recording.snapshots import SnapshotMaker
+    from uwblink.recording.file import SnapshotMaker
 
     path, secret = tmp_path / "live.uwb", tmp_path / "secret.txt"
     secret.write_text(SECRET)

@@ -10,13 +10,13 @@ import stat
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from uwblink.errors import RecordingError
 from uwblink.interrupts import interrupts_held
 
-if TYPE_CHECKING:
-    import duckdb
+with interrupts_held():  # an interrupt within this import ends the process in C++
+    import duckdb as duckdb
 
 STORAGE_VERSION: Final = "v1.5.0"
 """Storage of new files: that of the lowest version in pyproject.toml, so that every allowed version reads them."""
@@ -47,9 +47,6 @@ def connect(
     It keeps `memory_mb` in memory, by default most of what there is, and the rest in the folder `temporary`. Raises
     what DuckDB raises, and what `check_log` raises.
     """
-    with interrupts_held():  # one within its import ends the process in C++
-        import duckdb
-
     if path is not None:
         check_log(path)
     limits = {

@@ -17,8 +17,8 @@ from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from uwblink.exporters import check_export, export_recording
 from uwblink.output import check_output
+from uwblink.recording.contents import READING_MB, exchanges_with_poses
 from uwblink.recording.file import Recording
-from uwblink.recording.pieces import READING_MB, exchanges_with_poses
 from uwblink.twr import Exchanges
 
 NUMBERS: Final = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")

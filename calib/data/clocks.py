@@ -11,7 +11,7 @@ import numpy as np
 from uwblink.arrays import Bools, Floats
 from uwblink.protocols.formulas import Intervals
 from uwblink.protocols.table import PROTOCOLS, is_single_sided
-from uwblink.recording.relative_clocks import IMPOSSIBLE_PPM, target_faster_ppm
+from uwblink.recording import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import COLUMNS, Exchanges, intervals, names_in, without_stamps
 

@@ -15,9 +15,8 @@ from calib.errors import BadInputError, UnanswerableError
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of
-from uwblink.recording.distances import distances_m
+from uwblink.recording.distances import Tracks, distances_m
 from uwblink.recording.schema import Poses, Tag
-from uwblink.recording.tracks import Tracks
 from uwblink.twr import Exchanges, delay_weights, middle_ns, raw_range, without_stamps
 
 IN_MEMORY: Final = "memory"

@@ -37,10 +37,10 @@ from calib.data.ranges import (
 from calib.errors import BadInputError, UnanswerableError
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
+from uwblink.recording.distances import Tracks
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, Fault, KnownDistance, Poses, Tag
 from uwblink.recording.target_reports import single_exchange_blocks, single_reports
-from uwblink.recording.tracks import Tracks
 from uwblink.twr import Exchanges, names_in
 
 EXCHANGES_AT_ONCE: Final = 131_072

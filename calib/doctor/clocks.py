@@ -16,7 +16,7 @@ from calib.estimation.plausibility import robust_slope
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.protocols.table import single_sided
-from uwblink.recording.relative_clocks import clock_skews
+from uwblink.recording import clock_skews
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import Exchanges, intervals, without_stamps
 

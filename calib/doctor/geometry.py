@@ -15,9 +15,8 @@ import numpy as np
 from calib.doctor.base import RecordingView, spread_m
 from calib.doctor.checks import Seen, narrower
 from uwblink.errors import ImportTableError
-from uwblink.recording.distances import distances_m
+from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.schema import Poses, Tag
-from uwblink.recording.time_offset import find_offset
 
 LARGEST_OFFSET_S: Final = 3.0
 SMALLEST_OFFSET_S: Final = 0.03

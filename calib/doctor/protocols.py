@@ -12,7 +12,7 @@ from calib.doctor.base import RecordingView, plausible_share
 from calib.doctor.checks import Seen
 from uwblink.arrays import Bools
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.recording.relative_clocks import target_faster_ppm
+from uwblink.recording import target_faster_ppm
 from uwblink.twr import Exchanges, raw_range
 
 WIDTHS: Final = (32, 40)

@@ -19,9 +19,8 @@ import numpy as np
 from uwblink.boards.listeners import Heard, Listener
 from uwblink.database import log_of
 from uwblink.errors import RecordingError
-from uwblink.recording.file import Recording
+from uwblink.recording.file import Recording, SnapshotMaker
 from uwblink.recording.schema import CirRow, Fault, FrameRow
-from uwblink.recording.snapshots import SnapshotMaker
 from uwblink.twr import Exchanges
 from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import Cir, Overheard, RangeReport

@@ -15,7 +15,7 @@ from uwblink.exporters.tables import write_csv, write_parquet
 from uwblink.exporters.tum import write_tum
 from uwblink.output import place_beside, take_name
 from uwblink.plugins import NAME, Registry
-from uwblink.recording.soundness import check_name
+from uwblink.recording.intake import check_name
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,9 +19,8 @@ from uwblink.arrays import Floats
 from uwblink.errors import RecordingError
 from uwblink.exporters.corrections import corrections
 from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
-from uwblink.recording.contents import Contents
+from uwblink.recording.contents import READING_MB, Contents, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
-from uwblink.recording.pieces import READING_MB, distances_by_poses_m, pieces
 
 WORLD: Final = "world"
 WARNING: Final = 3

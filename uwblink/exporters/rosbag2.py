@@ -17,9 +17,8 @@ import numpy as np
 
 from uwblink.errors import RecordingError
 from uwblink.exporters.corrections import variances
-from uwblink.recording.contents import Contents
+from uwblink.recording.contents import READING_MB, Contents, pieces
 from uwblink.recording.file import Recording
-from uwblink.recording.pieces import READING_MB, pieces
 
 WORLD: Final = "world"
 WARN: Final = 30

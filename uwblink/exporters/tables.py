@@ -17,8 +17,8 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.database import check_log, connect, log_of
 from uwblink.errors import RecordingError, first_line
+from uwblink.recording.contents import distances_by_poses_m
 from uwblink.recording.file import Recording
-from uwblink.recording.pieces import distances_by_poses_m
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
 
 if TYPE_CHECKING:

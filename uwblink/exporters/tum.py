@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from uwblink.errors import RecordingError
+from uwblink.recording.contents import READING_MB, pieces
 from uwblink.recording.file import Recording
-from uwblink.recording.pieces import READING_MB, pieces
 from uwblink.recording.schema import Poses
 
 

@@ -29,7 +29,7 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
         raise ImportTableError(f"{folder}: holds no exchanges.csv or exchanges.parquet, as 'uwblink export' writes")
     with TemporaryDirectory() as place:
         path = Path(place) / "exported.uwb"
-        store = Store.create(path, path)
+        store = Store.write(path, path)
         try:
             for table, source in paths.items():
                 if source is not None:

@@ -15,11 +15,10 @@ from uwblink.columns import few_words
 from uwblink.errors import ImportTableError, RecordingExistsError
 from uwblink.importers.poses import read_poses
 from uwblink.importers.units import other_unit
-from uwblink.recording.distances import distances_m
+from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.tags import load_places
-from uwblink.recording.time_offset import find_offset
 from uwblink.twr import Exchanges, raw_range
 
 MOST_RANGES: Final = 2000

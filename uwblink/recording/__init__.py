@@ -1,15 +1,10 @@
 """The recording: file, tables, summary, and distances between its tags."""
 
-from typing import TYPE_CHECKING, Final
-
-from uwblink.lazy import offer
-
-if TYPE_CHECKING:
-    from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delays_in_meta, load_antenna_delays
-    from uwblink.recording.relative_clocks import clock_skews
-    from uwblink.recording.summary import Summary, counted
+from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delays_in_meta, load_antenna_delays
+from uwblink.recording.summary import IMPOSSIBLE_PPM, Summary, clock_skews, counted, target_faster_ppm
 
 __all__ = [
+    "IMPOSSIBLE_PPM",
     "AntennaDelay",
     "AntennaDelays",
     "Summary",
@@ -17,16 +12,5 @@ __all__ = [
     "counted",
     "delays_in_meta",
     "load_antenna_delays",
+    "target_faster_ppm",
 ]
-
-_HOMES: Final = {
-    "Summary": "uwblink.recording.summary",
-    "clock_skews": "uwblink.recording.relative_clocks",
-    "counted": "uwblink.recording.summary",
-    **dict.fromkeys(
-        ("AntennaDelay", "AntennaDelays", "delays_in_meta", "load_antenna_delays"), "uwblink.recording.antenna_delays"
-    ),
-}
-
-if not TYPE_CHECKING:
-    __getattr__, __dir__ = offer(__name__, _HOMES)

@@ -1,32 +1,31 @@
-"""Everything that a recording holds, in memory: loaded at once, cut, and written again."""
+"""What a recording holds, in memory: all at once, cut and written again; or in pieces of time, for long recordings."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.arrays import Bools, Ints
+from uwblink.arrays import Bools, Floats
 from uwblink.display import as_html, first_few, printable
 from uwblink.errors import ArgumentError
+from uwblink.recording.distances import distances_m
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Arrangement, CirRow, Fault, FrameRow, KnownDistance, Poses, Tag
 from uwblink.recording.summary import counted
-from uwblink.twr import Exchanges
+from uwblink.twr import LATEST_NS, Exchanges, middle_ns
 
 Pairs = Iterable[tuple[int, int]]
-LONGEST_S: Final = 2**62 * 1e-9
-ROWS_AT_A_TIME: Final = 500_000
-"""Exchanges that are written at once: DuckDB holds what it has not committed in memory."""
+Row = TypeVar("Row", CirRow, FrameRow, Fault)
 
-
-def _no_poses() -> Poses:
-    return Poses.from_arrays([], "", (0.0, 0.0, 0.0))
+READING_MB: Final = 300
+"""Memory for a file that is read in pieces; without a limit, it would be the size of the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +44,7 @@ class Contents:
 
     exchanges: Exchanges
     tags: list[Tag] = field(default_factory=list)
-    poses: Poses = field(default_factory=_no_poses)
+    poses: Poses = field(default_factory=lambda: Poses.from_arrays([], "", (0.0, 0.0, 0.0)))
     overheard: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     imu: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     height: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -74,24 +73,40 @@ class Contents:
         Raises `ArgumentError`.
         """
         first_ns, end_ns = self._bounds(start_s, stop_s)
-        chosen = _Choice(first_ns, end_ns, _ids("tags", tags), _pairs(pairs))
-        x, heard = self.exchanges, self.overheard
-        kept = {"start_s": start_s, "stop_s": stop_s, "tags": tags and sorted(tags), "pairs": chosen.pairs}
+        of_tags, of_pairs = _ids(tags), _pairs(pairs)
+
+        def chosen(columns: Mapping[str, NDArray[Any]]) -> Bools:
+            """Return which rows are in the span, and where they are of two tags, of these tags and pairs."""
+            good: Bools = (columns["time_ns"] >= first_ns) & (columns["time_ns"] < end_ns)
+            if "initiator" in columns:
+                ends = columns["initiator"], columns["target"]
+                if of_tags is not None:
+                    good &= np.isin(ends[0], of_tags) & np.isin(ends[1], of_tags)
+                if of_pairs is not None:
+                    hits = [(ends[0] == i) & (ends[1] == j) for i, j in of_pairs]
+                    good &= np.any(hits, axis=0) if hits else False
+            return good
+
+        def rows(listed: list[Row], *names: str) -> list[Row]:
+            columns = {name: np.array([getattr(row, name) for row in listed]) for name in ("time_ns", *names)}
+            return [row for row, good in zip(listed, chosen(columns).tolist(), strict=True) if good]
+
+        cut: dict[str, Any] = {}
+        for table in _COLUMNS:
+            if columns := getattr(self, table):
+                good = chosen(columns)
+                cut[table] = {name: column[good] for name, column in columns.items()}
+        kept = {"start_s": start_s, "stop_s": stop_s, "tags": tags and sorted(tags), "pairs": of_pairs}
         return replace(
             self,
-            exchanges=x[chosen.rows(x.time_ns, x.initiator, x.target)],
+            exchanges=self.exchanges[chosen(self.exchanges.to_dict())],
             poses=_around(self.poses, first_ns, end_ns),
-            overheard=_overheard(heard, chosen),
-            powers=_overheard(self.powers, chosen),
-            corrected=_overheard(self.corrected, chosen),
-            imu=_between(self.imu, first_ns, end_ns),
-            height=_between(self.height, first_ns, end_ns),
-            temperature=_between(self.temperature, first_ns, end_ns),
-            cirs=[row for row in self.cirs if chosen.has(row.time_ns, row.initiator, row.target)],
-            frames=[row for row in self.frames if first_ns <= row.time_ns < end_ns],
-            faults=[row for row in self.faults if first_ns <= row.time_ns < end_ns],
+            cirs=rows(self.cirs, "initiator", "target"),
+            frames=rows(self.frames),
+            faults=rows(self.faults),
             arrangements=[row for row in self.arrangements if row.start_ns < end_ns and first_ns <= row.end_ns],
             meta={**self.meta, "selected": {key: value for key, value in kept.items() if value is not None}},
+            **cut,
         )
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -100,15 +115,11 @@ class Contents:
         with Recording.create(path, meta=meta, force=force) as recording:
             recording.append_tags(self.tags)
             recording.append_poses(self.poses)
-            for start in range(0, len(self.exchanges), ROWS_AT_A_TIME):
-                recording.append_exchanges(self.exchanges[start : start + ROWS_AT_A_TIME])
-            for table in _COLUMNS:
-                recording.append_columns(table, getattr(self, table))
-            recording.append_cirs(self.cirs)
-            recording.append_frames(self.frames)
-            recording.append_faults(self.faults)
-            recording.append_arrangements(self.arrangements)
-            recording.append_distances(self.known_distances)
+            # 500 000 at once: DuckDB holds what it has not committed in memory.
+            for start in range(0, len(self.exchanges), 500_000):
+                recording.append_exchanges(self.exchanges[start : start + 500_000])
+            for table in (*_COLUMNS, *_LISTS):
+                recording.append({"known_distances": "distances"}.get(table, table), getattr(self, table))
 
     def __repr__(self) -> str:
         """Return a headline, what else there is, and the first exchanges."""
@@ -125,10 +136,9 @@ class Contents:
         return f"{len(self.tags)} tags on {bodies}; {also}"
 
     def _numbers(self) -> dict[str, int]:
-        numbers = {"exchanges": len(self.exchanges), "poses": len(self.poses)}
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        numbers |= {name: len(found["time_ns"]) if found else 0 for name, found in columns.items()}
-        return numbers | {name: len(getattr(self, name)) for name in _LISTS}
+        columns = {name: len(getattr(self, name).get("time_ns", ())) for name in _COLUMNS}
+        lists = {name: len(getattr(self, name)) for name in _LISTS}
+        return {"exchanges": len(self.exchanges), "poses": len(self.poses)} | columns | lists
 
     def counts(self) -> dict[str, int]:
         """Return how many rows there are by table: the exchanges, and of the others those that have any."""
@@ -136,14 +146,13 @@ class Contents:
 
     def _bounds(self, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
         for name, value in (("start_s", start_s), ("stop_s", stop_s)):
-            if value is not None and not abs(value) < LONGEST_S:
+            if value is not None and not abs(value) < LATEST_NS * 1e-9:
                 raise ArgumentError(f"{name}: found {value!r}, expected seconds since the first exchange")
         if start_s is not None and stop_s is not None and stop_s < start_s:
             raise ArgumentError(f"stop_s: found {stop_s:g}, expected no less than start_s, {start_s:g}")
         origin = int(self.exchanges.time_ns.min()) if len(self.exchanges) else 0
-        far = 2**62
-        first = -far if start_s is None else origin + round(start_s * 1e9)
-        return first, far if stop_s is None else origin + round(stop_s * 1e9)
+        first = -LATEST_NS if start_s is None else origin + round(start_s * 1e9)
+        return first, LATEST_NS if stop_s is None else origin + round(stop_s * 1e9)
 
 
 _LISTS: Final = ("cirs", "frames", "faults", "arrangements", "known_distances")
@@ -174,42 +183,6 @@ def load(path: str | os.PathLike[str]) -> Contents:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class _Choice:
-    """A span of time, and of whom: None for all."""
-
-    first_ns: int
-    end_ns: int
-    tags: list[int] | None
-    pairs: list[tuple[int, int]] | None
-
-    def rows(self, time_ns: Ints, initiator: Ints, target: Ints) -> Bools:
-        good: Bools = (time_ns >= self.first_ns) & (time_ns < self.end_ns)
-        if self.tags is not None:
-            good &= np.isin(initiator, self.tags) & np.isin(target, self.tags)
-        if self.pairs is not None:
-            hits = [(initiator == i) & (target == j) for i, j in self.pairs]
-            good &= np.any(hits, axis=0) if hits else False
-        return good
-
-    def has(self, time_ns: int, initiator: int, target: int) -> bool:
-        return bool(self.rows(np.array([time_ns]), np.array([initiator]), np.array([target]))[0])
-
-
-def _overheard(heard: Mapping[str, NDArray[Any]], chosen: _Choice) -> Mapping[str, NDArray[Any]]:
-    if not heard:
-        return heard
-    rows = chosen.rows(heard["time_ns"], heard["initiator"], heard["target"])
-    return {name: column[rows] for name, column in heard.items()}
-
-
-def _between(columns: Mapping[str, NDArray[Any]], first_ns: int, end_ns: int) -> Mapping[str, NDArray[Any]]:
-    if not columns:
-        return columns
-    rows = (columns["time_ns"] >= first_ns) & (columns["time_ns"] < end_ns)
-    return {name: column[rows] for name, column in columns.items()}
-
-
 def _around(poses: Poses, first_ns: int, end_ns: int) -> Poses:
     """Return each body's poses in a span of time, and the ones next to it, between which it is interpolated."""
     keep = np.zeros(len(poses), dtype=bool)
@@ -222,11 +195,11 @@ def _around(poses: Poses, first_ns: int, end_ns: int) -> Poses:
     return poses[keep]
 
 
-def _ids(name: str, ids: Collection[int] | None) -> list[int] | None:
+def _ids(ids: Collection[int] | None) -> list[int] | None:
     if ids is None:
         return None
     if isinstance(ids, str | bytes) or not all(isinstance(i, int | np.integer) for i in ids):
-        raise ArgumentError(f"{name}: found {ids!r:.60}, expected ids of tags, as [1, 2]")
+        raise ArgumentError(f"tags: found {ids!r:.60}, expected ids of tags, as [1, 2]")
     return sorted(int(i) for i in ids)
 
 
@@ -237,3 +210,45 @@ def _pairs(pairs: Pairs | None) -> list[tuple[int, int]] | None:
     if not all(len(pair) == 2 and all(isinstance(i, int | np.integer) for i in pair) for pair in listed):
         raise ArgumentError(f"pairs: found {listed!r:.60}, expected pairs of initiator and target, as [(1, 2)]")
     return [(int(i), int(j)) for i, j in listed]
+
+
+def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
+    """Yield what has a time, piece by piece, about so many rows of a table each: later rows are in later pieces.
+
+    Bytes, impulse responses and total powers are left out, and so is `corrected` where it is not that of the exchanges,
+    row by row.
+    """
+    fitting = recording.corrected_is_of_exchanges()
+    edges = {-LATEST_NS, LATEST_NS}
+    for table in ("exchanges", "poses", "imu", "height", "temperature", "corrected", "faults"):
+        edges |= set(recording.times_apart(table, rows))
+    for start_ns, end_ns in pairwise(sorted(edges)):
+        yield Contents(
+            exchanges=recording.exchanges_between(start_ns, end_ns),
+            poses=recording.poses(start_ns, end_ns),
+            imu=recording.imu(start_ns, end_ns),
+            height=recording.heights(start_ns, end_ns),
+            temperature=recording.temperatures(start_ns, end_ns),
+            corrected=recording.corrected(start_ns, end_ns) if fitting else {},
+            faults=recording.faults(start_ns, end_ns),
+        )
+
+
+def distances_by_poses_m(recording: Recording, blocks: Iterable[Exchanges]) -> Iterator[Floats]:
+    """Yield the distances (n,) at which the antennas of each block of exchanges were by the poses; NaN without poses.
+
+    A distance is that in the middle of the first two messages, to which a range belongs.
+    """
+    tracks, tags = recording.pose_windows().tracks, recording.tags()
+    for some in blocks:
+        yield distances_m(tracks, tags, some.initiator, some.target, middle_ns(some))
+
+
+def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Poses]]:
+    """Yield all exchanges in the order of their rows, some at a time, and the poses between which they are.
+
+    Distances at the exchanges' times, and at the middles of their messages, are what they are with all poses.
+    """
+    windows = recording.pose_windows()
+    for block in recording.exchange_blocks():
+        yield from windows.beside(block)

@@ -1,43 +1,53 @@
 """The recording: one DuckDB file (`.uwb`) that simulator, recorder and importers write alike.
 
-Column meanings are those of `uwblink.twr.Exchanges`; the tables are listed in
-docs/architecture.md.
+Column meanings are those of `uwblink.twr.Exchanges`; the tables are listed in docs/architecture.md.
+
+DuckDB lets one process have a file. So a reader that finds a recording in use puts a request beside it, an empty hidden
+file; the writer copies what it has committed into a file beside the request, on a second connection of its own, so
+that recording goes on meanwhile; and the reader opens that file and deletes its name. Nothing is left behind.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
+import threading
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from uuid import uuid4
 
 from uwblink.database import log_of
 from uwblink.errors import RecordingError, RecordingInUseError, RecordingMissingError
-from uwblink.output import check_output, place_beside
-from uwblink.recording.readers import TableReaders, known_tables
-from uwblink.recording.schema import (
-    FORMAT_VERSION,
-    SUFFIX,
-    TABLES,
-    standard_meta,
-)
-from uwblink.recording.snapshots import open_snapshot
-from uwblink.recording.soundness import is_locked
+from uwblink.output import PARTIAL, check_output, place_beside
+from uwblink.recording.intake import is_locked
+from uwblink.recording.schema import FORMAT_VERSION, SUFFIX, TABLES, standard_meta
 from uwblink.recording.store import Store
-from uwblink.recording.writers import TableWriters
+from uwblink.recording.tables import Tables, known_tables
 from uwblink.text_files import require_regular
 
 if TYPE_CHECKING:
     from uwblink.recording.summary import Summary
 
 COPYING_MB: Final = 300
-"""Of a file that is written again so much is kept in memory; without a limit, all of it."""
+"""Memory for a file that is written again; without a limit, it would be the size of the file."""
+
+WANTED: Final = ".wanted"
+BEGUN: Final = ".partial-begun"
+READY: Final = ".snapshot"
+"""Endings of a request for a snapshot, of one that is being worked on, and of the snapshot."""
+
+PATIENCE_S: Final = 30.0
+"""How long a snapshot may take: a disk of 100 MB/s copies 3 GB in this time."""
+
+Opened = TypeVar("Opened")
 
 
-class Recording(TableWriters, TableReaders):
+class Recording(Tables):
     """An open recording. Use `create` to write and `open` to read; both are context managers.
 
     >>> import pathlib, tempfile
@@ -87,14 +97,14 @@ class Recording(TableWriters, TableReaders):
         try:
             with ExitStack() as place:
                 partial = place.enter_context(place_beside(final))
-                recording = cls(Store.create(partial, final, memory_mb), partial)
+                recording = cls(Store.write(partial, final, memory_mb), partial)
                 recording.append_meta(standard_meta() | dict(meta or {}))
                 if not live:
                     recording._place = place.pop_all()
                     return recording
                 # So that the tables are in the file itself, and only rows ever in the log beside it.
                 recording._complete()
-            return cls(Store.grow(final, memory_mb))
+            return cls(Store.write(final, final, memory_mb))
         except OSError as error:
             raise RecordingError(f"{final}: cannot be written ({error.strerror or error})") from error
 
@@ -122,9 +132,16 @@ class Recording(TableWriters, TableReaders):
             store.path = source
         recording = cls(store)
         try:
-            recording._check_version()
+            version = recording.meta().get("format_version")
+            if not isinstance(version, int):
+                raise RecordingError(f"{source}: not a {SUFFIX} recording (no format_version in meta)")
+            if version > FORMAT_VERSION:
+                raise RecordingError(
+                    f"{source}: format version {version} is newer than this uwbcal reads ({FORMAT_VERSION}); "
+                    "update uwbcal"
+                )
         except RecordingError:
-            recording._store.close()
+            store.close()
             raise
         return recording
 
@@ -188,12 +205,10 @@ class Recording(TableWriters, TableReaders):
         with the same keys. Raises what `create` raises, and `RecordingError` for a table that recordings do not have.
         """
         instead = dict(replacing or {})
-        known_tables(instead)
-        entries = instead.pop("meta", None)
-        entries = self.meta() if entries is None else entries
-        with self._copying(path, entries | dict(meta or {}), instead, force=force) as written:
-            for table in instead:
-                _APPENDERS[table](written, instead[table])
+        entries = dict(instead.get("meta", {})) | dict(meta or {})
+        with self.copying(path, without=instead, meta=entries, force=force) as written:
+            for table in instead.keys() - {"meta"}:
+                written.append(table, instead[table])
 
     @contextmanager
     def copying(
@@ -209,43 +224,90 @@ class Recording(TableWriters, TableReaders):
         What the block appends need not be in memory at once. Raises what `copy` raises.
         """
         known_tables(without)
-        with self._copying(path, self.meta() | dict(meta or {}), without, force=force) as written:
-            yield written
-
-    @contextmanager
-    def _copying(
-        self, path: str | os.PathLike[str], meta: Mapping[str, Any], without: Collection[str], *, force: bool
-    ) -> Iterator[Self]:
-        with type(self).create(path, meta=meta, force=force, memory_mb=COPYING_MB) as written:
+        entries = {} if "meta" in without else self.meta()
+        with type(self).create(path, meta=entries | dict(meta or {}), force=force, memory_mb=COPYING_MB) as written:
             for table in TABLES:
                 if table != "meta" and table not in without:
                     written._store.take(self._store, table)
             yield written
 
-    def _check_version(self) -> None:
-        version = self.meta().get("format_version")
-        if not isinstance(version, int):
-            raise RecordingError(f"{self.path}: not a {SUFFIX} recording (no format_version in meta)")
-        if version > FORMAT_VERSION:
-            raise RecordingError(
-                f"{self.path}: format version {version} is newer than this uwbcal reads "
-                f"({FORMAT_VERSION}); update uwbcal"
-            )
+
+class SnapshotMaker:
+    """The writer's side: makes a snapshot for every request, in a thread of its own.
+
+    `make(place)` writes what is committed to a new file. Where it raises `RecordingError` there is no snapshot.
+    """
+
+    def __init__(self, recording: Path, make: Callable[[Path], None]) -> None:
+        """Answer requests for a recording; removes what processes that were killed have left."""
+        self._recording, self._make = recording, make
+        self._thread: threading.Thread | None = None
+        for left in (place for kind in (WANTED, BEGUN, READY, PARTIAL) for place in _beside(recording, kind)):
+            if left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+
+    def look(self) -> None:
+        """Start on requests, unless earlier ones are still being worked on; cheap enough for ten times a second."""
+        if self._thread is not None and self._thread.is_alive():
+            return
+        wanted = _beside(self._recording, WANTED)
+        if wanted:
+            self._thread = threading.Thread(target=self._answer, args=(wanted,), name="uwblink snapshot", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Wait for the snapshot that is being made."""
+        if self._thread is not None:
+            self._thread.join(PATIENCE_S)
+
+    def _answer(self, wanted: list[Path]) -> None:
+        for request in wanted:
+            begun = request.with_suffix(BEGUN)
+            with suppress(OSError, RecordingError):
+                request.rename(begun)  # the reader sees that somebody works on it
+                with place_beside(self._recording) as place:
+                    self._make(place)
+                    place.rename(request.with_suffix(READY))
+            begun.unlink(missing_ok=True)
 
 
-_APPENDERS: Final[dict[str, Callable[[Recording, Any], None]]] = {
-    "tags": Recording.append_tags,
-    "poses": Recording.append_poses,
-    "exchanges": Recording.append_exchanges,
-    "overheard": lambda recording, columns: recording.append_columns("overheard", columns),
-    "cirs": Recording.append_cirs,
-    "frames": Recording.append_frames,
-    "faults": Recording.append_faults,
-    "imu": lambda recording, columns: recording.append_columns("imu", columns),
-    "height": lambda recording, columns: recording.append_columns("height", columns),
-    "powers": lambda recording, columns: recording.append_columns("powers", columns),
-    "temperature": lambda recording, columns: recording.append_columns("temperature", columns),
-    "corrected": lambda recording, columns: recording.append_columns("corrected", columns),
-    "arrangements": Recording.append_arrangements,
-    "distances": Recording.append_distances,
-}
+def open_snapshot(recording: Path, reopen: Callable[[Path], Opened]) -> Opened:
+    """Ask a recording's writer for a snapshot, and open it; the recording itself, if its writer ends meanwhile.
+
+    Raises `RecordingInUseError` where the writer makes none (another program, an older version), the folder cannot be
+    written, or the disk is full.
+    """
+    request = recording.with_name(f".{recording.name}.{uuid4().hex}{WANTED}")
+    ready, begun = request.with_suffix(READY), request.with_suffix(BEGUN)
+    refused = f"{recording}: another process is writing it, and {{}}; wait until that ends"
+    try:
+        request.touch()
+    except OSError as error:
+        why = f"no request can be put beside it: {error.strerror}"
+        raise RecordingInUseError(refused.format(why)) from error
+    asked_s = time.monotonic()
+    try:
+        while time.monotonic() < asked_s + PATIENCE_S:
+            if ready.exists():
+                return reopen(ready)
+            if not request.exists() and not begun.exists() and not ready.exists():
+                break  # the writer began, and gave up
+            # A writer looks for requests ten times a second; one that has not begun after two seconds makes none.
+            if request.exists() and time.monotonic() > asked_s + 2.0:
+                break
+            time.sleep(0.02)
+            with suppress(RecordingInUseError):
+                return reopen(recording)
+        raise RecordingInUseError(refused.format("it makes no snapshots"))
+    finally:
+        request.unlink(missing_ok=True)
+        ready.unlink(missing_ok=True)
+
+
+def _beside(recording: Path, kind: str) -> list[Path]:
+    """Return the hidden files of a kind that belong to a recording."""
+    start = f".{recording.name}."
+    folder = recording.parent
+    return [folder / name for name in os.listdir(folder) if name.startswith(start) and name.endswith(kind)]

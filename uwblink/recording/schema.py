@@ -17,23 +17,8 @@ from uwblink.twr import COLUMNS, LATEST_NS
 FORMAT_VERSION: Final = 1
 SUFFIX: Final = ".uwb"
 
-_EXCHANGE_TYPES: Final = {
-    **dict.fromkeys(COLUMNS, "BIGINT"),
-    **dict.fromkeys(("initiator", "target", "reporter"), "USMALLINT"),
-    **dict.fromkeys([c for c in COLUMNS if c.endswith(("_m", "_dbm", "_ppm"))], "DOUBLE"),
-    "protocol": "VARCHAR",
-}
-_LISTENER_STAMPS: Final = ("rx1", "rx2", "rx3")
-_NEIGHBOUR_STAMPS: Final = ("tx1_n", "rx1_n", "tx2_n", "rx2_n", "tx3_n", "rx3_n")
-_LISTENER_LEVELS: Final = (
-    "fpp1_dbm",
-    "fpp2_dbm",
-    "fpp3_dbm",
-    "skew1_ppm",
-    "skew2_ppm",
-    "skew3_ppm",
-)
-_NEIGHBOUR_LEVELS: Final = ("fpp1_n_dbm", "fpp2_n_dbm", "skew1_n_ppm", "skew2_n_ppm")
+POSE: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""What a pose is beside its time and body: a position in metres and a quaternion."""
 
 TABLES: Final[dict[str, dict[str, str]]] = {
     "meta": {"key": "VARCHAR", "value": "VARCHAR"},
@@ -41,14 +26,20 @@ TABLES: Final[dict[str, dict[str, str]]] = {
     "poses": {
         "time_ns": "BIGINT",
         "body": "VARCHAR",
-        **dict.fromkeys(("x", "y", "z", "qx", "qy", "qz", "qw"), "DOUBLE"),
+        **dict.fromkeys(POSE, "DOUBLE"),
     },
-    "exchanges": _EXCHANGE_TYPES,
+    "exchanges": {
+        **dict.fromkeys(COLUMNS, "BIGINT"),
+        **dict.fromkeys(("initiator", "target", "reporter"), "USMALLINT"),
+        **dict.fromkeys([c for c in COLUMNS if c.endswith(("_m", "_dbm", "_ppm"))], "DOUBLE"),
+        "protocol": "VARCHAR",
+    },
     "overheard": {
         "time_ns": "BIGINT",
         **dict.fromkeys(("listener", "initiator", "target"), "USMALLINT"),
-        **dict.fromkeys(_LISTENER_STAMPS + _NEIGHBOUR_STAMPS, "BIGINT"),
-        **dict.fromkeys(_LISTENER_LEVELS + _NEIGHBOUR_LEVELS, "DOUBLE"),
+        **dict.fromkeys(("rx1", "rx2", "rx3", "tx1_n", "rx1_n", "tx2_n", "rx2_n", "tx3_n", "rx3_n"), "BIGINT"),
+        **dict.fromkeys(("fpp1_dbm", "fpp2_dbm", "fpp3_dbm", "skew1_ppm", "skew2_ppm", "skew3_ppm"), "DOUBLE"),
+        **dict.fromkeys(("fpp1_n_dbm", "fpp2_n_dbm", "skew1_n_ppm", "skew2_n_ppm"), "DOUBLE"),
     },
     "cirs": {
         "time_ns": "BIGINT",
@@ -99,13 +90,10 @@ BY_POSES: Final = "poses"
 
 ADDED_LATER: Final = {
     "faults": frozenset({"initiator", "target"}),
-    "imu": frozenset(TABLES["imu"]),
-    "height": frozenset(TABLES["height"]),
-    "powers": frozenset(TABLES["powers"]),
-    "temperature": frozenset(TABLES["temperature"]),
-    "corrected": frozenset(TABLES["corrected"]),
-    "arrangements": frozenset(TABLES["arrangements"]),
-    "distances": frozenset(TABLES["distances"]),
+    **{
+        table: frozenset(TABLES[table])
+        for table in ("imu", "height", "powers", "temperature", "corrected", "arrangements", "distances")
+    },
 }
 """Columns that a recording may lack, because it is older than they are; where all of a table's are, the table."""
 
@@ -177,8 +165,7 @@ class Poses:
         ['time_ns', 'body', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
         """
         named = {"time_ns": self.time_ns, "body": self.body}
-        named |= dict(zip("xyz", self.position_m.T, strict=True))
-        return named | dict(zip(("qx", "qy", "qz", "qw"), self.quaternion.T, strict=True))
+        return named | dict(zip(POSE, (*self.position_m.T, *self.quaternion.T), strict=True))
 
     def __repr__(self) -> str:
         """Return a headline and the first rows, in lines of 79 characters."""

@@ -1,7 +1,7 @@
 """Tables of a recording in a DuckDB file: columns in, columns out, and every error with the file's name.
 
-Files from strangers are data: they are opened read-only, with every access to other files switched off and the settings
-locked, and are looked over (`uwblink.recording.intake`) before anything in them is read.
+Files may come from anyone, so they are data: they are opened read-only, without access to other files and with locked
+settings, and are checked (`uwblink.recording.intake`) before anything in them is read.
 """
 
 from __future__ import annotations
@@ -11,26 +11,31 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.database import connect, log_of
+from uwblink.columns import few_words
+from uwblink.database import connect, duckdb, log_of
 from uwblink.errors import RecordingError, RecordingInUseError, first_line
-from uwblink.recording.batches import batch_of
-from uwblink.recording.intake import COLUMNS, check_intake, interrupted_after, longest_read_s
+from uwblink.recording.intake import (
+    COLUMNS,
+    check_intake,
+    check_length,
+    check_name,
+    damaged,
+    interrupted_after,
+    is_locked,
+    longest_read_s,
+)
 from uwblink.recording.schema import ADDED_LATER, SUFFIX, TABLES
-from uwblink.recording.soundness import check_length, check_name, damaged, is_locked
-
-if TYPE_CHECKING:
-    import duckdb
-
-LONGEST_LOOK_S: Final = 2.0
-"""A reader that finds a new recording before its writer has opened it again looks it over in this time."""
 
 ROWS_AT_A_TIME: Final = 100_000
-"""Rows that a copy holds in memory at once; of impulse responses, which are the largest, 0.2 GB."""
+"""Rows that a copy holds in memory at once; of impulse responses, the largest rows, this is 0.2 GB."""
+
+_UNFIT: Final = (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException)
+"""What DuckDB raises for values that do not fit into a table; all else is the file's fault."""
 
 
 class Store:
@@ -50,45 +55,33 @@ class Store:
         self._columns: dict[str, set[str]] | None = None
 
     @classmethod
-    def create(cls, place: Path, path: Path, memory_mb: int | None = None) -> Self:
-        """Make a file at `place` with empty tables, for a recording that is called `path`; raises `RecordingError`."""
+    def write(cls, place: Path, path: Path, memory_mb: int | None = None) -> Self:
+        """Open or make the file at `place` for a recording called `path`; raises `RecordingError`.
+
+        A reader that checks a file which was just made holds it for a moment: the writer waits up to two seconds.
+        """
         check_name(path)
-        store = cls._writing(place, path, memory_mb)
-        store.vanishes = True
+        end_s = time.monotonic() + 2.0
+        while True:
+            try:
+                # Snapshots are written beside the recording, and nothing is ever written elsewhere.
+                db = connect(place, folders=[place.parent], memory_mb=memory_mb)
+                break
+            except duckdb.Error as error:
+                if time.monotonic() > end_s or not is_locked(place, update=True):
+                    raise RecordingError(f"{path}: cannot be written ({first_line(error)})") from error
+                time.sleep(0.02)
+        store = cls(db, path, writes=True, vanishes=place != path)
         store._create_missing()
         return store
 
     @classmethod
-    def grow(cls, path: Path, memory_mb: int | None = None) -> Self:
-        """Open a file that was just made, for a recording that goes on for long; raises `RecordingError`."""
-        end_s = time.monotonic() + LONGEST_LOOK_S
-        while True:
-            try:
-                return cls._writing(path, path, memory_mb)
-            except RecordingError:
-                if time.monotonic() > end_s or not is_locked(path, update=True):
-                    raise
-                time.sleep(0.02)
-
-    @classmethod
-    def _writing(cls, place: Path, path: Path, memory_mb: int | None) -> Self:
-        import duckdb
-
-        try:
-            # Snapshots are written beside the recording, and nothing ever elsewhere.
-            return cls(connect(place, folders=[place.parent], memory_mb=memory_mb), path, writes=True)
-        except duckdb.Error as error:
-            raise RecordingError(f"{path}: cannot be written ({first_line(error)})") from error
-
-    @classmethod
     def open(cls, path: Path, *, update: bool, memory_mb: int | None = None) -> Self:
-        """Open a file for reading, or to `update` it; raises `RecordingError` for what is none, or is in use.
+        """Open a file for reading, or to `update` it; raises `RecordingError` if it is none, or is in use.
 
-        Of what was read, and of what a query works on, no more than `memory_mb` is kept in memory, by default most of
-        what there is; a file that is open in this program already keeps what it was opened with.
+        At most `memory_mb` of what was read, and of what a query works on, is kept in memory, by default most of what
+        there is; a file that is open in this program already keeps the limit with which it was opened.
         """
-        import duckdb
-
         check_name(path)
         check_length(path)
         size = path.stat().st_size
@@ -96,19 +89,15 @@ class Store:
             try:
                 connection = connect(path, read_only=not update, memory_mb=memory_mb)
             except duckdb.ConnectionException:
-                if memory_mb is None:
-                    raise
                 connection = connect(path, read_only=not update)
-            store = cls(connection, path, size, writes=update)
         except duckdb.ConnectionException as error:
             raise RecordingError(f"{path}: is open in this program in another way; close it there first") from error
-        except duckdb.IOException as error:
-            if is_locked(path, update=update):
+        except duckdb.Error as error:
+            if isinstance(error, duckdb.IOException) and is_locked(path, update=update):
                 use = "has it open" if update else "is writing it"
                 raise RecordingInUseError(f"{path}: another process {use}; wait until that ends") from error
             raise damaged(path, error) from error
-        except duckdb.Error as error:
-            raise damaged(path, error) from error
+        store = cls(connection, path, size, writes=update)
         try:
             check_intake(store.rows, path, size)
             store.check_columns()
@@ -125,12 +114,10 @@ class Store:
         self._db.close()
 
     def finish(self) -> None:
-        """Put everything into the file itself, none of it left in the log beside it; raises `RecordingError`.
+        """Put everything into the file itself, nothing left in the log beside it; raises `RecordingError`.
 
-        Closing does so too, and says nothing where it cannot.
+        Closing does so too, but reports nothing where it cannot.
         """
-        import duckdb
-
         try:
             self._db.execute("CHECKPOINT")
         except duckdb.Error as error:
@@ -143,8 +130,6 @@ class Store:
 
     def shorten_log(self) -> None:
         """Put what is in the log into the file, while others go on writing; raises `RecordingError`."""
-        import duckdb
-
         try:
             with self._second_lock:
                 self._second.execute("CHECKPOINT")
@@ -153,8 +138,6 @@ class Store:
 
     def copy_to(self, place: Path) -> None:
         """Write what is committed to a new file, on a connection of its own; raises `RecordingError`."""
-        import duckdb
-
         target = str(place).replace("'", "''")
         try:
             with self._second_lock:
@@ -171,18 +154,14 @@ class Store:
 
     def execute(self, statement: str, values: list[Any] | None = None) -> None:
         """Execute a statement of SQL; raises `RecordingError` where the file cannot be written."""
-        import duckdb
-
         try:
             self._db.execute(statement, values)
-        except (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException):
-            raise  # of values, and who inserts them knows of which table
+        except _UNFIT:
+            raise  # `insert` knows of which table
         except duckdb.Error as error:
             raise self._unwritable(error) from error
 
     def _unwritable(self, error: duckdb.Error) -> RecordingError:
-        import duckdb
-
         disk = isinstance(error, duckdb.IOException | duckdb.TransactionException | duckdb.FatalException)
         reason = f"{first_line(error)}){'; is the disk full?' if disk else '.'}"
         if self.vanishes:
@@ -200,30 +179,18 @@ class Store:
             raise RecordingError(f"{self.path}: table {table}: columns of different lengths, {lengths}")
         if not lengths or not lengths[names[0]]:
             return
-        batch = batch_of(table, {name: columns[name] for name in names})
+        arrays, bound = dict[str, NDArray[Any]](), list[Any]()
+        values = [_value(name, TABLES[table][name], columns[name], arrays, bound) for name in names]
         listed = ", ".join(f'"{name}"' for name in names)
-        self._db.register("batch", batch.columns)
-        with self._fitting(table):
-            self.execute(f"INSERT INTO {table} ({listed}) SELECT {batch.values} FROM batch", batch.bound)  # noqa: S608 - keys of TABLES
-        self._db.unregister("batch")
-
-    def insert_row(self, table: str, values: list[Any]) -> None:
-        """Add one row, a value a column; raises `RecordingError` for values that do not fit into the table."""
-        marks = ", ".join("?" * len(values))
-        with self._fitting(table):
-            self.execute(f"INSERT INTO {table} VALUES ({marks})", values)  # noqa: S608 - a key of TABLES
-
-    @contextmanager
-    def _fitting(self, table: str) -> Iterator[None]:
-        import duckdb
-
+        self._db.register("batch", arrays)
         try:
-            yield
-        except (duckdb.DataError, duckdb.InvalidInputException, duckdb.BinderException) as error:
+            self.execute(f"INSERT INTO {table} ({listed}) SELECT {', '.join(values)} FROM batch", bound)  # noqa: S608 - keys of TABLES
+        except _UNFIT as error:
             raise RecordingError(
                 f"{self.path}: table {table}: values that do not fit ({first_line(error)}); "
                 f"its columns are {', '.join(f'{name} {kind}' for name, kind in TABLES[table].items())}"
             ) from error
+        self._db.unregister("batch")
 
     def read(self, query: str) -> dict[str, NDArray[Any]]:
         """Return what a query finds, as columns; masked where it is missing. Raises `RecordingError`."""
@@ -237,8 +204,6 @@ class Store:
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        import duckdb
-
         with interrupted_after(self._longest_read_s, self._db.interrupt) as late:
             try:
                 yield
@@ -248,53 +213,43 @@ class Store:
 
     def take(self, source: Store, table: str) -> None:
         """Add all rows of another file's table in their order, missing values included, some at a time."""
-        present = source.columns().get(table, set())
-        if not present:
-            return
-        names = ", ".join(f'"{name}"' for name in present & TABLES[table].keys())
-        (last,) = source.read(f"SELECT max(rowid) AS last FROM {table}")["last"]  # noqa: S608 - a key of TABLES
-        for start in range(0, 0 if last is np.ma.masked else int(last) + 1, ROWS_AT_A_TIME):
+        present = source.columns().get(table, set()) & TABLES[table].keys()
+        ((last,),) = source.rows(f"SELECT max(rowid) FROM {table}") if present else [(None,)]  # noqa: S608 - a key of TABLES
+        names = ", ".join(f'"{name}"' for name in present)
+        for start in range(0, 0 if last is None else int(last) + 1, ROWS_AT_A_TIME):
             piece = f"rowid >= {start} AND rowid < {start + ROWS_AT_A_TIME} ORDER BY rowid"
             self.insert(table, source.read(f"SELECT {names} FROM {table} WHERE {piece}"))  # noqa: S608 - keys of TABLES
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Have everything inserted in the block written at once, or not at all; raises `RecordingError`."""
-        import duckdb
-
         try:
             self.execute("BEGIN")
             yield
             self.execute("COMMIT")
-        except duckdb.Error as error:
+        except (duckdb.Error, RecordingError) as error:
             with suppress(RecordingError):
                 self.execute("ROLLBACK")
+            if isinstance(error, RecordingError):
+                raise
             raise self._unwritable(error) from error
-        except RecordingError:
-            with suppress(RecordingError):
-                self.execute("ROLLBACK")
-            raise
 
     def columns(self) -> dict[str, set[str]]:
         """Return the names of the columns of each table that the file has."""
         if self._columns is None or self.writes:
-            self._columns = self._listed_columns()
+            self._columns = {}
+            for table, column, _kind in self.rows(COLUMNS):
+                self._columns.setdefault(table, set()).add(column)
         return self._columns
 
-    def _listed_columns(self) -> dict[str, set[str]]:
-        found: dict[str, set[str]] = {}
-        for table, column, _kind in self.rows(COLUMNS):
-            found.setdefault(table, set()).add(column)
-        return found
-
     def _create_missing(self) -> None:
-        """Create the tables that the file does not have: all of a new one, and those that an old one is older than."""
+        """Create the tables that the file does not have: all in a new one, and later ones in an older one."""
         for table, columns in TABLES.items():
             spec = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
             self.execute(f"CREATE TABLE IF NOT EXISTS {table} ({spec})")
 
     def check_columns(self) -> None:
-        """Raise `RecordingError` where the file lacks a table or a column of those that recordings always had."""
+        """Raise `RecordingError` where the file lacks a table or a column that all recordings have."""
         found = self.columns()
         if "meta" not in found:
             raise RecordingError(f"{self.path}: a DuckDB file, but not a {SUFFIX} recording (no table meta)")
@@ -304,3 +259,20 @@ class Store:
             missing = sorted(columns.keys() - present - (later if not (present and came_whole) else set()))
             if missing:
                 raise RecordingError(f"{self.path}: table {table} lacks {', '.join(missing)}")
+
+
+def _value(name: str, kind: str, column: NDArray[Any], arrays: dict[str, NDArray[Any]], bound: list[Any]) -> str:
+    """Return the SQL of a column's values; adds to `arrays` what DuckDB scans, and to `bound` what is bound."""
+    arrays[name], value = np.ascontiguousarray(np.ma.getdata(column)), f'"{name}"'
+    if (coded := few_words(column)) is not None:
+        # DuckDB would sort an array of words, which takes longer than the rest of an insertion.
+        bound.append(coded[0].tolist())
+        arrays[name], value = coded[1] + 1, f'CAST(? AS VARCHAR[])["{name}"]'
+    if kind == "BLOB":
+        # Not every version takes bytes from an array; all take digits.
+        arrays[name] = np.array([data.hex() for data in arrays[name].tolist()], dtype=object)
+        value = f'unhex("{name}")'
+    if np.ma.is_masked(column):
+        arrays[f"no_{name}"] = np.ma.getmaskarray(column)
+        value = f'CASE WHEN "no_{name}" THEN NULL ELSE {value} END'
+    return value

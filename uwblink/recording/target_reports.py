@@ -8,23 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from uwblink.arrays import Bools, Ints
-from uwblink.recording.blocks import ROWS_AT_ONCE
+from uwblink.recording.tables import ROWS_AT_ONCE, Tables
 from uwblink.twr import STAMPS, Exchanges, without_stamps
-
-if TYPE_CHECKING:
-    from uwblink.recording.readers import TableReaders
 
 APART_NS: Final = 60_000_000
 """Reports of one exchange are nearer than this, and equal stamps of another one further: they wrap after 67 ms."""
 
 COMPARED: Final = (*STAMPS, "range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
-KEYS: Final = ("tx1", "tx2")
-"""A stamp of each board's clock: where one is damaged, the other still tells."""
+"""What both reports say of an exchange."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +44,7 @@ def single_reports(exchanges: Exchanges) -> SingleReports:
         return SingleReports(exchanges, 0, np.empty((0, 2), dtype=np.int64))
     by_initiator = np.flatnonzero(exchanges.reporter == exchanges.initiator)
     partner = np.full(len(by_target), -1, dtype=np.int64)
-    for name in KEYS:
+    for name in ("tx1", "tx2"):  # a stamp of each board's clock: where one is damaged, the other still tells
         alone = partner < 0
         partner[alone] = _partners(exchanges, name, by_target[alone], by_initiator)
     known = partner >= 0
@@ -84,44 +80,48 @@ def from_targets(exchanges: Exchanges) -> Bools:
     return np.asarray((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target))
 
 
-def single_report_blocks(recording: TableReaders) -> Iterator[tuple[SingleReports, Exchanges]]:
-    """Yield what `single_reports` returns of a recording, some of it at a time, and what that was made of.
-
-    Where targets reported the pieces are stretches of time, which are looked at together with what is around them, for
-    both reports of an exchange may lie on either side of an edge.
-    """
-    blocks = recording.exchange_blocks(ROWS_AT_ONCE)
-    if not recording.has_target_reports():
-        for block in blocks:
-            yield SingleReports(block, 0, np.empty((0, 2), dtype=np.int64)), block
+def single_report_blocks(recording: Tables) -> Iterator[tuple[SingleReports, Exchanges]]:
+    """Yield what `single_reports` returns of a recording, some of it at a time, and what that was made of."""
+    if not _has_target_reports(recording):
+        for block in recording.exchange_blocks(ROWS_AT_ONCE):
+            yield single_reports(block), block
         return
-    for start_ns, end_ns in recording.stretches(ROWS_AT_ONCE):
-        both = recording.exchanges_between(start_ns - APART_NS, end_ns + APART_NS)
-        yield _within(single_reports(both), both, start_ns, end_ns), both
+    for found, both, _ in _by_stretches(recording):
+        yield found, both
 
 
-def single_exchange_blocks(recording: TableReaders, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
+def single_exchange_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
     """Yield the exchanges of `single_reports` of a recording, in the order of their rows, about so many at once."""
-    if not recording.has_target_reports():
+    if not _has_target_reports(recording):
         yield from recording.exchange_blocks(rows)
         return
-    second = np.zeros(recording.row_end(), dtype=bool)
+    second = [numbers[found.seconds] for found, _, numbers in _by_stretches(recording)]
+    left_out = np.concatenate([np.empty(0, np.int64), *second])
+    for block, numbers in recording.numbered_blocks(rows):
+        yield block[~np.isin(numbers, left_out)]
+
+
+def _has_target_reports(recording: Tables) -> bool:
+    """Return whether targets reported exchanges, too, of which each may then be there twice."""
+    ends = recording.tally("exchanges", "initiator", "target", "reporter")
+    return any(reporter == target != initiator for initiator, target, reporter in ends)
+
+
+def _by_stretches(recording: Tables) -> Iterator[tuple[SingleReports, Exchanges, Ints]]:
+    """Yield single reports by stretches of time, the exchanges they are from, and the numbers of these rows.
+
+    A stretch is read together with what is around it, for both reports of an exchange may lie on either side of an
+    edge; what is found there is left out.
+    """
     for start_ns, end_ns in recording.stretches(ROWS_AT_ONCE):
-        around = start_ns - APART_NS, end_ns + APART_NS
-        both = recording.exchanges_between(*around)
-        found = _within(single_reports(both), both, start_ns, end_ns)
-        second[recording.rows_between(*around)[found.seconds]] = True
-    yield from recording.exchange_blocks_without(second, rows)
-
-
-def _within(found: SingleReports, both: Exchanges, start_ns: int, end_ns: int) -> SingleReports:
-    """Return the exchanges, and the second reports, of a stretch of time."""
-    here = (found.exchanges.time_ns >= start_ns) & (found.exchanges.time_ns < end_ns)
-    second = both.time_ns[found.seconds]
-    mine = (second >= start_ns) & (second < end_ns)
-    later = both.time_ns[found.differing[:, 1]]
-    differing = found.differing[(later >= start_ns) & (later < end_ns)]
-    return SingleReports(found.exchanges[here], int(np.count_nonzero(mine)), differing, found.seconds[mine])
+        both, numbers = recording.numbered_between(start_ns - APART_NS, end_ns + APART_NS)
+        here = (both.time_ns >= start_ns) & (both.time_ns < end_ns)
+        found = single_reports(both)
+        kept = np.ones(len(both), dtype=bool)
+        kept[found.seconds] = False
+        seconds = found.seconds[here[found.seconds]]
+        differing = found.differing[here[found.differing[:, 1]]]
+        yield SingleReports(both[kept & here], len(seconds), differing, seconds), both, numbers
 
 
 def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:

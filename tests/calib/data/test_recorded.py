@@ -10,7 +10,7 @@ import pytest
 from calib.data import sources
 from calib.data.ranges import COLUMNS, Ranges
 from calib.data.samples import sample_flight
-from uwblink.recording import AntennaDelay, blocks, target_reports
+from uwblink.recording import AntennaDelay, target_reports
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.target_reports import single_reports
@@ -83,8 +83,6 @@ def test_blocks_of_any_size_make_the_ranges_of_the_whole(tmp_path, monkeypatch):
     assert whole.excluded["no true distance"] > 5
     assert whole.excluded["no power"] > 5
     assert whole.left_skew is not None
-    monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**7)
-    monkeypatch.setattr(blocks, "POSES_AT_ONCE", 300)
     for rows in (37, ROWS - 1, 10 * ROWS):
         monkeypatch.setattr(sources, "EXCHANGES_AT_ONCE", rows)
         assert_same(sources.load_ranges(path), whole)
@@ -100,31 +98,6 @@ def test_bodies_with_one_pose_do_not_split_what_is_read(tmp_path):
     with Recording.open(path) as recording:
         parts = [len(part) for part, _ in recording.pose_windows().beside(recording.exchanges())]
     assert parts == [3000]
-
-
-@pytest.mark.parametrize("moved", [0, 20])
-def test_no_more_poses_are_held_than_lie_around_some_exchanges(tmp_path, monkeypatch, moved):
-    """Also where the clock was set back, so that the last rows are of the beginning."""
-    flight = sample_flight(3000)
-    rows = np.roll(np.arange(3000), -moved)
-    path = written(tmp_path / "it.uwb", flight.exchanges[rows], flight.poses, flight.tags)
-    whole, held = of_all(path), list[int]()
-    monkeypatch.setattr(blocks, "LEAP_NS", int(np.ptp(flight.exchanges.time_ns)) // 2)
-    monkeypatch.setattr("uwblink.recording.blocks.MARGIN_NS", 10**8)
-    monkeypatch.setattr(blocks, "POSES_AT_ONCE", len(flight.poses) // 20)
-    window = blocks.PoseWindows.window
-
-    def watched(self, start_ns, end_ns):
-        found = window(self, start_ns, end_ns)
-        held.append(len(found))
-        return found
-
-    monkeypatch.setattr(blocks.PoseWindows, "window", watched)
-    found = sources.load_ranges(path)
-    assert len(found) == 3000
-    assert_same(found, whole)
-    assert len(held) > 10
-    assert max(held) < len(flight.poses) / 10
 
 
 def both_ends(exchanges, poses, tags):

@@ -165,7 +165,7 @@ def test_meta_that_is_no_json(file, value, expected):
 
 def test_tags_with_nothing_in_them(file):
     change(file, "INSERT INTO tags VALUES (2, NULL, 0, 0, 0)")
-    with Recording.open(file) as recording, pytest.raises(RecordingError, match="table tags: a tag with nothing"):
+    with Recording.open(file) as recording, pytest.raises(RecordingError, match="table tags: a row with nothing"):
         recording.tags()
 
 

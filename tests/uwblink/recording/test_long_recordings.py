@@ -9,8 +9,8 @@ import pytest
 
 from uwblink import Contents, Exchanges, Recording
 from uwblink.recording import target_reports
-from uwblink.recording.relative_clocks import clock_skews
 from uwblink.recording.schema import Fault
+from uwblink.recording.summary import clock_skews
 from uwblink.recording.target_reports import single_report_blocks, single_reports
 
 COUNT = 700

@@ -9,8 +9,8 @@ import pytest
 
 from uwblink import Contents, Exchanges, Poses, Recording
 from uwblink.exporters import export_recording, mcap, rosbag2, tum
+from uwblink.recording.contents import exchanges_with_poses, pieces
 from uwblink.recording.distances import distances_m
-from uwblink.recording.pieces import exchanges_with_poses, pieces
 from uwblink.recording.schema import Fault, Tag
 
 COUNT = 400

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from uwblink.recording.relative_clocks import clock_skews, told
+from uwblink.recording.summary import _told as told
+from uwblink.recording.summary import clock_skews
 from uwblink.twr import Exchanges
 
 TICKS = 128 * 499.2e6

@@ -12,9 +12,8 @@ import pytest
 import uwblink
 from tests.boards import bench_scenario
 from uwblink.errors import RecordingError, RecordingInUseError
-from uwblink.recording.file import Recording
+from uwblink.recording.file import Recording, SnapshotMaker, open_snapshot
 from uwblink.recording.schema import Fault
-from uwblink.recording.snapshots import SnapshotMaker, open_snapshot
 from uwbsim.boards.virtual_port import VirtualPorts
 
 BIN = Path(sys.executable).parent
