@@ -168,8 +168,8 @@ def dask() -> str:
     from distributed import Client, LocalCluster
 
     from uwbsim.sweep.design import load_design
+    from uwbsim.sweep.executors import run_chunk
     from uwbsim.sweep.runner import _task
-    from uwbsim.sweep.task import run_chunk
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"

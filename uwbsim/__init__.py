@@ -15,16 +15,13 @@ if TYPE_CHECKING:
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
     from uwbsim.pages.scenario_page import show
     from uwbsim.pages.scenario_summary import preview
-    from uwbsim.protocols.comparison import Comparison, compare
-    from uwbsim.protocols.reply_delay import optimum
-    from uwbsim.protocols.single_state import Prediction, State, predict_state
+    from uwbsim.protocols.comparison import Comparison, compare, optimum
+    from uwbsim.protocols.prediction import Prediction, State, predict_state
     from uwbsim.scenario.faults import load_faults
-    from uwbsim.scenario.loading import load
+    from uwbsim.scenario.loading import load, shipped_scenarios
     from uwbsim.scenario.model import Scenario
-    from uwbsim.scenario.shipped import shipped_scenarios
     from uwbsim.simulation.run import simulate
-    from uwbsim.simulation.simulated import Simulated
-    from uwbsim.simulation.through_wire import through_wire
+    from uwbsim.simulation.simulated import Simulated, through_wire
     from uwbsim.sweep.design import load_design
     from uwbsim.sweep.runner import run_sweep
     from uwbsim.twins.fitting import Twin, twin
@@ -61,12 +58,12 @@ __all__ = [
 _HOMES: Final = {
     "Comparison": "uwbsim.protocols.comparison",
     "ParameterError": "uwbsim.errors",
-    "Prediction": "uwbsim.protocols.single_state",
+    "Prediction": "uwbsim.protocols.prediction",
     "Scenario": "uwbsim.scenario.model",
     "ScenarioError": "uwbsim.errors",
     "Server": "uwbsim.boards.server",
     "Simulated": "uwbsim.simulation.simulated",
-    "State": "uwbsim.protocols.single_state",
+    "State": "uwbsim.protocols.prediction",
     "Twin": "uwbsim.twins.fitting",
     "UwbsimError": "uwbsim.errors",
     "VirtualPorts": "uwbsim.boards.virtual_port",
@@ -74,15 +71,15 @@ _HOMES: Final = {
     "load": "uwbsim.scenario.loading",
     "load_design": "uwbsim.sweep.design",
     "load_faults": "uwbsim.scenario.faults",
-    "optimum": "uwbsim.protocols.reply_delay",
-    "predict_state": "uwbsim.protocols.single_state",
+    "optimum": "uwbsim.protocols.comparison",
+    "predict_state": "uwbsim.protocols.prediction",
     "preview": "uwbsim.pages.scenario_summary",
     "register_channel_effect": "uwbsim.world.channel",
     "run_sweep": "uwbsim.sweep.runner",
-    "shipped_scenarios": "uwbsim.scenario.shipped",
+    "shipped_scenarios": "uwbsim.scenario.loading",
     "show": "uwbsim.pages.scenario_page",
     "simulate": "uwbsim.simulation.run",
-    "through_wire": "uwbsim.simulation.through_wire",
+    "through_wire": "uwbsim.simulation.simulated",
     "twin": "uwbsim.twins.fitting",
 }
 

@@ -5,8 +5,7 @@ from collections import Counter
 import pytest
 
 from tests.boards import bench_scenario
-from uwbsim.boards.board_air import MS, US
-from uwbsim.boards.frames import FinalPayload, PollPayload, Received
+from uwbsim.boards.frames import MS, US, FinalPayload, PollPayload, Received
 from uwbsim.boards.virtual_port import VirtualPorts
 from uwbsim.scenario.model import Scenario
 

@@ -22,8 +22,8 @@ from calib.cli.commands import app as calib_app
 from calib.surveys.knowledge import load_knowledge
 from tests import pages
 from uwblink.cli.commands import app as uwblink_app
-from uwbsim.boards.stays import stays_s
-from uwbsim.scenario.published_curves import BIAS
+from uwbsim.boards.server import stays_s
+from uwbsim.scenario.radio import BIAS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "without-motion-capture.md").read_text(encoding="utf-8")

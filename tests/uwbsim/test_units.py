@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from uwbsim.scenario.devices import Tag
 from uwbsim.scenario.model import Mocap
 from uwbsim.scenario.radio import Radio
 from uwbsim.scenario.ranging import FixedReply, Ranging
-from uwbsim.scenario.tags import Tag
 
 PACKAGE = Path(__file__).parents[2] / "uwbsim"
 ROOMS = ("world", "simulation")

@@ -1,7 +1,8 @@
-"""Ranging as the firmware does it: the initiator's side in the USB task, the target's in the interrupt's.
+"""Ranging as the firmware does it: the initiator in the USB task, target and listeners in the interrupt.
 
 Each waits for a frame as the firmware does, takes whatever comes first, and gives up on anything else than what it
-waits for (firmware wire format, 3.1 and 3.2).
+waits for (firmware wire format, 3.1 and 3.2). Overhearing keeps the processor busy from frame to frame, and waits for
+ever for the initiator's final: a passive board is deaf to USB meanwhile (firmware wire format, 3.3).
 """
 
 from __future__ import annotations
@@ -15,10 +16,13 @@ import simpy
 from uwblink.ticks import REPORT_BITS
 from uwblink.twr import Exchanges, board_range
 from uwblink.wire.codec import encode
-from uwblink.wire.messages import Cir, RangeReport, TargetRangeReport
-from uwbsim.boards.board_air import MS, US
+from uwblink.wire.messages import BroadcastReceived, Cir, Overheard, OverheardNothing, RangeReport, TargetRangeReport
 from uwbsim.boards.frames import (
     MASK,
+    MS,
+    PREAMBLE_TIMEOUT,
+    US,
+    DataPayload,
     FinalPayload,
     Frame,
     Payload,
@@ -30,6 +34,7 @@ from uwbsim.world.impulse_response import impulse_response, in_transfers
 
 if TYPE_CHECKING:
     from uwbsim.boards.virtual_board import VirtualBoard
+
 
 TO_AIR: Final = 330 * US
 """From the poll of the USB buffer that found a command to the time stamp of its frame: set-up and half a preamble."""
@@ -207,3 +212,108 @@ def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) 
     for piece in in_transfers(encode(Cir(initiator, target, index, taps))):
         board.say(piece)
         yield board.sleep(MS + int(board.chance.integers(0, 120 * US)))
+
+
+TO_LINE: Final = 90 * US
+"""From the end of a frame to a line that needs no arithmetic."""
+
+TO_OVERHEARD: Final = 525 * US
+WARNING_B: Final = b"WARNING 0xB: TWR message is firing an interrupt when it shouldn't be.\r\n"
+WARNING_C: Final = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
+
+Expected = tuple[type[Payload], int, int, int | None]
+"""A frame that a listener waits for: its payload, its two boards, and for how long."""
+
+
+def received_by(board: VirtualBoard, received: Received | None) -> Steps | None:
+    """Deal with a frame at once, or return the steps that it takes."""
+    if received is None:
+        return _recover(board)
+    payload = received.frame.payload
+    if isinstance(payload, PollPayload):
+        if received.frame.receiver == board.id:
+            return answer(board, received)
+        if board.passive:
+            return overhear(board, received)
+    elif isinstance(payload, DataPayload):
+        board.say(BroadcastReceived(payload.data), TO_LINE)
+    else:
+        board.say(WARNING_B if isinstance(payload, ResponsePayload) else WARNING_C, TO_LINE)
+    board.radio.listen()
+    return None
+
+
+def _recover(board: VirtualBoard) -> Steps:
+    """After a damaged frame the receiver is off, until the USB task looks at it."""
+    board.release()
+    yield board.until_next_poll()
+
+
+def overhear(board: VirtualBoard, poll: Received) -> Steps:
+    """Follow the exchange that a poll begins, and print it; nothing, or zeros, where a frame does not come."""
+    wish, initiator, target = poll.frame.payload, poll.frame.sender, poll.frame.receiver
+    if not isinstance(wish, PollPayload) or target is None:
+        raise TypeError("an exchange begins with a poll for somebody")
+    heard = [poll]
+    for payload, sender, receiver, patience in _sequence(wish, initiator, target):
+        came = yield from board.radio.wait(patience)
+        if came is None or not is_expected(came, payload, sender, receiver):
+            if wish.double_sided and len(heard) == 1:
+                board.say(OverheardNothing(initiator, target), TO_LINE)
+            return
+        heard.append(came)
+    yield board.sleep(TO_OVERHEARD)
+    if wish.get_cir:
+        yield from print_cir(board, initiator, target, heard[-1])
+    board.say(_overheard(initiator, target, wish, heard))
+
+
+def _sequence(wish: PollPayload, initiator: int, target: int) -> list[Expected]:
+    """Return the frames that follow a poll; the firmware sets no time-out for the last one."""
+    frames: list[Expected] = [(FinalPayload, target, initiator, PREAMBLE_TIMEOUT)]
+    if wish.double_sided:
+        frames.insert(0, (ResponsePayload, target, initiator, PREAMBLE_TIMEOUT))
+    if wish.target_reports:
+        frames.append((FinalPayload, initiator, target, None))
+    return frames
+
+
+def _overheard(initiator: int, target: int, wish: PollPayload, heard: list[Received]) -> Overheard:
+    """Return what a listener prints; the initiator's own readings travel only in its final."""
+    signals = heard[:3] if wish.double_sided else heard[:2]
+    rx = [*(r.stamp & MASK for r in signals), 0]
+    power: list[float | None] = [*(r.power_dbm for r in signals), None]
+    skew: list[float | None] = [*(r.skew_ppm for r in signals), None]
+    theirs = _readings(signals[-1])
+    mine = _readings(heard[-1]) if wish.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
+    (tx1, rx2, rx3), (rx1, tx2, tx3) = mine.stamps, theirs.stamps
+    return Overheard(
+        initiator,
+        target,
+        rx1=rx[0],
+        rx2=rx[1],
+        rx3=rx[2],
+        tx1_n=tx1,
+        rx1_n=rx1,
+        tx2_n=tx2,
+        rx2_n=rx2,
+        tx3_n=tx3,
+        rx3_n=rx3,
+        fpp1_dbm=heard[0].power_dbm,
+        fpp2_dbm=heard[1].power_dbm,
+        fpp3_dbm=power[2],
+        skew1_ppm=heard[0].skew_ppm,
+        skew2_ppm=heard[1].skew_ppm,
+        skew3_ppm=skew[2],
+        fpp1_n_dbm=theirs.power_dbm,
+        fpp2_n_dbm=mine.power_dbm,
+        skew1_n_ppm=theirs.skew_ppm,
+        skew2_n_ppm=mine.skew_ppm,
+    )
+
+
+def _readings(received: Received) -> FinalPayload:
+    payload = received.frame.payload
+    if not isinstance(payload, FinalPayload):
+        raise TypeError("readings travel in finals")
+    return payload

@@ -1,4 +1,4 @@
-"""Virtual boards: command bytes in, report bytes out, with the firmware's tasks and its quirks.
+"""Virtual boards: command bytes in, report bytes out, with the firmware's tasks, its USB and its quirks.
 
 All boards of a scenario share one air and one SimPy clock in integer nanoseconds, which tests turn by hand and
 `uwbsim.boards.server` along with the wall clock. Formats, order and timing are those of the firmware wire format,
@@ -9,20 +9,91 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import simpy
 
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import Message
-from uwbsim.boards import command_parser as firmware
-from uwbsim.boards.board_air import MS, US, BoardAir, Radio
-from uwbsim.boards.commands import ANSWER, EXECUTORS, Attempt
-from uwbsim.boards.frames import Radios, Received
-from uwbsim.boards.interrupts import received_by
-from uwbsim.boards.usb import FULL, UsbLink
+from uwbsim.boards.commands import ANSWER, EXECUTORS, Attempt, Command, read_commands
+from uwbsim.boards.frames import MS, US, BoardAir, Radio, Radios, Received
+from uwbsim.boards.ranging import received_by
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
+
+PACKET_BYTES: Final = 64
+PACKET_GAP: Final = 55 * US
+INBOUND: Final = 100 * US
+LONGEST_QUEUE: Final = 8
+FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
+
+
+class UsbLink:
+    """One board's USB from power-up to power-off. `arrived` is triggered when a packet comes; `lost` counts transfers
+    that found the bus busy."""
+
+    def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
+        """Be plugged in; `send` takes the bytes of a transfer at its time."""
+        self._env, self._send = env, send
+        self._packets: list[bytes] = []
+        self._busy_until = 0
+        self._open = True
+        self.arrived = env.event()
+        self.lost = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Whether packets wait to be read."""
+        return bool(self._packets)
+
+    def close(self) -> None:
+        """Be unplugged: what is under way comes nowhere."""
+        self._open = False
+
+    def write(self, data: bytes) -> None:
+        """Take one write of the host, which USB carries in packets of 64 bytes."""
+        for number, at in enumerate(range(0, len(data), PACKET_BYTES)):
+            piece = data[at : at + PACKET_BYTES]
+            # The firmware drops packets of one byte; "~" alone is one of them.
+            if len(piece) > 1:
+                self._after(INBOUND + number * PACKET_GAP, partial(self._arrive, piece))
+
+    def read(self) -> bytes:
+        """Return what has come, which empties the queue."""
+        data = b"".join(self._packets)
+        self._packets.clear()
+        self.arrived = self._env.event()
+        return data
+
+    def say(self, data: bytes, delay: int = 0) -> None:
+        """Send a transfer after a delay (ns)."""
+        if delay:
+            self._after(delay, partial(self._transfer, data))
+        else:
+            self._transfer(data)
+
+    def _after(self, delay: int, work: Callable[[], None]) -> None:
+        self._env.timeout(delay).callbacks.append(lambda _: work() if self._open else None)
+
+    def _arrive(self, piece: bytes) -> None:
+        if len(self._packets) >= LONGEST_QUEUE:
+            self._transfer(FULL)
+            return
+        self._packets.append(piece)
+        if not self.arrived.triggered:
+            self.arrived.succeed()
+
+    def _transfer(self, data: bytes) -> None:
+        now = int(self._env.now)
+        if not self._open:
+            return
+        if now < self._busy_until:
+            self.lost += 1
+            return
+        self._busy_until = now + -(-len(data) // PACKET_BYTES) * PACKET_GAP
+        self._send(data)
+
 
 POLL_PERIOD: Final = MS
 LONGEST_BUFFER: Final = 8000
@@ -67,7 +138,7 @@ class Bench:
 class _Task:
     """The command that the board is busy with; `tries` survives a change of command, as on the boards."""
 
-    command: firmware.Command | None = None
+    command: Command | None = None
     tries: int = 0
 
 
@@ -197,7 +268,7 @@ class VirtualBoard:
         if len(self._buffer) > LONGEST_BUFFER:
             self.say(FULL)
             self._buffer = self._buffer[:LONGEST_BUFFER]
-        reading = firmware.read(self._buffer, EXECUTORS)
+        reading = read_commands(self._buffer, EXECUTORS)
         self._buffer = reading.rest
         for number, complaint in enumerate(reading.complaints):
             if number:
@@ -209,7 +280,7 @@ class VirtualBoard:
             # Only the last one is executed, in place of whatever was being retried, and with its count of tries.
             self._task.command = reading.commands[-1]
 
-    def _try(self, command: firmware.Command) -> Steps:
+    def _try(self, command: Command) -> Steps:
         if self._task.tries > LAST_RETRY:
             self.say(FAILED, ANSWER)
             self._task = _Task()

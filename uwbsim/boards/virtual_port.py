@@ -20,7 +20,7 @@ from typing import Final
 
 from uwblink.boards.ports import Transport
 from uwblink.errors import PortLostError, PortMissingError
-from uwbsim.boards.board_air import NS_PER_S
+from uwbsim.boards.frames import NS_PER_S
 from uwbsim.boards.virtual_board import Bench
 from uwbsim.errors import ParameterError
 from uwbsim.scenario.loading import Source, as_scenario

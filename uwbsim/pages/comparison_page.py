@@ -10,9 +10,8 @@ from typing import Any, Final
 from uwblink.output import check_folder, made_folder, write_text
 from uwblink.pages.html import both_widths, page_html, table_html
 from uwbsim.pages import protocol_figures as figures
-from uwbsim.protocols.comparison import Comparison, ProtocolErrors
+from uwbsim.protocols.comparison import Comparison, ProtocolErrors, over_reply, over_skew, over_state
 from uwbsim.protocols.conditions import conditions_of
-from uwbsim.protocols.error_curves import over_reply, over_skew, over_state
 from uwbsim.tables import write_csv, write_parquet
 
 COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {

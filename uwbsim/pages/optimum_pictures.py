@@ -9,7 +9,7 @@ from pathlib import Path
 from uwblink.output import check_folder, write_files
 from uwblink.pages.figures import picture
 from uwbsim.pages.protocol_figures import optimum_curve
-from uwbsim.protocols.reply_delay import Optimum
+from uwbsim.protocols.comparison import Optimum
 
 
 def optimum_file(protocol: str) -> str:

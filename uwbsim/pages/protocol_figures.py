@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, VERMILION, Look, look
 from uwblink.pages.figures import label, legend, mark, sheet
-from uwbsim.protocols.error_curves import ErrorCurve
-from uwbsim.protocols.reply_delay import Optimum
+from uwbsim.protocols.comparison import ErrorCurve, Optimum
 
 LINEAR_CM: Final = 1.0
 """Biases below are drawn to scale, larger ones by their logarithm."""

@@ -16,12 +16,11 @@ from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import TICK_S
 from uwbsim.random_streams import stream
-from uwbsim.scenario.airtime import after_marker_s, before_marker_s, message_bytes
 from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
 from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw_reply_s, stamp
-from uwbsim.world.clocks import Clocks
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.reception import Medium
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 LONGEST_DRAWN_S: Final = 120.0

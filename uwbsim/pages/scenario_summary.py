@@ -12,8 +12,8 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import UUS_S
-from uwbsim.simulation.schedule import schedule
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+from uwbsim.simulation.air import schedule
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 SAMPLES: Final = 200

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from uwbsim.protocols.comparison import chosen
+    from uwbsim.protocols.conditions import chosen
 
 __all__ = [
     "chosen",
 ]
 
 _HOMES: Final = {
-    "chosen": "uwbsim.protocols.comparison",
+    "chosen": "uwbsim.protocols.conditions",
 }
 
 if not TYPE_CHECKING:

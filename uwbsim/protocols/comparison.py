@@ -1,9 +1,10 @@
-"""Protocols side by side in the same random world: what they know, what they cost."""
+"""Protocols side by side in the same random world: errors, costs, error curves, and the best delay of a reply."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -11,12 +12,14 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
-from uwblink.protocols.table import PROTOCOLS
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.conditions import Conditions, calibrated, conditions_of
+from uwbsim.protocols.conditions import Conditions, Protocols, calibrated, chosen, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
-from uwbsim.scenario.airtime import (
+from uwbsim.scenario.loading import Source, as_scenario
+from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.ranging import (
     RECEIVER_ON_S,
     TURNAROUND_S,
     after_marker_s,
@@ -25,8 +28,6 @@ from uwbsim.scenario.airtime import (
     frame_s,
     message_bytes,
 )
-from uwbsim.scenario.loading import Source, as_scenario
-from uwbsim.scenario.model import Scenario
 
 MOST: Final = 50_000_000
 """Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""
@@ -114,26 +115,6 @@ class Comparison:
                 f"{one.protocol:10s}" + "".join(f"{100 * e:11.3f}" for e in errors) + f"{1e6 * one.air_s:10.0f}"
             )
         return "\n".join(lines)
-
-
-Protocols = Sequence[str | RangingProtocol]
-
-
-def chosen(protocols: Protocols | None, parameter: str = "protocols") -> list[RangingProtocol]:
-    """Return rows of protocols, given as rows or by name, each once; None is all that there are.
-
-    Raises `ParameterError` that lists what there is.
-    """
-    wanted = list(PROTOCOLS) if protocols is None else protocols
-    rows: dict[str, RangingProtocol] = {}
-    for one in wanted:
-        if not isinstance(one, RangingProtocol) and one not in PROTOCOLS:
-            raise ParameterError(f"found {one!r}, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
-        row = one if isinstance(one, RangingProtocol) else PROTOCOLS[one]
-        rows.setdefault(row.name, row)
-    if not rows:
-        raise ParameterError(f"found none, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
-    return list(rows.values())
 
 
 def compare(
@@ -254,3 +235,161 @@ def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[di
             }
         )
     return rows
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorCurve:
+    """Error over something: where, simulated mean and spread, predicted mean and spread, metres, (n,) each."""
+
+    x: Floats
+    bias_m: Floats
+    std_m: Floats
+    predicted_bias_m: Floats
+    predicted_std_m: Floats
+
+
+def over_skew(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
+    """Error over the relative skew of the two clocks, in ppm, everything else as in the scenario."""
+    world = calibrated(conditions_of(scenario, 2048))
+    skews = np.linspace(-20, 20, 17)
+    worlds = [world.with_columns(rate_initiator=s * 0.5e-6, rate_target=-s * 0.5e-6) for s in skews]
+    return _curve(protocol, skews, worlds, scenario.run.seed, count)
+
+
+def over_reply(scenario: Scenario, protocol: RangingProtocol, count: int = 16_384) -> ErrorCurve:
+    """Error over the delay of the scheduled message, in microseconds."""
+    world = calibrated(conditions_of(scenario, 2048))
+    delays = np.geomspace(300, 6000, 15)
+    worlds = [world.with_columns(scheduled=delay * 1e-6) for delay in delays]
+    return _curve(protocol, delays, worlds, scenario.run.seed, count)
+
+
+def _curve(protocol: RangingProtocol, x: Floats, worlds: Sequence[Conditions], seed: int, count: int) -> ErrorCurve:
+    errors = [range_errors_m(protocol, world, seed, count) for world in worlds]
+    pooled = np.array([predict(protocol, world).pooled() for world in worlds])
+    means, spreads = (np.array([f(e) for e in errors]) for f in (np.mean, np.std))
+    return ErrorCurve(x, means, spreads, pooled[:, 0], np.sqrt(pooled[:, 1]))
+
+
+def over_state(
+    protocol: RangingProtocol, conditions: Conditions, values: Floats, errors: Floats, groups: int = 14
+) -> ErrorCurve:
+    """Error over something that the states have, `values` (states,), from `errors` that met them in turn."""
+    used = np.resize(np.arange(len(conditions)), len(errors))
+    prediction = predict(protocol, conditions)
+    parts = np.array_split(np.argsort(values), groups)
+    place = np.empty(len(conditions), dtype=np.int64)
+    for k, rows in enumerate(parts):
+        place[rows] = k
+    group = place[used]
+    counts = np.maximum(np.bincount(group, minlength=groups), 1)
+    mean = np.bincount(group, errors, groups) / counts
+    std = np.sqrt(np.maximum(np.bincount(group, errors**2, groups) / counts - mean**2, 0))
+    means = np.array([prediction.mean_m[rows].mean() for rows in parts])
+    spreads = np.array([prediction.variance_m2[rows].mean() + prediction.mean_m[rows].var() for rows in parts])
+    middles = np.array([np.median(values[rows]) for rows in parts])
+    return ErrorCurve(middles, mean, std, means, np.sqrt(spreads))
+
+
+def paper_bias_m(skew_ppm: float, reply_s: float) -> float:
+    """Return the bias of SS-TWR, c/2 times relative skew times reply (ICRA 2023, section II)."""
+    return 0.5 * SPEED_OF_LIGHT * skew_ppm * 1e-6 * reply_s
+
+
+SHORTEST_S: Final = 287e-6
+"""280 UWB microseconds, below which the boards miss the time to send (firmware wire format)."""
+
+LONGEST_S: Final = 6.6e-3
+POINTS: Final = 121
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Optimum:
+    """The best delay, and the curve: delays in seconds, mean squared error of a range and of a second of them in m^2.
+
+    `rms_m` is the error of one range, `second_rms_m` that of the mean of as many as a pair has in a second: noise
+    averages away with their number, what skew leaves does not. `duration_s` is how long one takes, turnaround included.
+    `on_edge` says that the best delay is the shortest or the longest one that boards take.
+    """
+
+    protocol: str
+    delay_s: float
+    rms_m: float
+    duration_s: float
+    second_rms_m: float
+    on_edge: bool
+    delays_s: Floats
+    range_m2: Floats
+    second_m2: Floats
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        edge = " (the edge of what boards take)" if self.on_edge else ""
+        return (
+            f"{self.protocol}: best delay {1e6 * self.delay_s:.0f} µs{edge}, one range {100 * self.rms_m:.2f} cm in "
+            f"{1e6 * self.duration_s:.0f} µs, mean of a second {1e3 * self.second_rms_m:.3f} mm"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `uwbsim optimum --json` prints."""
+        document = asdict(self)
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in document.items()}
+
+
+def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds", overhead_s: float = 0.0) -> Optimum:
+    """Minimise the mean squared error of the mean of a second's exchanges over the delay of the scheduled message.
+
+    A second holds 1/duration exchanges of a pair, one after the other at the boards' turnaround. The variance of their
+    mean is that of one times the duration; the bias that skew, drift and motion leave is that of one. Antenna delays,
+    power bias and reflections are left out: calibration deals with them, and no delay does. `scenario` is whatever
+    `load` takes, or a `Scenario`, `protocol` a name or a row of `PROTOCOLS`; `overhead_s` is what an exchange takes
+    besides, in seconds (others on the air). Raises `ParameterError`.
+
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> best = uwbsim.optimum(
+    ...     {
+    ...         "run": {"duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     }
+    ... )
+    >>> best.on_edge, 500e-6 < best.delay_s < 1500e-6
+    (False, True)
+    """
+    from scipy.optimize import minimize_scalar
+
+    scenario, (protocol,) = as_scenario(scenario), chosen([protocol], "protocol")
+    if not (math.isfinite(overhead_s) and overhead_s >= 0):
+        raise ParameterError(f"found {overhead_s}, expected seconds, 0 or more", parameter="overhead_s")
+    world = calibrated(conditions_of(scenario, 2048))
+    # The grid of delayed transmissions would show as teeth of 8 ns on the curve.
+    world = replace(world, quantize=False)
+    delays = np.geomspace(SHORTEST_S, LONGEST_S, POINTS)
+
+    def duration(delay: float) -> float:
+        return costs(scenario, protocol, delay)["duration_s"] + TURNAROUND_S + overhead_s
+
+    def errors(delay: float) -> tuple[float, float]:
+        """Return the mean squared error of one range, and of the mean of a second of them."""
+        found = predict(protocol, world.with_columns(scheduled=delay))
+        return found.mean_of(1), found.mean_of(1 / duration(delay))
+
+    one, second = np.array([errors(float(delay)) for delay in delays]).T
+    best = int(np.argmin(second))
+    low, high = delays[max(best - 1, 0)], delays[min(best + 1, POINTS - 1)]
+    refined = minimize_scalar(lambda d: errors(d)[1], bounds=(low, high), method="bounded", options={"xatol": 1e-8})
+    delay = min((float(refined.x), float(delays[best])), key=lambda d: errors(d)[1])
+    one_m2, second_m2 = errors(delay)
+    return Optimum(
+        protocol=protocol.name,
+        delay_s=delay,
+        rms_m=math.sqrt(one_m2),
+        duration_s=duration(delay),
+        second_rms_m=math.sqrt(second_m2),
+        on_edge=best in (0, POINTS - 1),
+        delays_s=delays,
+        range_m2=one,
+        second_m2=second,
+    )

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
 
 from uwblink.arrays import Floats, Ints
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S, UUS_TICKS
-from uwbsim.errors import ScenarioError
+from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.random_streams import stream
-from uwbsim.scenario.airtime import before_marker_s
 from uwbsim.scenario.model import Scenario
-from uwbsim.simulation.schedule import schedule
+from uwbsim.scenario.ranging import before_marker_s
+from uwbsim.simulation.air import schedule
 from uwbsim.simulation.timestamps import draw_reply_s
-from uwbsim.world.clocks import Clocks
+from uwbsim.world.antenna_delays import AntennaDelays
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.radio import carrier_bias_ppm
 from uwbsim.world.reception import arrive
-from uwbsim.world.temperature import AntennaDelays
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
 
 STATES: Final = 16_384
@@ -98,6 +100,26 @@ class Conditions:
 
 
 COLUMNS: Final = tuple(f.name for f in fields(Conditions) if f.type == "Floats")
+
+
+Protocols = Sequence[str | RangingProtocol]
+
+
+def chosen(protocols: Protocols | None, parameter: str = "protocols") -> list[RangingProtocol]:
+    """Return rows of protocols, given as rows or by name, each once; None is all that there are.
+
+    Raises `ParameterError` that lists what there is.
+    """
+    wanted = list(PROTOCOLS) if protocols is None else protocols
+    rows: dict[str, RangingProtocol] = {}
+    for one in wanted:
+        if not isinstance(one, RangingProtocol) and one not in PROTOCOLS:
+            raise ParameterError(f"found {one!r}, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
+        row = one if isinstance(one, RangingProtocol) else PROTOCOLS[one]
+        rows.setdefault(row.name, row)
+    if not rows:
+        raise ParameterError(f"found none, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
+    return list(rows.values())
 
 
 def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from uwbsim.scenario.shipped import copy_scenarios, listed, shipped_scenarios
-    from uwbsim.scenario.tags import with_antenna_delays
+    from uwbsim.scenario.devices import with_antenna_delays
+    from uwbsim.scenario.loading import copy_scenarios, listed, shipped_scenarios
 
 __all__ = [
     "copy_scenarios",
@@ -16,10 +16,10 @@ __all__ = [
 ]
 
 _HOMES: Final = {
-    "copy_scenarios": "uwbsim.scenario.shipped",
-    "listed": "uwbsim.scenario.shipped",
-    "shipped_scenarios": "uwbsim.scenario.shipped",
-    "with_antenna_delays": "uwbsim.scenario.tags",
+    "copy_scenarios": "uwbsim.scenario.loading",
+    "listed": "uwbsim.scenario.loading",
+    "shipped_scenarios": "uwbsim.scenario.loading",
+    "with_antenna_delays": "uwbsim.scenario.devices",
 }
 
 if not TYPE_CHECKING:

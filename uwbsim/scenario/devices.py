@@ -1,13 +1,20 @@
-"""The boards of a scenario as devices: temperature, supply voltage, and group delay over direction."""
+"""The boards of a scenario: tags with antenna delays and clocks, temperature, supply voltage, group delay."""
 
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, Any, Literal, Self
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from uwbsim.scenario.base import NotNegative, Positive, Section
+from uwblink.errors import PlanError
+from uwblink.recording.antenna_delays import REGISTER_MAX, delay_of, load_antenna_delays
+from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
+from uwbsim.errors import ScenarioError
+from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
+from uwbsim.scenario.bodies import Height, Imu, Motion, Shadow
+from uwbsim.units import NS, PPM
 
 
 class Constant(Section):
@@ -163,3 +170,187 @@ def check_grid(
     for k, row in enumerate(rows):
         if len(row) != len(elevation_deg):
             raise ValueError(f"{name}[{k}]: found {len(row)} values, the elevations are {len(elevation_deg)}")
+
+
+TX_SHARE: Final = 0.44
+"""Share of an aggregate antenna delay that belongs to transmissions, the rest to receptions (Decawave APS014)."""
+
+Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]
+PATTERN_SIZES: Final = (0, 1, 4, 9, 16, 25)
+
+
+"""How many spherical harmonics there are up to a degree."""
+
+
+class Body(Section):
+    """Something that carries tags, and may stand in the way of waves."""
+
+    name: Annotated[str, Field(min_length=1)] = Field(description="What the body is called; no two have the same name.")
+    motion: Motion = Field(description="How it moves.")
+    shadow: Shadow | None = Field(
+        None,
+        description="The part of it that waves do not pass unharmed; none where it is left out.",
+    )
+    temperature_c: Profile | None = Field(
+        None,
+        description="Temperature of those of its tags that have none of their own, over time.",
+    )
+    supply_v: Profile | None = Field(
+        None,
+        description="Supply voltage of those of its tags that have none of their own, over time.",
+    )
+    imu: Imu | None = Field(None, description="Its inertial sensor, whose readings the recording has.")
+    height: Height | None = Field(None, description="Its height sensor, whose readings the recording has.")
+
+
+class Programmed(Section):
+    """Antenna delays that are programmed into a board, in ticks of 15.65 ps.
+
+    The chip adds `tx` to the stamps of what it sends, and takes `rx` from those of what it receives. The firmware works
+    out the stamp of a reply that it schedules, with a constant of its build, `reply`.
+    """
+
+    tx: Register = Field(ANTENNA_DELAY_TICKS, description="Register of the transmitter.")
+    rx: Register = Field(ANTENNA_DELAY_TICKS, description="Register of the receiver.")
+    reply: Register = Field(ANTENNA_DELAY_TICKS, description="Constant in the stamps of delayed replies (TX_ANT_DLY).")
+
+
+class Tag(Section):
+    """A board: where it sits, its antenna delay and its clock.
+
+    Give the aggregate `delay_ns` = transmit - receive, split 0.44 / 0.56, or both parts. What temperature and voltage
+    do to a tag is in `Devices`.
+    """
+
+    id: TagId = Field(description="Number of the board; no two have the same.")
+    body: str = Field(description="Name of the body that carries it.")
+    lever_arm_m: Vector = Field((0.0, 0.0, 0.0), description="Where its antenna sits in the frame of the body.")
+    delay_ns: float | None = Field(
+        None,
+        description="Aggregate antenna delay, transmit less receive, split 0.44 / 0.56; 0 where no delay is given.",
+    )
+    tx_delay_ns: float | None = Field(
+        None,
+        description="What the antenna adds to transmit stamps; give rx_delay_ns, too, and not delay_ns.",
+    )
+    rx_delay_ns: float | None = Field(
+        None,
+        description="What the antenna adds to receive stamps; give tx_delay_ns, too, and not delay_ns.",
+    )
+    antenna_delay: Programmed = Field(
+        Programmed(),
+        description="What is programmed into the board; by default the 16436 ticks that delays are relative to.",
+    )
+    skew_ppm: Annotated[float, Field(ge=-100, le=100)] = Field(
+        0.0,
+        description="How much faster than true time the clock runs at first.",
+    )
+    drift_ppm_per_sqrt_s: NotNegative = Field(
+        0.0,
+        description="Random walk of the clock's rate (Allan deviation q sqrt(tau/3)).",
+    )
+    white_ppm_sqrt_s: NotNegative = Field(
+        0.0,
+        description="White noise of the clock's rate (Allan deviation h/sqrt(tau)).",
+    )
+    flicker_ppm: NotNegative = Field(
+        0.0,
+        description="Flicker noise of the clock's rate (the same Allan deviation at every tau).",
+    )
+    ramp_ppm_per_s: float = Field(0.0, description="Steady change of the clock's rate.")
+    warm_up_ppm: float = Field(
+        0.0,
+        description="How much faster the clock runs at first, by a transient that dies out.",
+    )
+    warm_up_s: Positive = Field(60.0, description="Over which time that transient decays by e.")
+    temperature_c: Profile | None = Field(
+        None,
+        description="Its temperature over time; that of its body where it is left out.",
+    )
+    supply_v: Profile | None = Field(
+        None,
+        description="Its supply voltage over time; that of its body where it is left out.",
+    )
+    range_mm_per_k: float | None = Field(None, description="In the place of devices.range_mm_per_k, for this tag.")
+    range_cm_per_v: float | None = Field(None, description="In the place of devices.range_cm_per_v, for this tag.")
+    skew_ppm_per_k: float | None = Field(None, description="In the place of devices.skew_ppm_per_k, for this tag.")
+    group_delay: GroupDelay | None = Field(
+        None,
+        description="Group delay of its antenna over direction; that of radio.group_delay where it is left out.",
+    )
+    passive: bool = Field(False, description="Whether it records the exchanges that it overhears.")
+    tx_power_db: float = Field(0.0, description="How much stronger than others it sends.")
+    power_offset_db: float = Field(0.0, description="How much too high it reads powers.")
+    pattern_db: tuple[float, ...] = Field(
+        (),
+        description="What its own antenna adds to radio.antenna by direction in its body's frame: 1, 4, 9, 16 or 25 "
+        "coefficients of real spherical harmonics of degree 0, 1 and so on (m from -l to l), whose root "
+        "mean square over all directions is one.",
+    )
+    clock_offset_s: NotNegative | None = Field(
+        None,
+        description="What its clock shows when the run begins; drawn from the seed where it is left out.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        parts = (self.tx_delay_ns is not None, self.rx_delay_ns is not None)
+        if parts[0] != parts[1] or (parts[0] and self.delay_ns is not None):
+            raise ValueError("delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
+        if len(self.pattern_db) not in PATTERN_SIZES:
+            allowed = ", ".join(map(str, PATTERN_SIZES[1:]))
+            raise ValueError(f"pattern_db: found {len(self.pattern_db)} coefficients, expected {allowed} or none")
+        return self
+
+    @property
+    def antenna_delays_s(self) -> tuple[float, float]:
+        """Return what is added to a transmit and to a receive stamp beyond what belongs there, in seconds."""
+        transmit, receive = self.delays_ns()
+        return transmit * NS, receive * NS
+
+    @property
+    def skew(self) -> float:
+        """Return how much faster than true time the clock runs at first, as a fraction."""
+        return self.skew_ppm * PPM
+
+    @property
+    def drift_per_sqrt_s(self) -> float:
+        """Return the random walk of the clock's rate, as a fraction per root of a second."""
+        return self.drift_ppm_per_sqrt_s * PPM
+
+    @property
+    def white_sqrt_s(self) -> float:
+        """Return the white noise of the clock's rate, as a fraction times the root of a second."""
+        return self.white_ppm_sqrt_s * PPM
+
+    @property
+    def flicker(self) -> float:
+        """Return the Allan deviation of flicker noise of the clock's rate, as a fraction."""
+        return self.flicker_ppm * PPM
+
+    @property
+    def ramp_per_s(self) -> float:
+        """Return what a change of temperature adds to the clock's rate, as a fraction per second."""
+        return self.ramp_ppm_per_s * PPM
+
+    def delays_ns(self) -> tuple[float, float]:
+        """Return what is added to a transmit and to a receive stamp beyond what belongs there, in nanoseconds.
+
+        That is what the antenna adds, and what is programmed above or below 16436.
+        """
+        aggregate = self.delay_ns or 0.0
+        transmit = TX_SHARE * aggregate if self.tx_delay_ns is None else self.tx_delay_ns
+        receive = (TX_SHARE - 1) * aggregate if self.rx_delay_ns is None else self.rx_delay_ns
+        more = [(ticks - ANTENNA_DELAY_TICKS) * TICK_S / NS for ticks in (self.antenna_delay.tx, self.antenna_delay.rx)]
+        return transmit + more[0], receive - more[1]
+
+
+def with_antenna_delays(tags: tuple[Tag, ...], path: Path) -> tuple[Tag, ...]:
+    """Return tags with the antenna delays of a file programmed into them; raises `ScenarioError`."""
+    try:
+        delays = load_antenna_delays(path)
+    except PlanError as error:
+        raise ScenarioError(str(error)) from error
+    found = {tag.id: delay_of(delays, tag.id) for tag in tags}
+    programmed = {tag: Programmed(**one._asdict()) for tag, one in found.items() if one is not None}
+    return tuple(tag.model_copy(update={"antenna_delay": programmed.get(tag.id, tag.antenna_delay)}) for tag in tags)

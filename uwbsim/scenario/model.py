@@ -13,13 +13,10 @@ from pydantic import Field, model_validator
 
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
-from uwbsim.scenario.devices import Devices
-from uwbsim.scenario.motion import Carried, RandomFlight, Static, Waypoints
-from uwbsim.scenario.multipath import GeometricMultipath, TwoStateMultipath
-from uwbsim.scenario.radio import Radio, Spline
+from uwbsim.scenario.bodies import Carried, Obstacle, RandomFlight, Room, Static, Waypoints
+from uwbsim.scenario.devices import Body, Devices, Tag
+from uwbsim.scenario.radio import GeometricMultipath, Radio, Spline, TwoStateMultipath
 from uwbsim.scenario.ranging import Ranging
-from uwbsim.scenario.surroundings import Obstacle, Room
-from uwbsim.scenario.tags import Body, Tag
 from uwbsim.units import MS
 
 WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6

@@ -1,16 +1,236 @@
-"""The radios of a scenario: power, noise and bias."""
+"""The radios of a scenario: power, noise, bias curves, reflections, fading and outages."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from uwbsim.scenario.base import NotNegative, Positive, Section
+from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
 from uwbsim.scenario.devices import GroupDelay, check_grid
-from uwbsim.scenario.multipath import Fading, IndependentMultipath, Multipath, Outages
-from uwbsim.scenario.published_curves import BIAS, SIGMA
-from uwbsim.units import PS
+from uwbsim.units import MS, NS, PS
+
+_AUGUST: Final = [0.014173673264269979] * 4 + [1.599984520527571] * 4
+_JULY: Final = [0.009024434505913748] * 4 + [1.8988661927089594] * 4
+
+BIAS: Final[dict[str, dict[str, Any] | None]] = {
+    "none": None,
+    "icra2023": {
+        "knots": _AUGUST,
+        "coefficients": [-0.10390405490159899, 0.19557370947637895, 0.009971128641334684, -0.08013907739130957],
+    },
+    "icra2023-july": {
+        "knots": _JULY,
+        "coefficients": [0.04966490271694489, 0.1953304643142809, -0.07314396259120787, -0.13110281313784328],
+    },
+    "miluv": {
+        "knots": [0.01] * 4 + [1.8] * 4,
+        "coefficients": [-0.07124040390869976, 0.3203602506292999, -0.17857607126613156, -0.07516134998019255],
+    },
+    "aps011": {
+        "power_dbm": [float(-61 - 2 * k) for k in range(18)],
+        "bias_m": [
+            b / 1000
+            for b in (-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86)
+        ],
+    },
+}  # fmt: skip
+"""Bias of a range in metres."""
+
+REPLY_RATIO: Final = 0.2
+"""dt32/dt53 of the boards in the flights behind the curves: 305 us to 1539 us."""
+
+SIGMA: Final[dict[str, dict[str, Any] | None]] = {
+    "none": None,
+    "icra2023": {
+        "knots": _AUGUST,
+        "coefficients": [0.07418352595325353, 0.11438036048184572, 0.04769635492702895, 0.06499148440853658],
+        "reply_ratio": REPLY_RATIO,
+    },
+    "icra2023-july": {
+        "knots": _JULY,
+        "coefficients": [0.20866472194861246, 0.08108610512201572, 0.06722711440695964, 0.07144904233331333],
+        "reply_ratio": REPLY_RATIO,
+    },
+    "miluv": {
+        "knots": [0.01] * 5 + [1.8] * 5,
+        "coefficients": [
+            0.18973127701786333, 0.1401417272865022, 0.3951126347143982, -0.11438027911679073, 0.12874371852672592,
+        ],
+        "degree": 4,
+        "reply_ratio": REPLY_RATIO,
+    },
+}  # fmt: skip
+"""Standard deviation of a double-sided range in metres, as those were from which the curves come."""
+
+
+class IndependentMultipath(Section):
+    """The positive tail, drawn for each exchange alone: with `probability` it travels an exponential excess distance.
+
+    All pairs are alike, nothing lasts, and neither power nor impulse response tells such an exchange from others.
+    """
+
+    model: Literal["independent"] = Field("independent", description="Drawn for each exchange alone.")
+    probability: Share = Field(description="Share of exchanges that travel a detour.")
+    mean_excess_m: Positive = Field(description="Mean excess length of detours, which is exponential.")
+
+
+class PairMultipath(Section):
+    """What a pair of tags has of reflections where it is known; the rest is drawn."""
+
+    tags: tuple[TagId, TagId] = Field(description="The two tags.")
+    share: Share | None = Field(None, description="Their share of time in reflections.")
+    life_s: Positive | None = Field(None, description="Their time between redraws.")
+    mean_excess_m: Positive | None = Field(None, description="Mean excess length of their reflections.")
+
+
+class TwoStateMultipath(Section):
+    """Reflections that last: at any time a pair's first path is the direct one or a reflection.
+
+    At random instants, on average a pair's life apart, a pair's path is drawn anew: with its share a reflection, whose
+    excess length has a gamma distribution. So both the state and the excess have the autocorrelation exp(-dt/life). A
+    reflection leaves its trace in the powers, and in the impulse response most of its power comes late.
+    """
+
+    model: Literal["two-state"] = Field(description="Reflections that last, by pair.")
+    share: Share = Field(0.1, description="Mean share of time in which a pair's first path is a reflection.")
+    share_std: NotNegative = Field(0.0, description="Standard deviation of pairs' shares (a beta distribution).")
+    life_s: Annotated[float, Field(ge=0.01)] = Field(0.5, description="Median time between redraws of a pair's path.")
+    life_spread: Annotated[float, Field(ge=0, le=2)] = Field(
+        0.0,
+        description="Standard deviation of the logarithm of pairs' lives.",
+    )
+    mean_excess_m: Positive = Field(0.4, description="Mean excess length of reflections.")
+    excess_shape: Positive = Field(
+        1.0,
+        description="Shape of the gamma distribution of excess lengths; 1 is exponential.",
+    )
+    first_path_loss_db: NotNegative = Field(
+        8.0,
+        description="How much weaker a reflected first path is than the direct one, on average.",
+    )
+    loss_std_db: NotNegative = Field(2.0, description="Standard deviation of that.")
+    total_loss_db: NotNegative = Field(2.0, description="How much weaker all paths together are then.")
+    rise_ns: Positive = Field(6.0, description="How much later most of the power comes then, on average.")
+    direct_std_m: NotNegative = Field(
+        0.0,
+        description="Standard deviation of by how much a direct path seems longer or shorter, for as long as it lasts.",
+    )
+    pairs: tuple[PairMultipath, ...] = Field((), description="What is known of single pairs; the rest is drawn.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.share_std and self.share_std**2 >= self.share * (1 - self.share):
+            most = (self.share * (1 - self.share)) ** 0.5
+            raise ValueError(
+                f"share_std: found {self.share_std:g}, with a mean of {self.share:g} it is below {most:.3g}"
+            )
+        if self.total_loss_db > self.first_path_loss_db:
+            raise ValueError(
+                f"total_loss_db: found {self.total_loss_db:g}, at most first_path_loss_db ({self.first_path_loss_db:g})"
+            )
+        known = [frozenset(pair.tags) for pair in self.pairs]
+        for k, pair in enumerate(known):
+            if len(pair) < 2 or pair in known[:k]:
+                raise ValueError(
+                    f"pairs[{k}].tags: found {list(self.pairs[k].tags)}, give two tags, and each pair once"
+                )
+        return self
+
+    @property
+    def rise_s(self) -> float:
+        """Return in seconds how much later the strongest path comes on average."""
+        return self.rise_ns * NS
+
+
+class Fading(Section):
+    """Power that comes and goes with the place, alike in both directions of a pair of tags.
+
+    At random instants, `life_s` apart on average, it is drawn anew, with the standard deviation `std_db`; so its
+    autocorrelation is exp(-dt/life). With `levels_db` it has these quantiles instead, from 0 to 1 in equal steps.
+    """
+
+    std_db: NotNegative = Field(0.0, description="Standard deviation of the power; or give levels_db.")
+    levels_db: tuple[float, ...] = Field(
+        (),
+        description="Quantiles of the power from 0 to 1 in equal steps; or give std_db.",
+    )
+    life_s: Annotated[float, Field(ge=0.01)] = Field(0.5, description="Mean time between redraws.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.levels_db) == 1 or list(self.levels_db) != sorted(self.levels_db):
+            raise ValueError("levels_db: give two or more, which do not decrease")
+        if self.levels_db and self.std_db:
+            raise ValueError("levels_db: give either levels_db or std_db")
+        return self
+
+
+class Outages(Section):
+    """Whiles in which two tags do not hear each other, for no reason that the scenario has: `share` of the time.
+
+    At random instants, `life_s` apart on average, it is drawn anew whether a pair is out.
+    """
+
+    share: Share = Field(description="Share of time in which two tags do not hear each other.")
+    life_s: Annotated[float, Field(ge=0.01)] = Field(0.5, description="Mean time between redraws.")
+
+
+class GeometricMultipath(Section):
+    """One impulse response from geometry: direct path, reflections off room and obstacles, and things in the room.
+
+    The room's surfaces and the obstacles' faces reflect as their materials do (Fresnel), less what their roughness
+    scatters; obstacles and bodies throw shadows with soft edges. `scatterers` are things at places of their own in the
+    room, drawn from the seed: each gives back what a mirror there would, less `scatter_loss_db` on average (with a
+    Rayleigh distribution of its field), later by what waves bounce around it, whose power dies out over `decay_ns`.
+    All paths add up with their phases. The response is computed for each pair every `step_ms`; of it follow first path,
+    powers, excess range, impulse response, and with `stamp_noise` what noise does to the leading edge: noise is
+    `threshold_to_noise` times below the first path's threshold, which is `radio.dynamic_range_db` below the strongest
+    tap, or at `radio.sensitivity_dbm`.
+
+    `scatter_loss_db` and `decay_ns` were chosen so that rooms have the total less first-path powers of MILUV's recorded
+    responses (median 7.5 dB); these also say 18 dB for `radio.dynamic_range_db`, and 12 for `threshold_to_noise`.
+    """
+
+    model: Literal["geometric"] = Field(description="One impulse response from geometry.")
+    scatterers: Annotated[int, Field(ge=0, le=500)] = Field(
+        32,
+        description="How many things stand in the room at places drawn from the seed.",
+    )
+    scatter_loss_db: float = Field(
+        1.0,
+        description="How much less than a mirror in its place each gives back, on average.",
+    )
+    decay_ns: Positive = Field(12.0, description="Over which time the power of what bounces around it dies out by e.")
+    step_ms: Annotated[float, Field(ge=0.1, le=100)] = Field(
+        5.0,
+        description="How often the response of each pair is computed.",
+    )
+    stamp_noise: bool = Field(True, description="Whether the noise of stamps follows from the leading edge.")
+    threshold_to_noise: Positive = Field(
+        12.0,
+        description="How many times below the first path's threshold the noise is.",
+    )
+
+    @property
+    def decay_s(self) -> float:
+        """Return over which time the power of what bounces around falls to a share of 1/e."""
+        return self.decay_ns * NS
+
+    @property
+    def step_s(self) -> float:
+        """Return in seconds how often responses are computed."""
+        return self.step_ms * MS
+
+
+def _independent_unless_named(value: Any) -> Any:
+    return {"model": "independent"} | value if isinstance(value, dict) else value
+
+
+Multipath = Annotated[
+    Annotated[IndependentMultipath | TwoStateMultipath | GeometricMultipath, Field(discriminator="model")],
+    BeforeValidator(_independent_unless_named),
+]
 
 
 class Spline(Section):

@@ -12,22 +12,19 @@ from uwblink.recording.schema import Tag
 from uwblink.ticks import UUS_TICKS
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
-from uwbsim.scenario.airtime import before_marker_s
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation import air
-from uwbsim.simulation.overhearing import overhear, responses
-from uwbsim.simulation.reporting import Run, provenance, reported_exchanges, reported_faults
-from uwbsim.simulation.schedule import Schedule, schedule
+from uwbsim.simulation.air import Schedule, schedule
+from uwbsim.simulation.reporting import Run, overhear, provenance, reported_exchanges, reported_faults, responses
 from uwbsim.simulation.simulated import Simulated
 from uwbsim.simulation.timestamps import Begun, Draws, draw, stamp
-from uwbsim.world.clocks import LONGEST_RUN_S, Clocks
-from uwbsim.world.inertial import height_readings, inertial_readings
-from uwbsim.world.lookahead import SampledWorld
+from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.reception import Medium
 from uwbsim.world.temperature import readings
-from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
-from uwbsim.world.world import World
+from uwbsim.world.trajectories import height_readings, inertial_readings
+from uwbsim.world.world import SampledWorld, World
 
 
 def simulate(

@@ -22,8 +22,8 @@ from uwblink.ticks import (
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import US
+from uwbsim.world.clocks import SUBTICKS
 from uwbsim.world.reception import Frames, Medium
-from uwbsim.world.true_time import SUBTICKS
 
 GRID: Final = DELAYED_TX_GRID
 

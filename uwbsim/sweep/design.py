@@ -20,8 +20,7 @@ from uwblink.toml import FileKey
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.linked_files import Folders, check_linked
-from uwbsim.scenario.loading import load
-from uwbsim.scenario.shipped import SUFFIX, shipped_scenarios
+from uwbsim.scenario.loading import SUFFIX, load, shipped_scenarios
 
 KINDS: Final = ("compare", "calibrate")
 DESIGNS: Final = ("grid", "latin-hypercube", "list")

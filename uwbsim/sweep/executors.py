@@ -1,21 +1,184 @@
-"""Who does the work of a sweep: this process, all cores, or a Dask cluster that runs already."""
+"""One run of a sweep as a worker does it, and the workers: this process, processes, or a Dask cluster.
+
+A run goes from plain data to plain rows, the same on every worker. Workers are other processes, perhaps on other
+machines: functions of plug-ins reach them by module and name.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import platform
 import signal
-from collections.abc import Iterator, Sequence
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import entry_points
 from multiprocessing.connection import Connection
 from threading import Thread
 from typing import Any, Final, Protocol
 
+import numpy as np
+
+import uwblink
+from uwblink.errors import UwblinkError
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS, register_protocol
 from uwbsim.errors import ParameterError, UwbsimError
-from uwbsim.sweep.extensions import Extensions
-from uwbsim.sweep.task import Result, Task, run_chunk
+from uwbsim.simulation.simulated import Simulated
+from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
+
+Evaluate = Callable[[Simulated], Mapping[str, Any]]
+"""Returns the figures of a flight as columns of one row: numbers, texts or None."""
+
+GROUP: Final = "uwbcal.evaluators"
+"""Entry points of this group offer functions of kind `Evaluate`, by the name of a sweep's kind."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Extensions:
+    """What a worker needs besides its tasks: the function that evaluates flights, protocols, effects of the channel."""
+
+    evaluate: Evaluate | None = None
+    protocols: tuple[RangingProtocol, ...] = ()
+    effects: tuple[tuple[str, ChannelEffect], ...] = ()
+
+    @classmethod
+    def of_here(cls, evaluate: Evaluate | None, protocols: Sequence[str]) -> Extensions:
+        """Return what this process has, with the rows of some protocols."""
+        added = {name: effect for name, effect in CHANNEL_EFFECTS.items() if name not in OWN_EFFECTS}
+        rows = tuple(PROTOCOLS[name] for name in protocols)
+        return cls(evaluate=evaluate, protocols=rows, effects=tuple(added.items()))
+
+    def install(self) -> None:
+        """Have a process know what is in here; what it knows already stays."""
+        for row in self.protocols:
+            if row.name not in PROTOCOLS:
+                register_protocol(row)
+        for name, effect in self.effects:
+            CHANNEL_EFFECTS.setdefault(name, effect)
+
+    def check(self) -> None:
+        """Raise `ParameterError` where another process would not find a function by its name."""
+        named: dict[str, object] = {f"channel effect {name!r}": effect for name, effect in self.effects}
+        for row in self.protocols:
+            formulas = {part: getattr(row, part) for part in ("flight_ticks", "delay_weights")}
+            named |= {f"{part} of protocol {row.name!r}": formula for part, formula in formulas.items()}
+        if self.evaluate is not None:
+            named["evaluate"] = self.evaluate
+        for what, function in named.items():
+            if not _found_by_name(function):
+                raise ParameterError(
+                    f"found {function!r}, which other processes cannot import; "
+                    "give a function at the top of a module, or work in this process (workers = 1)",
+                    parameter=what,
+                )
+
+
+def _found_by_name(function: object) -> bool:
+    module = sys.modules.get(getattr(function, "__module__", None) or "")
+    return getattr(module, getattr(function, "__qualname__", ""), None) is function
+
+
+def evaluator(kind: str) -> Evaluate:
+    """Return the function that installed distributions offer for a kind of sweep; raises `ParameterError`."""
+    for entry in entry_points(group=GROUP, name=kind):
+        try:
+            found: Evaluate = entry.load()
+        except (ImportError, AttributeError) as error:
+            raise ParameterError(
+                f"{entry.value}, which {GROUP} names, cannot be imported: {error}", parameter="evaluate"
+            ) from error
+        return found
+    raise ParameterError(
+        f"a sweep of kind {kind!r} needs a function that evaluates a flight, and no installed distribution offers one "
+        f"(entry point {kind!r} of the group {GROUP})",
+        parameter="evaluate",
+    )
+
+
+Rows = list[dict[str, Any]]
+Result = tuple[int, Rows]
+"""A run's number, and its rows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """What a worker needs to do one run: the scenario as JSON, or the error that it gave."""
+
+    number: int
+    seed: int
+    values: Mapping[str, Any]
+    kind: str
+    protocols: tuple[str, ...]
+    ranges: int
+    name: str
+    scenario: str = ""
+    error: str = ""
+
+
+def run_chunk(tasks: Sequence[Task], extensions: Extensions | None = None) -> tuple[list[Result], float]:
+    """Do some runs; return their rows by number, and how long they took together. A failure is a row."""
+    start = time.perf_counter()
+    known = extensions or Extensions()
+    known.install()
+    return [(task.number, rows_of(task, known.evaluate)) for task in tasks], time.perf_counter() - start
+
+
+def rows_of(task: Task, evaluate: Evaluate | None = None) -> Rows:
+    """Return the rows of one run, one a protocol."""
+    try:
+        if task.error:
+            raise UwbsimError(task.error)
+        outcomes = _compare(task) if evaluate is None else _evaluate(task, evaluate)
+    except (UwbsimError, UwblinkError, ArithmeticError, ValueError, MemoryError) as error:
+        return [failure(task, str(error) or type(error).__name__)]
+    return [_head(task) | {"status": "ok", "error": None} | outcome for outcome in outcomes]
+
+
+def failure(task: Task, reason: str) -> dict[str, Any]:
+    """Return the row of a run that failed."""
+    return _head(task) | {"status": "failed", "error": reason.splitlines()[0][:300] if reason else "unknown"}
+
+
+def _head(task: Task) -> dict[str, Any]:
+    versions = {"uwbcal": uwblink.__version__, "numpy": np.__version__, "python": platform.python_version()}
+    named = {"scenario": task.name, "number": task.number, "seed": task.seed}
+    values = {k: v if isinstance(v, int | float | str | bool) else json.dumps(v) for k, v in task.values.items()}
+    return named | versions | values
+
+
+def _compare(task: Task) -> Rows:
+    from uwbsim.protocols.comparison import compare
+    from uwbsim.scenario.model import Scenario
+
+    scenario = Scenario.model_validate_json(task.scenario)
+    return [outcome.to_dict() for outcome in compare(scenario, task.protocols, task.ranges).outcomes]
+
+
+def _evaluate(task: Task, evaluate: Evaluate) -> Rows:
+    """Simulate a flight with each protocol, and have it evaluated."""
+    from uwbsim.scenario.model import Scenario
+    from uwbsim.simulation.run import simulate
+
+    scenario = Scenario.model_validate_json(task.scenario)
+    found = []
+    for name in task.protocols:
+        ranging = scenario.ranging.model_copy(update={"protocol": name})
+        simulated = simulate(scenario.model_copy(update={"ranging": ranging}))
+        try:
+            figures = dict(evaluate(simulated))
+        except Exception as error:
+            # Somebody else's function: whatever it raises is the failure of this run, and of no other.
+            raise UwbsimError(str(error) or type(error).__name__) from error
+        found.append({"protocol": name} | figures | {"failed_exchanges": len(simulated.faults)})
+    return found
+
 
 Chunk = list[Task]
 Done = tuple[Chunk, list[Result] | None, float]

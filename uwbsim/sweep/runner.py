@@ -1,4 +1,4 @@
-"""Runs a sweep: hands out chunks, stores what comes back, and goes on where a killed one ended.
+"""[sweep.runner] Runs a sweep: hands out chunks, stores what comes back, and goes on where a killed one ended.
 
 A result depends on its run alone, so neither the number of workers nor their order changes a bit of it. At most a few
 chunks are out at a time and every result goes to the store at once, so memory does not grow with the number of runs.
@@ -17,10 +17,8 @@ from uwblink.output import check_folder
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.loading import load
 from uwbsim.sweep.design import SweepDesign
-from uwbsim.sweep.executors import Chunk, Workers, workers_for
-from uwbsim.sweep.extensions import Evaluate, Extensions, evaluator
+from uwbsim.sweep.executors import Chunk, Evaluate, Extensions, Result, Task, Workers, evaluator, failure, workers_for
 from uwbsim.sweep.results import Store, export
-from uwbsim.sweep.task import Result, Task, failure
 
 STORE: Final = "results.duckdb"
 CHUNK_S: Final = 1.0

@@ -5,14 +5,13 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from uwbsim.twins.comparison import LEVEL, Compared
-    from uwbsim.twins.fitting import Twin, check_name
+    from uwbsim.twins.fitting import LEVEL, Compared, Twin, check_name
 
 __all__ = ["LEVEL", "Compared", "Twin", "check_name"]
 
 _HOMES: Final = {
-    "LEVEL": "uwbsim.twins.comparison",
-    "Compared": "uwbsim.twins.comparison",
+    "LEVEL": "uwbsim.twins.fitting",
+    "Compared": "uwbsim.twins.fitting",
     "Twin": "uwbsim.twins.fitting",
     "check_name": "uwbsim.twins.fitting",
 }

@@ -16,8 +16,7 @@ from scipy.sparse import csr_array, hstack, vstack
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import TICK_S
 from uwblink.twr import intervals
-from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import bulk_spread, some_rows
+from uwbsim.twins.flight import Flight, bulk_spread, some_rows
 
 UNKNOWNS: Final = 300
 """Rates that are solved for at most, tags times knots."""

@@ -9,10 +9,8 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, effective_size, lasting
-from uwbsim.world.patterns import harmonics
-from uwbsim.world.radio import ANTENNAS
+from uwbsim.twins.flight import Flight, Lasting, autocovariance, bulk_spread, effective_size, lasting
+from uwbsim.world.radio import ANTENNAS, harmonics
 
 LEAST_SPREAD: Final = 0.05
 """Of the decimal logarithm of distance, below which nothing is told of path loss."""

@@ -17,9 +17,8 @@ from scipy.special import erfcx, log_ndtr
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import intervals
-from uwbsim.scenario.multipath import TwoStateMultipath
-from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import Lasting, autocovariance, bulk_spread, effective_size, lasting, some_rows
+from uwbsim.scenario.radio import TwoStateMultipath
+from uwbsim.twins.flight import Flight, Lasting, autocovariance, bulk_spread, effective_size, lasting, some_rows
 
 LEAST_SHARE: Final = 1e-4
 SHORTEST_CORE_M: Final = 1e-3

@@ -13,8 +13,7 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.schema import Fault
 from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S, UUS_TICKS
 from uwblink.twr import intervals
-from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import lag_one
+from uwbsim.twins.flight import Flight, lag_one
 from uwbsim.units import NS
 
 REGULAR: Final = 0.9

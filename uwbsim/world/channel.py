@@ -1,13 +1,14 @@
 """What reaches one antenna from another: the one place where the length and the powers of a link are computed.
 
-Flight loop, served boards, passive listeners and the protocol workbench all ask here, wherever they have the places of
-the antennas from; so an effect of `CHANNEL_EFFECTS` shows in all of them, by the same decibels and metres.
+Simulated flights, served boards, passive listeners and the protocol workbench all call `link_between`, so an effect of
+`CHANNEL_EFFECTS` shows in all of them, by the same decibels and metres. The functions on segments work on n straight
+segments from `a` (n, 3) to `b` (n, 3), metres.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -15,21 +16,48 @@ import numpy as np
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
+from uwbsim.scenario.bodies import Room, Shadow
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.multipath import TwoStateMultipath
-from uwbsim.scenario.surroundings import Shadow
+from uwbsim.scenario.radio import TwoStateMultipath
+from uwbsim.world.diffraction import box_loss, ellipsoid_chord_m
 from uwbsim.world.geometric_responses import GeometricResponses
-from uwbsim.world.group_delay import group_delay_m, has_group_delays
-from uwbsim.world.pair_levels import PairLevels
-from uwbsim.world.patterns import pattern_gain_db
-from uwbsim.world.propagation import SURFACES, Link, ellipsoid_chord_m, first_path, reflections, through, with_path
-from uwbsim.world.radio import gain_db, path_gain_db
-from uwbsim.world.reflected_states import ReflectedStates
+from uwbsim.world.impulse_response import PathsHeard
+from uwbsim.world.pair_states import PairLevels, ReflectedStates
+from uwbsim.world.radio import antenna_gain_db, group_delay_m, has_group_delays, path_gain_db
 
 SHORTEST_M: Final = 1e-10
-"""Nearer than this two antennas have no direction."""
+"""Nearer than this two antennas have no direction; it only keeps divisions defined."""
 
-NOTHING_MW: Final = 1e-30
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """What reaches one antenna from another, (n,).
+
+    `distance_m` is the straight line, `excess_m` how much longer the first detected path is or seems;
+    `power_dbm` that path's power, `total_dbm` that of all paths together. Where there are several paths, `paths_m` and
+    `paths_dbm` are the lengths and powers of all, (n, paths), in any order. `noise_s` is what noise does to the leading
+    edge of the first path, a standard deviation, where a response tells.
+    """
+
+    distance_m: Floats
+    excess_m: Floats
+    power_dbm: Floats
+    total_dbm: Floats
+    _: KW_ONLY
+    paths_m: Floats | None = None
+    paths_dbm: Floats | None = None
+    noise_s: Floats | None = None
+
+    def __getitem__(self, rows: Ints) -> Link:
+        """Return the chosen links."""
+        names = ("distance_m", "excess_m", "power_dbm", "total_dbm", "paths_m", "paths_dbm", "noise_s")
+        columns = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
+
+    def weaker(self, loss_db: Floats) -> Link:
+        """Return the link with all of its paths weaker by a loss (n,)."""
+        paths = None if self.paths_dbm is None else self.paths_dbm - loss_db[:, None]
+        return replace(self, power_dbm=self.power_dbm - loss_db, total_dbm=self.total_dbm - loss_db, paths_dbm=paths)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +67,11 @@ class PlacedShadow:
     shadow: Shadow
     position_m: Floats
     rotation: Floats
+
+    def loss_db(self, one: Floats, other: Floats) -> Floats:
+        """Return what the body takes away from segments (n, k or 1, 3) to (n, k, 3), in dB, (n, k)."""
+        a, b = ((spots - self.position_m[:, None]) @ self.rotation for spots in (one, other))
+        return ellipsoid_chord_m(self.shadow, a, b) * self.shadow.loss_db_per_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,14 +100,19 @@ class Ends:
     distance_m: Floats = field(init=False)
 
     def __post_init__(self) -> None:
-        """Work out what all effects need, once."""
+        """Compute the distances, which all effects need."""
         apart = self.antennas_m[1] - self.antennas_m[0]
         object.__setattr__(self, "distance_m", np.sqrt(np.einsum("ij,ij->i", apart, apart)))
 
     @property
+    def towards(self) -> Floats:
+        """Return unit vectors from the sender to the receiver, (n, 3)."""
+        return (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(self.distance_m, SHORTEST_M)[:, None]
+
+    @property
     def gain_db(self) -> Floats:
-        """What the sender's power and the antennas add along the straight lines; worked out when asked for."""
-        towards = (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(self.distance_m, SHORTEST_M)[:, None]
+        """Return what the sender's power and the antennas add along the straight lines, (n,)."""
+        towards = self.towards
         return self.gain_towards_db(towards, -towards)
 
     def gain_towards_db(self, leaving: Floats, arriving: Floats) -> Floats:
@@ -83,15 +121,9 @@ class Ends:
         `leaving` are the unit vectors (n, 3) in which they leave the sender, `arriving` those in which the receiver
         sees them come.
         """
-        radio, gain = self.scenario.radio, np.zeros(len(leaving))
+        gain = np.zeros(len(leaving))
         for tags, rotation, way in zip(self.places, self.rotations, (leaving, arriving), strict=True):
-            phases = self.phases[tags] if radio.shadowing_db else self.phases
-            there = np.einsum("ni,nij->nj", way, rotation)
-            gain = gain + gain_db(radio, phases, there)
-            for place in np.unique(tags).tolist() if any(tag.pattern_db for tag in self.scenario.tags) else ():
-                mine, own = np.flatnonzero(tags == place), self.scenario.tags[place].pattern_db
-                if own:
-                    gain[mine] += pattern_gain_db(own, there[mine])
+            gain = gain + antenna_gain_db(self.scenario, self.phases, tags, np.einsum("ni,nij->nj", way, rotation))
         if any(tag.tx_power_db for tag in self.scenario.tags):
             gain = gain + np.array([tag.tx_power_db for tag in self.scenario.tags])[self.places[0]]
         return gain
@@ -102,8 +134,24 @@ class Ends:
         return ids[self.places[0]], ids[self.places[1]]
 
 
+def paths_heard(link: Link, detour_m: float = 0.0) -> PathsHeard:
+    """Return what a response shows of a single link, whose first path is `detour_m` longer still by chance."""
+    power = float(link.power_dbm[0])
+    if link.paths_m is None or link.paths_dbm is None:
+        return PathsHeard(power_dbm=power, echoes=[])
+    # Echoes that come within 1 cm of the first path, or are 80 dB weaker, change no tap.
+    later_m = link.paths_m[0] - float(link.distance_m[0] + link.excess_m[0]) - detour_m
+    shares = 10 ** ((link.paths_dbm[0] - power) / 20)
+    echoes = [
+        (later / SPEED_OF_LIGHT, share)
+        for later, share in zip(later_m.tolist(), shares.tolist(), strict=True)
+        if later > 0.01 and share > 1e-4
+    ]
+    return PathsHeard(power_dbm=power, echoes=echoes)
+
+
 ChannelEffect = Callable[[Link, Ends], Link]
-"""Returns what becomes of n links between given ends; what it does not change it takes over (`dataclasses.replace`)."""
+"""Returns what becomes of n links between given ends; what it does not change it keeps (`dataclasses.replace`)."""
 
 
 def link_between(ends: Ends) -> Link:
@@ -120,7 +168,7 @@ def link_between(ends: Ends) -> Link:
 
 
 def _check(name: str, link: Link, ends: Ends) -> None:
-    """Raise `ScenarioError` where a stranger's effect returned something else than n finite links."""
+    """Raise `ScenarioError` where the effect of a plug-in returned something else than n finite links."""
     if not isinstance(link, Link):
         raise ScenarioError(f"channel effect {name!r}: returned {link!r:.60}, expected a Link")
     for column in ("distance_m", "excess_m", "power_dbm", "total_dbm"):
@@ -135,63 +183,98 @@ def _check(name: str, link: Link, ends: Ends) -> None:
 def _obstacles(link: Link, ends: Ends) -> Link:
     if not ends.scenario.obstacles or ends.responses is not None:
         return link
-    loss, excess = through(ends.scenario.obstacles, *ends.antennas_m)
-    return replace(link, excess_m=excess, power_dbm=link.power_dbm - loss, total_dbm=link.total_dbm - loss)
+    loss, excess = box_loss(ends.scenario.obstacles, *ends.antennas_m)
+    return replace(link.weaker(loss), excess_m=excess)
 
 
 def _shadows(link: Link, ends: Ends) -> Link:
-    """Bodies in the way of the direct path, before the first path is chosen."""
+    """Weaken the direct path by bodies in its way, before the first path is chosen."""
     for body in ends.shadows if ends.responses is None else ():
-        loss = _shadow_db(body, *(spots[:, None] for spots in ends.antennas_m))[:, 0]
-        link = replace(link, power_dbm=link.power_dbm - loss, total_dbm=link.total_dbm - loss)
+        link = link.weaker(body.loss_db(*(spots[:, None] for spots in ends.antennas_m))[:, 0])
     return link
 
 
 def _reflections(link: Link, ends: Ends) -> Link:
-    """Ways by the room's surfaces, through obstacles and bodies as the direct one, with their own antenna gains."""
+    """Add the paths by the room's surfaces, through obstacles and bodies as the direct one.
+
+    The image method: straight to the image of the other end is as long as the path by the surface, which it crosses
+    where that reflects. The detector takes the earliest path that is not weaker than the strongest by more than its
+    dynamic range.
+    """
     room, radio = ends.scenario.room, ends.scenario.radio
     if room is None or room.reflection_loss_db is None:
         return link
-    by, shape = reflections(room, *ends.antennas_m), (len(ends.distance_m), SURFACES)
-    gain = np.stack([ends.gain_towards_db(by.leaving[:, k], by.arriving[:, k]) for k in range(SURFACES)], axis=1)
-    loss, excess = np.zeros(shape), np.zeros(shape)
+    surfaces = 6
+    spots = [np.repeat(end[:, None], surfaces, axis=1) for end in ends.antennas_m]
+    images = [_images(room, end) for end in spots]
+    way, back = images[1] - spots[0], images[0] - spots[1]
+    length = np.linalg.norm(way, axis=2)
+    scale = np.maximum(length, SHORTEST_M)[:, :, None]
+    # How far in front of the surface the two ends are decides where the path meets it.
+    near, far = (np.linalg.norm(image - end, axis=2) for image, end in zip(images, spots, strict=True))
+    point = spots[0] + (near / np.maximum(near + far, SHORTEST_M))[:, :, None] * way
+    leaving, arriving = way / scale, back / scale
+    gain = np.stack([ends.gain_towards_db(leaving[:, k], arriving[:, k]) for k in range(surfaces)], axis=1)
+    loss, excess = np.zeros(length.shape), np.zeros(length.shape)
     for end in ends.antennas_m:
         if ends.scenario.obstacles:
-            lost, late = through(ends.scenario.obstacles, np.repeat(end, SURFACES, axis=0), by.point_m.reshape(-1, 3))
-            loss, excess = loss + lost.reshape(shape), excess + late.reshape(shape)
+            lost, late = box_loss(ends.scenario.obstacles, np.repeat(end, surfaces, axis=0), point.reshape(-1, 3))
+            loss, excess = loss + lost.reshape(length.shape), excess + late.reshape(length.shape)
         for body in ends.shadows:
-            loss = loss + _shadow_db(body, end[:, None], by.point_m)
-    echoes = path_gain_db(radio, by.length_m) + gain - room.reflection_loss_db - loss
-    return first_path(link, by.length_m + excess, echoes, radio.dynamic_range_db)
+            loss = loss + body.loss_db(end[:, None], point)
+    echoes = path_gain_db(radio, length) + gain - room.reflection_loss_db - loss
+    lengths = np.column_stack([link.distance_m + link.excess_m, length + excess])
+    power = np.column_stack([link.power_dbm, echoes])
+    audible = power >= power.max(axis=1, keepdims=True) - radio.dynamic_range_db
+    first = np.argmin(np.where(audible, lengths, np.inf), axis=1)
+    rows = np.arange(len(first))
+    return replace(
+        link,
+        excess_m=lengths[rows, first] - link.distance_m,
+        power_dbm=power[rows, first],
+        total_dbm=np.asarray(10 * np.log10(np.sum(10 ** (power / 10), axis=1))),
+        paths_m=lengths,
+        paths_dbm=power,
+    )
 
 
-def _shadow_db(body: PlacedShadow, one: Floats, other: Floats) -> Floats:
-    """Return what a body takes away from straight segments (n, k or 1, 3) to (n, k, 3), in dB, (n, k)."""
-    a, b = ((spots - body.position_m[:, None]) @ body.rotation for spots in (one, other))
-    return ellipsoid_chord_m(body.shadow, a, b) * body.shadow.loss_db_per_m
+def _images(room: Room, spots: Floats) -> Floats:
+    """Return points (n, 6, 3) mirrored at the surface of their column."""
+    image = spots.copy()
+    for axis in range(3):
+        for side, wall in enumerate((room.min_m[axis], room.max_m[axis])):
+            image[:, 2 * axis + side, axis] = 2 * wall - image[:, 2 * axis + side, axis]
+    return image
 
 
 def _states(link: Link, ends: Ends) -> Link:
-    """Reflections that last: a weaker and later first path, and most of the power later still."""
+    """Apply reflections that last: a weaker and later first path, and most of the power later still."""
     model = ends.scenario.radio.multipath
     if ends.states is None or not isinstance(model, TwoStateMultipath):
         return link
-    paths = ends.states.at(ends.places, ends.time_s)
-    power = link.power_dbm - paths.first_loss_db
-    total = link.total_dbm - np.where(paths.reflected, model.total_loss_db, 0.0)
-    rest = np.maximum(10 ** (total / 10) - 10 ** (power / 10), NOTHING_MW)
-    excess = link.excess_m + paths.excess_m
-    # The strongest path comes after the first; with a direct path there is none.
-    later = with_path(
+    first = ends.states.at(ends.places, ends.time_s)
+    power = link.power_dbm - first.first_loss_db
+    total = link.total_dbm - np.where(first.reflected, model.total_loss_db, 0.0)
+    excess = link.excess_m + first.excess_m
+    # The strongest path comes after the first; with a direct path there is none, of 1e-30 mW.
+    nothing_mw = 1e-30
+    rest = np.maximum(10 ** (total / 10) - 10 ** (power / 10), nothing_mw)
+    later = np.where(first.reflected, 10 * np.log10(rest), 10 * np.log10(nothing_mw))
+    lengths, powers = link.paths_m, link.paths_dbm
+    if lengths is None or powers is None:
+        lengths, powers = (link.distance_m + link.excess_m)[:, None], link.power_dbm[:, None]
+    return replace(
         link,
-        link.distance_m + excess + paths.rise_s * SPEED_OF_LIGHT,
-        np.where(paths.reflected, 10 * np.log10(rest), 10 * np.log10(NOTHING_MW)),
+        excess_m=excess,
+        power_dbm=power,
+        total_dbm=total,
+        paths_m=np.column_stack([lengths, link.distance_m + excess + first.rise_s * SPEED_OF_LIGHT]),
+        paths_dbm=np.column_stack([powers, later]),
     )
-    return replace(later, excess_m=excess, power_dbm=power, total_dbm=total)
 
 
 def _response(link: Link, ends: Ends) -> Link:
-    """All that geometry does, read off one response: instead of the effects above, which leave such links alone."""
+    """Read all that geometry does off one response: instead of the effects above, which leave such links alone."""
     if ends.responses is None:
         return link
     read = ends.responses.at(ends.places, ends.time_s)
@@ -201,21 +284,16 @@ def _response(link: Link, ends: Ends) -> Link:
 
 
 def _levels(link: Link, ends: Ends) -> Link:
-    """Fading and outages of pairs, of all paths alike."""
-    if ends.levels is None:
-        return link
-    level = ends.levels.at_db(ends.places, ends.time_s)
-    dbm = None if link.paths_dbm is None else link.paths_dbm + level[:, None]
-    return replace(link, power_dbm=link.power_dbm + level, total_dbm=link.total_dbm + level, paths_dbm=dbm)
+    """Apply fading and outages of pairs, to all paths alike."""
+    return link if ends.levels is None else link.weaker(-ends.levels.at_db(ends.places, ends.time_s))
 
 
 def _group_delays(link: Link, ends: Ends) -> Link:
-    """Antennas delay by direction: every path of a link as much as the direct one."""
+    """Delay every path of a link by the group delays of the antennas in the directions of the direct one."""
     if not has_group_delays(ends.scenario):
         return link
-    apart = (ends.antennas_m[1] - ends.antennas_m[0]) / np.maximum(ends.distance_m, SHORTEST_M)[:, None]
-    late = np.zeros(len(apart))
-    for tags, rotation, way in zip(ends.places, ends.rotations, (apart, -apart), strict=True):
+    towards, late = ends.towards, np.zeros(len(ends.distance_m))
+    for tags, rotation, way in zip(ends.places, ends.rotations, (towards, -towards), strict=True):
         late = late + group_delay_m(ends.scenario, tags, np.einsum("ni,nij->nj", way, rotation))
     paths = None if link.paths_m is None else link.paths_m + late[:, None]
     return replace(link, excess_m=link.excess_m + late, paths_m=paths)
@@ -230,10 +308,10 @@ CHANNEL_EFFECTS: Final[dict[str, ChannelEffect]] = {
     "fading and outages": _levels,
     "group delays": _group_delays,
 }
-"""What happens to waves on their way, in this order, for every link of every scenario; strangers' effects come last."""
+"""What happens to waves on their way, in this order, for every link of every scenario; those of plug-ins come last."""
 
 OWN_EFFECTS: Final = tuple(CHANNEL_EFFECTS)
-"""Those that a scenario alone decides on."""
+"""Those that follow from the scenario alone."""
 
 
 def register_channel_effect(name: str, effect: ChannelEffect) -> None:

@@ -1,35 +1,253 @@
-"""All ways of a wave from one antenna to another in a room: direct, by mirrors, by things that scatter.
+"""A scenario's surroundings, and all paths of a wave between two antennas in them: direct, by mirrors, by scatterers.
 
-`paths_between` takes antennas in their surroundings to their paths, many links at once.
+`paths_between` takes antennas in their `Surroundings` to their paths, many links at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
-from uwblink.arrays import Complexes, Floats, Ints
+from uwblink.arrays import Bools, Complexes, Floats, Ints
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwbsim.random_streams import stream
+from uwbsim.scenario.bodies import Shadow
 from uwbsim.scenario.model import WAVELENGTH_M, Scenario
-from uwbsim.world.antenna_patterns import antenna_gain_db
-from uwbsim.world.diffraction import box_cover
-from uwbsim.world.fresnel_reflection import WAVENUMBER, roughness_factor
-from uwbsim.world.mirrors import AXIAL, coupling, on_faces, planes
-from uwbsim.world.propagation import box_chords_m
-from uwbsim.world.surroundings import (
-    SHORTEST_M,
-    Placed,
-    PlacedBody,
-    Surroundings,
-    antenna_axes,
-    field_after,
-    in_the_way,
+from uwbsim.scenario.radio import GeometricMultipath
+from uwbsim.world.diffraction import (
+    AXIAL,
+    LIT,
+    WAVENUMBER,
+    Mirrors,
+    body_gain,
+    box_chords_m,
+    box_cover,
+    box_loss,
+    coupling,
+    on_faces,
+    planes,
+    roughness_factor,
 )
+from uwbsim.world.radio import antenna_gain_db, path_gain_db
+
+CELLS: Final = 128
+"""A side of the table of an antenna's gains: directions are known to a degree."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patterns:
+    """Amplitude gains of t different antennas with their bodies, (t, cells), and which each tag has, (tags,).
+
+    Directions are folded onto an octahedron and that onto a square, so that a look-up takes no trigonometry. `level`
+    says that all gains are one.
+    """
+
+    table: Floats
+    which: Ints
+    level: bool
+
+    @classmethod
+    def of(cls, scenario: Scenario, phases: Floats) -> Self:
+        """Tabulate those of a scenario's tags; `phases` (tags, harmonics) are those of their shadowing."""
+        directions, radio = _directions(), scenario.radio
+        shadows = {body.name: body.shadow for body in scenario.bodies}
+        tables: list[Floats] = []
+        which: dict[object, int] = {}
+        places = []
+        for place, (tag, own) in enumerate(zip(scenario.tags, phases, strict=True)):
+            shadow = shadows[tag.body]
+            shape = tuple(own) if radio.shadowing_db else None
+            kind = (shadow, tag.lever_arm_m if shadow else None, shape, tag.pattern_db)
+            if kind not in which:
+                which[kind] = len(tables)
+                me = np.full(len(directions), place)
+                gain = 10 ** (antenna_gain_db(scenario, phases, me, directions) / 20)
+                if shadow:
+                    arm = np.broadcast_to(np.array(tag.lever_arm_m), directions.shape)
+                    # Seen from 3 m away, further than the shadow of its own body reaches.
+                    gain = gain * body_gain(shadow, arm, arm + 3.0 * directions)
+                tables.append(gain)
+            places.append(which[kind])
+        level = all(bool(np.all(table == 1)) for table in tables)
+        return cls(np.array(tables).ravel(), np.array(places), level)
+
+    def gain(self, tag: Ints, own: Sequence[Floats]) -> Floats:
+        """Return the gains of tags (n,) in directions of any length whose three coordinates are (n, k) each, (n, k)."""
+        x, y, z = own
+        if self.level:
+            return np.ones(x.shape)
+        wide = (CELLS / 2) / np.maximum(np.abs(x) + np.abs(y) + np.abs(z), 1e-12)
+        u, v = x * wide, y * wide
+        half = CELLS / 2
+        folded_u, folded_v = np.copysign(half - np.abs(v), u), np.copysign(half - np.abs(u), v)
+        below = z < 0
+        cell = (np.where(below, folded_u, u) + (half + 0.5)).astype(np.int32) * (CELLS + 1)
+        cell += (np.where(below, folded_v, v) + (half + 0.5)).astype(np.int32)
+        return np.asarray(self.table[cell + (self.which[tag] * (CELLS + 1) ** 2)[:, None]])
+
+
+def _directions() -> Floats:
+    """Return the directions of all cells, (cells, 3)."""
+    u, v = (np.ravel(w) for w in np.meshgrid(*[np.linspace(-1, 1, CELLS + 1)] * 2, indexing="ij"))
+    z = 1 - np.abs(u) - np.abs(v)
+    x = np.where(z < 0, np.copysign(1 - np.abs(v), u), u)
+    y = np.where(z < 0, np.copysign(1 - np.abs(u), v), v)
+    points = np.column_stack([x, y, z])
+    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
+
+
+SHORTEST_M: Final = 0.05
+"""Shorter paths count as this long; path gain has no sense nearer to an antenna."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scatterers:
+    """Things at places (s, 3) in metres; what each adds to a way, in metres, and its complex gain as a mirror, (s,)."""
+
+    place_m: Floats
+    extra_m: Floats
+    gain: Complexes
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        """Draw those of a scenario; each property has a stream, so that more of them leave the first where they are."""
+        model, room = scenario.radio.multipath, scenario.room
+        count = model.scatterers if isinstance(model, GeometricMultipath) and room else 0
+        if not isinstance(model, GeometricMultipath) or room is None:
+            return cls(place_m=np.zeros((0, 3)), extra_m=np.zeros(0), gain=np.zeros(0, dtype=np.complex128))
+        places, extra, field = (
+            stream(scenario.run.seed, "scatterers", what) for what in ("places", "bounces", "fields")
+        )
+        extra_m = extra.exponential(SPEED_OF_LIGHT * model.decay_s, count)
+        parts = field.normal(size=(count, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+        return cls(
+            place_m=places.uniform(room.min_m, room.max_m, (count, 3)),
+            extra_m=extra_m,
+            gain=parts * 10 ** (-model.scatter_loss_db / 20),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surroundings:
+    """A scenario as waves see it; `phases` (tags, harmonics) are those of the tags' shadowing."""
+
+    scenario: Scenario
+    mirrors: Mirrors
+    scatterers: Scatterers
+    patterns: Patterns
+    phases: Floats
+
+    @classmethod
+    def of(cls, scenario: Scenario, phases: Floats) -> Self:
+        """Collect what stands still, and draw the scatterers."""
+        return cls(
+            scenario=scenario,
+            mirrors=Mirrors.of(scenario),
+            scatterers=Scatterers.of(scenario),
+            patterns=Patterns.of(scenario, phases),
+            phases=phases,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placed:
+    """m antennas at an instant each: the tags' places in the scenario's list, positions (m, 3), rotations (m, 3, 3)."""
+
+    tag: Ints
+    antenna_m: Floats
+    rotation: Floats
+
+    def __getitem__(self, rows: Ints) -> Placed:
+        """Return the chosen antennas."""
+        return Placed(tag=self.tag[rows], antenna_m=self.antenna_m[rows], rotation=self.rotation[rows])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacedBody:
+    """A body with a shadow at m instants: its centre (m, 3) and rotation (m, 3, 3); `carries` (tags,) says whom."""
+
+    shadow: Shadow
+    position_m: Floats
+    rotation: Floats
+    carries: Bools
+
+    def past(self, at: Ints, a: Floats, b: Floats) -> Floats:
+        """Return the share of the field past it, of segments (n, 3) to (n, 3) at instants `at` (n,)."""
+        spots = (self._inside(at, ends) for ends in (a, b))
+        return body_gain(self.shadow, *spots)
+
+    def past_fans(self, end: Placed, at: Ints, spots: Floats, length_m: Floats) -> Floats | float:
+        """Return the same of k segments each, of known lengths (n, k), from antennas (n,) to spots (n, k, 3) or (k, 3).
+
+        Those that pass further away than a zone at its widest are not looked at any closer, nor is a body's own tag:
+        its pattern has its body.
+        """
+        a, k = end.antenna_m, self.shadow.centre_m
+        towards = self.position_m[at] - a
+        if any(k):
+            towards = towards + self.rotation[at] @ np.array(k)
+        along = towards @ spots.T if spots.ndim == 2 else np.einsum("nj,nkj->nk", towards, spots)
+        along -= (towards * a).sum(axis=1)[:, None]
+        squared = length_m**2
+        share = along / squared
+        np.clip(share, 0, 1, out=share)
+        # |towards - share way|^2, less |towards|^2.
+        squared *= share
+        squared -= 2 * along
+        squared *= share
+        longest_m = float(length_m.max(initial=0.0))
+        widest = max(self.shadow.semi_axes_m) - LIT * np.sqrt(WAVELENGTH_M / 8 * longest_m)
+        allowed = np.where(self.carries[end.tag], -np.inf, widest**2 - (towards**2).sum(axis=1))
+        rows, columns = np.nonzero(squared < allowed[:, None])
+        if not len(rows):
+            return 1.0
+        gain = np.ones(length_m.shape)
+        there = spots[columns] if spots.ndim == 2 else spots[rows, columns]
+        gain[rows, columns] = self.past(at[rows], a[rows], there)
+        return gain
+
+    def _inside(self, at: Ints, spots: Floats) -> Floats:
+        away = spots - self.position_m[at]
+        return np.asarray(np.einsum("nj,njk->nk", away, self.rotation[at]))
+
+
+def in_the_way(
+    around: Surroundings, end: Placed, bodies: Sequence[PlacedBody], at: Ints, spots: Floats, length: Floats
+) -> Floats:
+    """What obstacles and others' bodies leave of the field from antennas to spots (n, k, 3) or (k, 3), (n, k).
+
+    A tag's own body is part of its pattern.
+    """
+    left = np.ones(length.shape)
+    if around.scenario.obstacles:
+        begin = np.repeat(end.antenna_m, length.shape[1], axis=0)
+        loss, _ = box_loss(around.scenario.obstacles, begin, np.broadcast_to(spots, (*length.shape, 3)).reshape(-1, 3))
+        left = 10 ** (-loss.reshape(left.shape) / 20)
+    for body in bodies:
+        left = left * body.past_fans(end, at, spots, length)
+    return left
+
+
+def field_after(scenario: Scenario, length: Floats) -> Floats:
+    """Amplitude after a way without antennas: its square is the power in mW."""
+    radio = scenario.radio
+    if radio.path_loss_exponent == 2.0:
+        return np.asarray(10 ** (radio.first_path_at_1m_dbm / 20) / np.maximum(length, SHORTEST_M))
+    return np.asarray(10 ** (path_gain_db(radio, length) / 20))
+
+
+def antenna_axes(scenario: Scenario, end: Placed) -> Floats:
+    """Directions of the antennas, along which they are polarised: (n, 3)."""
+    if scenario.radio.antenna == "isotropic":
+        return np.broadcast_to(np.array([0.0, 0.0, 1.0]), (len(end.tag), 3))
+    return end.rotation[:, :, 2]
+
 
 CROSS_POLAR: Final = 0.1
-"""So much of a field across its polarisation an antenna takes all the same."""
+"""Share of a field across its polarisation that an antenna receives all the same: chosen, 20 dB down."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +267,10 @@ class Legs:
 
     length_m: Floats
     gain: Floats
+
+    def __getitem__(self, rows: Ints) -> Legs:
+        """Return those of the chosen antennas."""
+        return Legs(length_m=self.length_m[rows], gain=self.gain[rows])
 
 
 def legs_to_scatterers(around: Surroundings, ends: Placed, bodies: Sequence[PlacedBody], instant: Ints) -> Legs:

@@ -11,30 +11,25 @@ from dataclasses import dataclass, field
 from typing import Final, Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats, Ints
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.multipath import GeometricMultipath
+from uwbsim.scenario.radio import GeometricMultipath
 from uwbsim.world.geometric_paths import (
-    Legs,
     Paths,
+    Placed,
+    PlacedBody,
+    Surroundings,
     legs_to_scatterers,
     paths_between,
 )
-from uwbsim.world.leading_edge import Detected, Sensing, detect
-from uwbsim.world.surroundings import Placed, PlacedBody, Surroundings
+from uwbsim.world.impulse_response import Detected, Sensing, detect
 from uwbsim.world.trajectories import Trajectory
 
 CHUNK: Final = 2048
 """So many links at once: fewer take longer each, more do not fit into a core's cache."""
 
 COLUMNS: Final = ("excess_m", "power_dbm", "total_dbm", "noise_s")
-AHEAD: Final = 16
-FEW_KEPT: Final = 5_000
-"""So many responses' figures are kept for those who go from one instant to the next: none comes back far."""
-
-PATH_COLUMNS: Final = ("detour_m", "amplitude")
 MOST_KEPT: Final = 2_000_000
 """So many responses' figures are kept: 80 MB."""
 
@@ -93,21 +88,23 @@ class GeometricResponses:
 
     def look_ahead(self, sender: int, time_s: float) -> None:
         """Compute what all tags will hear of one for the next few steps, for whoever asks for one instant at a time."""
+        # Who goes from instant to instant does not come back far: few responses are kept.
+        ahead, most_kept = 16, 5_000
         here = np.arange(len(self.around.scenario.tags))
         origin, first = np.full(len(here), sender), self._step(np.array([time_s]))
         if not len(self._missing(self._key((origin, here), first))):
             return
-        if len(self.keys) > FEW_KEPT:
+        if len(self.keys) > most_kept:
             self.keys, self.columns = self.keys[:0], self.columns[:, :0]
-        steps = first + np.arange(AHEAD)[:, None]
-        self.prepare((np.tile(origin, AHEAD), np.tile(here, AHEAD)), np.repeat(steps * self.model.step_s, len(here)))
+        steps = first + np.arange(ahead)[:, None]
+        self.prepare((np.tile(origin, ahead), np.tile(here, ahead)), np.repeat(steps * self.model.step_s, len(here)))
 
     def paths(self, places: tuple[Ints, Ints], time_s: Floats) -> Paths:
         """Return the paths between tags at places (n,) at the steps nearest to true times (n,)."""
         keys, rows = np.unique(self._key(places, self._step(time_s)), return_inverse=True)
         parts = [self._paths(keys[begin : begin + CHUNK]) for begin in range(0, len(keys), CHUNK)]
-        detour_m, amplitude = (np.concatenate([getattr(part, name) for part in parts]) for name in PATH_COLUMNS)
-        return Paths(detour_m=detour_m[rows], amplitude=amplitude[rows])
+        detour_m = np.concatenate([part.detour_m for part in parts])
+        return Paths(detour_m=detour_m[rows], amplitude=np.concatenate([part.amplitude for part in parts])[rows])
 
     def _step(self, time_s: Floats) -> Ints:
         return np.rint(np.maximum(time_s, 0) / self.model.step_s).astype(np.int64)
@@ -139,7 +136,7 @@ class GeometricResponses:
         step, a = np.divmod(pair_step, count)
         instants, at = np.unique(step, return_inverse=True)
         time_s = instants * self.model.step_s
-        poses = {name: _pose(self.trajectories[name], time_s) for name in self.trajectories}
+        poses = {name: self.trajectories[name].pose(time_s) for name in self.trajectories}
         bodies = [
             PlacedBody(
                 shadow=body.shadow,
@@ -156,7 +153,7 @@ class GeometricResponses:
         legs = legs_to_scatterers(self.around, placed, bodies, instant)
         one, other = which[: len(keys)], which[len(keys) :]
         both = (placed[one], placed[other])
-        paths = paths_between(self.around, both, (_chosen(legs, one), _chosen(legs, other)), bodies, at)
+        paths = paths_between(self.around, both, (legs[one], legs[other]), bodies, at)
         stronger = 10 ** (np.array([tag.tx_power_db for tag in scenario.tags]) / 20)
         return Paths(detour_m=paths.detour_m, amplitude=paths.amplitude * stronger[a][:, None])
 
@@ -168,11 +165,3 @@ class GeometricResponses:
             rotation[rows] = turns[instant[rows]]
             position[rows] = spots[instant[rows]] + rotation[rows] @ np.array(each.lever_arm_m)
         return Placed(tag=tag, antenna_m=position, rotation=rotation)
-
-
-def _chosen(legs: Legs, rows: Ints) -> Legs:
-    return Legs(length_m=legs.length_m[rows], gain=legs.gain[rows])
-
-
-def _pose(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
-    return path.position_m(time_s), Rotation.from_quat(path.quaternion(time_s)).as_matrix()

@@ -1,58 +1,70 @@
-"""Channel impulse responses as the boards print them: a first path, its echoes, and noise.
+"""Channel impulse responses: as the boards print them, and what a chip reads off one.
 
-Of a link whose paths follow from geometry the response has these, with their phases, and nothing else.
+A printed response has a first path, its echoes, and noise; that of a link whose paths follow from geometry has these
+paths, with their phases, and nothing else. `detect` sums the paths of a link in the accumulator, which has a tap every
+1.0016 ns, and reads first path, powers and noise off it. Pulses are Gaussian; the direct path lies where the chip puts
+a first path, `EDGE_TO_PEAK` after a whole tap.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
+from scipy.sparse import coo_array
 
-from uwblink.arrays import Complexes, Floats
+from uwblink.arrays import Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.wire.messages import Cir
 from uwbsim.units import NS
-from uwbsim.world.propagation import Link
+from uwbsim.world.geometric_paths import Paths
 from uwbsim.world.radio import ALPHA_DBM, FPP_OFFSET_DB
 
-FIRST_PATH: Final = 745.0
-"""Where the chip puts the first path, give or take a tap (DW1000 User Manual, 7.2.40.1)."""
-
-NOISE: Final = 45.0
-RECORDED_NOISE: Final = 28.0
-SELF_NOISE: Final = 0.009
-"""Noise of recorded responses, as the standard deviation of either part: in the counts of a response that is not turned
-down, and as a share of the strongest tap besides (preambles do not correlate perfectly). By power, 265 responses of
-MILUV's boards have 0.0090 (at -82 dBm), 0.0091, 0.0113, 0.0122 and 0.0185 (at -93 dBm) of their strongest taps."""
-
-NEAREST_ECHO_M: Final = 0.01
-FAINTEST_ECHO: Final = 1e-4
-DECAY_TAPS: Final = 14.0
 PULSE_TAPS: Final = 1.2
-EDGE_TO_PEAK: Final = 1.5
-REACH: Final = 5
-"""Taps on either side of a pulse's peak where it is still there."""
+"""Half width of a pulse where it is 1/e of its height: 2 ns from half to half, which is a bandwidth of 440 MHz."""
 
-DIFFUSE: Final = 12
-TICKS_A_TAP: Final = 64
+EDGE_TO_PEAK: Final = 1.5
+"""Taps from the leading edge that the chip reports to the peak of the pulse."""
+
 TAP_S: Final = 1.0016 * NS
-VALUES_A_TRANSFER: Final = 50
-HEADER_FIELDS: Final = 5
+"""Half a period of 499.2 MHz, at which the accumulator is sampled (DW1000 User Manual, 7.2.26)."""
+
+TAP_M: Final = TAP_S * SPEED_OF_LIGHT
 INDEX_STEPS: Final = 1000
 """The boards print the first path in thousandths of a tap."""
 
-
-ACCUMULATED: Final = 118
-"""Preamble symbols that the chip adds up, of 128."""
-
-LARGEST: Final = 32_767
+LARGEST_TAP: Final = 32_767
 """Taps are 16 bits wide."""
 
-Echo = tuple[float, float]
-"""A path after the first: its delay in seconds, and its amplitude as a share of the first's."""
+BEFORE: Final = 6
+"""Taps before the direct path's edge; so many of them are enough for its pulse."""
+
+TAPS: Final = 64
+"""Taps in which a first path is looked for: 17 m."""
+
+LAST_M: Final = (TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M
+"""Paths that come later than this count for the total power alone."""
+
+REACH: Final = 4
+"""Taps on either side of a pulse's peak where it is still there: 1.5e-5 of its height at the fourth."""
+
+BLOCK: Final = 2 * REACH
+"""Taps in which a pulse alone is there."""
+
+FRACTIONS: Final = 128
+"""Places in a tap at which pulses are tabulated, 2 mm of path apart."""
+
+CURVATURE: Final = 1 / PULSE_TAPS**2
+"""The logarithm of a pulse is a parabola; this is its coefficient, turned round."""
+
+NOTHING: Final = 1e-20
+"""Amplitude in roots of mW whose logarithm is still taken."""
+
+OWN_TAPS: Final = np.arange(1, 4)
+"""Taps after the edge whose squares are the first path's power (DW1000 User Manual, 4.7.1)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,37 +82,23 @@ class Waves:
 class PathsHeard:
     """What an impulse response shows of a link: the power of the first path in dBm, and the paths after it.
 
-    Where `waves` are known, they are all that there is.
+    `echoes` are their delays in seconds and amplitudes as shares of the first's. Where `waves` are known, they are all
+    that there is.
     """
 
     power_dbm: float
-    echoes: list[Echo]
+    echoes: list[tuple[float, float]]
     waves: Waves | None = None
-
-
-def paths_heard(link: Link, detour_m: float = 0.0) -> PathsHeard:
-    """Return what a response shows of a single link, whose first path is `detour_m` longer still by chance."""
-    power = float(link.power_dbm[0])
-    if link.paths_m is None or link.paths_dbm is None:
-        return PathsHeard(power_dbm=power, echoes=[])
-    later_m = link.paths_m[0] - float(link.distance_m[0] + link.excess_m[0]) - detour_m
-    shares = 10 ** ((link.paths_dbm[0] - power) / 20)
-    echoes = [
-        (later / SPEED_OF_LIGHT, share)
-        for later, share in zip(later_m.tolist(), shares.tolist(), strict=True)
-        if later > NEAREST_ECHO_M and share > FAINTEST_ECHO
-    ]
-    return PathsHeard(power_dbm=power, echoes=echoes)
 
 
 def peak_amplitude(power_dbm: float) -> float:
     """Return the peak of a first path in the chip's counts, from its power (DW1000 User Manual, 4.7.1).
 
-    The power is 10 log10((F1^2 + F2^2 + F3^2)/N^2) - 121.74 of the three taps from the leading edge on.
+    The power is 10 log10((F1^2 + F2^2 + F3^2)/N^2) - 121.74 of the three taps from the leading edge on; of 128 symbols
+    of the preamble the chip adds up N = 118.
     """
-    taps = np.arange(1, 4) - EDGE_TO_PEAK
-    squares = float(np.sum(np.exp(-2 * (taps / PULSE_TAPS) ** 2)))
-    return float(ACCUMULATED * np.sqrt(10 ** ((power_dbm + FPP_OFFSET_DB) / 10) / squares))
+    squares = float(np.sum(np.exp(-2 * ((OWN_TAPS - EDGE_TO_PEAK) / PULSE_TAPS) ** 2)))
+    return float(118 * np.sqrt(10 ** ((power_dbm + FPP_OFFSET_DB) / 10) / squares))
 
 
 def impulse_response(
@@ -111,18 +109,23 @@ def impulse_response(
     With a receive `stamp` (ticks) the index has its fraction; `paths` are known ones, besides the diffuse, unless
     `paths.waves` has all. Without them the first path has the power of the boards' usual ones, -82 dBm.
     """
-    fraction = rng.uniform() if stamp is None else stamp % TICKS_A_TAP / TICKS_A_TAP
-    index = int(INDEX_STEPS * (FIRST_PATH + rng.integers(-1, 2) + fraction))
+    ticks_per_tap = 64
+    fraction = rng.uniform() if stamp is None else stamp % ticks_per_tap / ticks_per_tap
+    # The chip puts the first path at 745, give or take a tap (DW1000 User Manual, 7.2.40.1).
+    index = int(INDEX_STEPS * (745.0 + rng.integers(-1, 2) + fraction))
     # The chip reports the leading edge; the peak of the pulse follows it.
     peak = index / INDEX_STEPS + EDGE_TO_PEAK
-    noise = NOISE
+    noise = 45.0
     if paths and paths.waves:
         wave = _from_geometry(peak, paths.waves)
-        noise = float(np.hypot(RECORDED_NOISE, SELF_NOISE * np.abs(wave).max()))
+        # Noise of either part: 28 counts of a response that is not turned down, and a share of the strongest tap, as
+        # preambles do not correlate perfectly. By power, 265 responses of MILUV's boards have 0.0090 (at -82 dBm),
+        # 0.0091, 0.0113, 0.0122 and 0.0185 (at -93 dBm) of their strongest taps.
+        noise = float(np.hypot(28.0, 0.009 * np.abs(wave).max()))
     else:
         wave = _with_diffuse(rng, peak, paths)
     wave = wave + noise * (rng.normal(size=Cir.TAPS) + 1j * rng.normal(size=Cir.TAPS))
-    re, im = (np.minimum(np.abs(np.trunc(part)), LARGEST) for part in (wave.real, wave.imag))
+    re, im = (np.minimum(np.abs(np.trunc(part)), LARGEST_TAP) for part in (wave.real, wave.imag))
     # The firmware's estimate of a magnitude: the larger part and a quarter of the smaller.
     return index, tuple((np.maximum(re, im) + np.minimum(re, im) // 4).astype(np.int64).tolist())
 
@@ -132,9 +135,9 @@ def _with_diffuse(rng: np.random.Generator, peak: float, paths: PathsHeard | Non
     taps = np.arange(Cir.TAPS)
     amplitude = peak_amplitude(paths.power_dbm if paths else ALPHA_DBM)
     wave = amplitude * np.exp(-(((taps - peak) / PULSE_TAPS) ** 2)) + 0j
-    count = rng.poisson(DIFFUSE)
-    later = rng.exponential(DECAY_TAPS, count)
-    strength = 0.25 * np.exp(-later / DECAY_TAPS) * rng.rayleigh(size=count)
+    count, decay_taps = rng.poisson(12), 14.0
+    later = rng.exponential(decay_taps, count)
+    strength = 0.25 * np.exp(-later / decay_taps) * rng.rayleigh(size=count)
     known = [*zip(later.tolist(), strength.tolist(), strict=True)]
     known += [(delay_s / TAP_S, share) for delay_s, share in paths.echoes] if paths else []
     for (place, share), phase in zip(known, rng.uniform(0, 2 * np.pi, len(known)), strict=True):
@@ -145,20 +148,157 @@ def _with_diffuse(rng: np.random.Generator, peak: float, paths: PathsHeard | Non
 def _from_geometry(peak: float, waves: Waves) -> Complexes:
     """The sum of all paths; turned down as a whole, as the chip's gain control does, where it would not fit."""
     place = peak + waves.delay_s / TAP_S
-    taps = np.floor(place)[:, None] + np.arange(-REACH, REACH + 1)
+    taps = np.floor(place)[:, None] + np.arange(-5, 6)
     pulses = np.exp(-(((taps - place[:, None]) / PULSE_TAPS) ** 2)) * (peak_amplitude(0.0) * waves.amplitude)[:, None]
     inside = (taps >= 0) & (taps < Cir.TAPS)
     at, pulses = taps[inside].astype(np.intp), pulses[inside]
     parts = [np.bincount(at, part, minlength=Cir.TAPS) for part in (pulses.real, pulses.imag)]
     wave = parts[0] + 1j * parts[1]
-    return np.asarray(wave * min(1.0, LARGEST / max(float(np.abs(wave).max()), 1.0)))
+    return np.asarray(wave * min(1.0, LARGEST_TAP / max(float(np.abs(wave).max()), 1.0)))
 
 
 def in_transfers(line: bytes) -> list[bytes]:
     """Cut a printed response into its USB transfers of 50 values, and one for the line end."""
     body, end = line[:-2], line[-2:]
     parts = body.split(b"|")
-    cuts = [0, *range(HEADER_FIELDS + VALUES_A_TRANSFER, len(parts), VALUES_A_TRANSFER), len(parts)]
+    values, header = 50, 5
+    cuts = [0, *range(header + values, len(parts), values), len(parts)]
     pieces = [b"|".join(parts[a:b]) for a, b in itertools.pairwise(cuts)]
     # Each piece after the first begins with the bar that separates it from the one before.
     return [pieces[0], *(b"|" + piece for piece in pieces[1:]), end]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensing:
+    """What a chip can tell: how far below the strongest tap, and above which power in dBm, it takes a first path.
+
+    `noise_share` is the noise's standard deviation as a share of that threshold; 0 for none on the stamps.
+    """
+
+    dynamic_range_db: float
+    sensitivity_dbm: float
+    noise_share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detected:
+    """What is read off n responses, (n,) each.
+
+    `excess_m` is how much longer than the straight line the first path seems, `power_dbm` its power in the chip's
+    formula, `total_dbm` that of the whole response, `noise_s` what noise does to its edge (standard deviation).
+    """
+
+    excess_m: Floats
+    power_dbm: Floats
+    total_dbm: Floats
+    noise_s: Floats
+
+
+def detect(paths: Paths, sensing: Sensing) -> Detected:
+    """Return what a chip makes of paths.
+
+    The first path is the first peak from where the response exceeds the threshold; the chip puts it where its leading
+    edge has half its height (so it does in recorded responses: 0.52 in the median of 944 of MILUV's boards). From there
+    to the peak it is as far as in a pulse alone, so a path alone is found where it is, at any power.
+    """
+    parts = accumulate(paths)
+    squares = parts[0] ** 2
+    squares += parts[1] ** 2
+    strongest = _height(squares.max(axis=1))
+    least = np.log(10) / 20
+    threshold = np.maximum(strongest - sensing.dynamic_range_db * least, sensing.sensitivity_dbm * least)
+    # Who is not heard has a first path all the same.
+    threshold = np.minimum(threshold, strongest - 0.5)
+    peak, top = _first_peak(squares, np.argmax(squares >= np.exp(2 * threshold)[:, None], axis=1))
+    edge, slope = _half_height(squares, peak, top)
+    # From half the height of a pulse alone to its peak.
+    arrival = edge + PULSE_TAPS * float(np.sqrt(np.log(2)))
+    first = np.floor(arrival - EDGE_TO_PEAK + 1e-6).astype(np.int64)[:, None] + OWN_TAPS
+    own = np.take_along_axis(squares, np.clip(first, 0, TAPS - 1), axis=1).sum(axis=1) / _squares(OWN_TAPS)
+    total = squares.sum(axis=1) / _squares(np.arange(-8, 9))
+    late = paths.detour_m >= LAST_M
+    if np.any(late):
+        total += np.sum(np.abs(np.where(late, paths.amplitude, 0)) ** 2, axis=1)
+    noise = sensing.noise_share * np.exp(np.minimum(threshold - top, 0)) * 2
+    # On a flatter edge than 0.2, of the logarithm over a tap, noise does not count for more.
+    return Detected(
+        excess_m=(arrival - BEFORE - EDGE_TO_PEAK) * TAP_M,
+        power_dbm=10 * np.log10(np.maximum(own, NOTHING)),
+        total_dbm=10 * np.log10(np.maximum(total, NOTHING)),
+        noise_s=noise / np.maximum(slope, 0.2) * TAP_S,
+    )
+
+
+def accumulate(paths: Paths) -> Floats:
+    """Return the accumulators of n links around their direct paths: real and imaginary parts in roots of mW.
+
+    Shape (2, n, `TAPS`).
+    A pulse lies in the block of taps where it begins and the next one; so each path adds one row of a table to two
+    blocks at its amplitude, which a sparse matrix does without a list of its taps.
+    """
+    count, blocks = len(paths.amplitude), TAPS // BLOCK
+    place = (BEFORE + EDGE_TO_PEAK + paths.detour_m / TAP_M) * FRACTIONS
+    inside = (paths.detour_m < LAST_M) & (place >= 0)
+    nearest = np.clip(np.rint(place), 0, TAPS * FRACTIONS - 1).astype(np.int32)
+    block, within = np.divmod(nearest, BLOCK * FRACTIONS)
+    block += np.arange(count, dtype=np.int32)[:, None] * blocks
+    amplitude = np.where(inside, paths.amplitude, 0).ravel()
+    rows = np.stack([block, block + count * blocks]).ravel()
+    values = np.concatenate([amplitude.real, amplitude.imag])
+    shape = (2 * count * blocks, BLOCK * FRACTIONS)
+    added = np.asarray(coo_array((values, (rows, np.tile(within.ravel(), 2))), shape=shape) @ _pulses())
+    pairs = added.reshape(2, count, blocks, 2, BLOCK)
+    taps = np.zeros((2, count, blocks + 1, BLOCK))
+    taps[:, :, :-1] = pairs[:, :, :, 0]
+    taps[:, :, 1:] += pairs[:, :, :, 1]
+    return taps.reshape(2, count, -1)[:, :, REACH - 1 : REACH - 1 + TAPS]
+
+
+def _squares(taps: Ints) -> float:
+    """Return the sum of the squares of a pulse of height one in taps after its edge."""
+    return float(np.sum(np.exp(-2 * CURVATURE * (taps - EDGE_TO_PEAK) ** 2)))
+
+
+@cache
+def _pulses() -> Floats:
+    """Pulses on two blocks of taps, by where in the first they peak, in `FRACTIONS` of a tap: (places, two blocks).
+
+    The first tap is the one `REACH` - 1 before; so far a pulse reaches back.
+    """
+    step, fraction = np.divmod(np.arange(BLOCK * FRACTIONS), FRACTIONS)
+    taps = np.arange(2 * BLOCK) - (REACH - 1) - step[:, None]
+    pulses = np.exp(-CURVATURE * (taps - (fraction / FRACTIONS)[:, None]) ** 2)
+    return np.asarray(np.where((taps > -REACH) & (taps <= REACH), pulses, 0))
+
+
+def _height(squares: Floats) -> Floats:
+    """The logarithm of an amplitude, of its square."""
+    return np.asarray(np.log(np.maximum(squares, NOTHING**2)) / 2)
+
+
+def _first_peak(squares: Floats, begin: Ints) -> tuple[Ints, Floats]:
+    """Return the first peak's tap from the tap `begin` on, and its height, by a parabola through its neighbours."""
+    rows, last = np.arange(len(squares)), squares.shape[1] - 2
+    falls = squares[:, :-1] >= squares[:, 1:]
+    falls &= np.arange(squares.shape[1] - 1) >= begin[:, None]
+    peak = np.clip(np.where(falls.any(axis=1), np.argmax(falls, axis=1), last), 1, last)
+    left, top, right = (_height(squares[rows, peak + k]) for k in (-1, 0, 1))
+    bend = np.minimum(left - 2 * top + right, -1e-6)
+    return peak, np.asarray(top - np.clip((right - left) ** 2 / (8 * bend), -1, 0))
+
+
+def _half_height(squares: Floats, peak: Ints, top: Floats) -> tuple[Floats, Floats]:
+    """Return where the edge before a peak has half its height, in taps, and its slope there.
+
+    Between two taps the logarithm is curved as a pulse's is.
+    """
+    rows, half = np.arange(len(squares)), top - np.log(2)
+    below = (squares < np.exp(2 * half)[:, None]) & (np.arange(squares.shape[1]) < peak[:, None])
+    # The last tap before the peak that is lower; the first there is where none is.
+    before = np.where(below.any(axis=1), squares.shape[1] - 1 - np.argmax(below[:, ::-1], axis=1), 0)
+    low, high = (_height(squares[rows, before + k]) for k in (0, 1))
+    rise = np.maximum(high - low, 1e-9)
+    # low + (rise + k) u - k u^2 = half.
+    linear, missing = rise + CURVATURE, np.clip(half - low, 0, rise)
+    root = np.sqrt(np.maximum(linear**2 - 4 * CURVATURE * missing, 0))
+    return before + 2 * missing / (linear + root), root

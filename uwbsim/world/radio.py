@@ -1,140 +1,182 @@
-"""Received power and what depends on it: antenna gain, shadowing, bias, noise, printed values."""
+"""Antennas over direction (gain, group delay), received power, and what depends on it: bias, noise, printed values."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from math import factorial, isqrt, sqrt
+from typing import Any, Final
 
 import numpy as np
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, RegularGridInterpolator
+from scipy.special import lpmv
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import truncate4
 from uwbsim.random_streams import stream
+from uwbsim.scenario.devices import GroupDelay, GroupDelayTable
+from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import AntennaTable, BiasTable, Radio, SigmaSpline, Spline
 
-if TYPE_CHECKING:
-    from scipy.interpolate import RegularGridInterpolator
-
 ALPHA_DBM: Final = -82.0
+"""Powers are lifted relative to this: 10^((p - alpha)/10) (ICRA 2023, section IV)."""
+
 FPP_OFFSET_DB: Final = 121.74
 """DW1000 User Manual, section 4.7.1, for a pulse repetition frequency of 64 MHz."""
 
-SKEW_GRID_PPM: Final = 9.3132e-4
-"""One count of the carrier integrator (firmware wire format, section 4)."""
-
-CARRIER_REFERENCE_DBM: Final = -90.0
-"""Where the bias of the carrier integrator's readings is `skew_bias_ppm`: in the middle of the boards' powers."""
-
-SATURATION_SHARPNESS: Final = 1.5
-"""How suddenly readings of power saturate: fitted to the powers of the ICRA 2023 flights, half of which end within 3 dB
-of their highest."""
-
-NULL_DEPTH: Final = 0.1
-SHADOW_HARMONICS: Final = 3
-SHADOW_ORDERS: Final = np.arange(1, SHADOW_HARMONICS + 1)
+SHADOW_ORDERS: Final = np.arange(1, 4)
+"""Harmonics of azimuth that the shadow of a tag's body is made of: smooth over some 60 degrees."""
 
 
-def dipole_gain_db(sine: Floats) -> Floats:
-    """Gain of a short dipole at the angle to its axis with this sine; nulls are 20 dB deep."""
-    return 1.76 + 20 * np.log10(np.maximum(sine, NULL_DEPTH))
+def _dipole_db(sine: Floats) -> Floats:
+    """Return the gain of a short dipole; nulls are 20 dB deep."""
+    return 1.76 + 20 * np.log10(np.maximum(sine, 0.1))
 
 
-ANTENNAS: Final[dict[str, Callable[[Floats], Floats]]] = {
-    "isotropic": np.zeros_like,
-    "dipole": dipole_gain_db,
-}
+ANTENNAS: Final[dict[str, Callable[[Floats], Floats]]] = {"isotropic": np.zeros_like, "dipole": _dipole_db}
+"""Gain in dB at the angle to the antenna's axis with this sine."""
 
 
-def shadowing_phases(seed: int, tag: int) -> Floats:
-    """Return what makes the shadow of a tag's body its own, the same in every run with a seed, shape (harmonics,)."""
-    return stream(seed, "shadowing", tag).uniform(0, 2 * np.pi, SHADOW_HARMONICS)
+def harmonics(direction: Floats, degree: int) -> Floats:
+    """Return the real spherical harmonics of degree 0 to `degree` at unit vectors (n, 3), (n, (degree + 1)^2).
+
+    In order of degree l, and in each of m from -l to l: the sine of azimuth for negative ones. Their root mean square
+    over all directions is one.
+    """
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
+    height = np.clip(direction[:, 2], -1, 1)
+    columns = []
+    for l in range(degree + 1):  # noqa: E741 - the letter that everybody writes
+        for m in range(-l, l + 1):
+            scale = sqrt((2 * l + 1) * factorial(l - abs(m)) / factorial(l + abs(m)) * (2 if m else 1))
+            # lpmv has the sign of Condon and Shortley, which is taken out again.
+            wave = (-1) ** m * (np.sin(-m * azimuth) if m < 0 else np.cos(m * azimuth))
+            columns.append(scale * lpmv(abs(m), l, height) * wave)
+    return np.column_stack(columns)
 
 
-def gain_db(radio: Radio, phases: Floats, direction: Floats) -> Floats:
-    """Gain of a tag towards unit vectors (n, 3) in its body's frame, in dB, shape (n,).
+def shadowing_phases(scenario: Scenario) -> Floats:
+    """Return the phases of the harmonics of each tag's shadow, (tags, harmonics): the same in every run with a seed."""
+    streams = (stream(scenario.run.seed, "shadowing", tag.id) for tag in scenario.tags)
+    return np.array([one.uniform(0, 2 * np.pi, len(SHADOW_ORDERS)) for one in streams])
+
+
+def antenna_gain_db(scenario: Scenario, phases: Floats, tags: Ints, direction: Floats) -> Floats:
+    """Return the gains in dB of tags at places (n,) towards unit vectors (n, 3) in their bodies' frames, (n,).
 
     The antenna stands along the body's z axis. Shadowing by the body is a smooth function of azimuth with standard
-    deviation `shadowing_db`; `phases` are those of the tag (harmonics,), or of n tags (n, harmonics).
+    deviation `shadowing_db`; `phases` (tags, harmonics) are those of `shadowing_phases`.
     """
+    radio = scenario.radio
     if isinstance(radio.antenna, AntennaTable):
-        gain = _table_gain_db(radio.antenna, direction)
+        azimuth = np.degrees(np.arctan2(direction[:, 1], direction[:, 0]))
+        elevation = np.degrees(np.arcsin(np.clip(direction[:, 2], -1, 1)))
+        table = _interpolator(radio.antenna.azimuth_deg, radio.antenna.elevation_deg, radio.antenna.gain_db)
+        gain = np.asarray(table(np.column_stack([azimuth, elevation])))
     else:
         gain = ANTENNAS[radio.antenna](np.hypot(direction[:, 0], direction[:, 1]))
     if radio.shadowing_db:
         azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-        waves = np.cos(azimuth[:, None] * SHADOW_ORDERS + phases).sum(axis=1)
-        gain = gain + radio.shadowing_db * waves * np.sqrt(2 / SHADOW_HARMONICS)
+        waves = np.cos(azimuth[:, None] * SHADOW_ORDERS + phases[tags]).sum(axis=1)
+        gain = gain + radio.shadowing_db * waves * np.sqrt(2 / len(SHADOW_ORDERS))
+    for place, tag in enumerate(scenario.tags):
+        if tag.pattern_db:
+            mine = np.flatnonzero(tags == place)
+            own = harmonics(direction[mine], isqrt(len(tag.pattern_db)) - 1)
+            gain[mine] += own @ np.array(tag.pattern_db)
     return gain
 
 
-def _table_gain_db(table: AntennaTable, direction: Floats) -> Floats:
-    azimuth = np.degrees(np.arctan2(direction[:, 1], direction[:, 0]))
-    elevation = np.degrees(np.arcsin(np.clip(direction[:, 2], -1, 1)))
-    return np.asarray(_interpolator(table)(np.column_stack([azimuth, elevation])))
-
-
 @lru_cache(maxsize=16)
-def _interpolator(table: AntennaTable) -> RegularGridInterpolator:
-    from scipy.interpolate import RegularGridInterpolator
+def _interpolator(azimuth_deg: tuple[float, ...], elevation_deg: tuple[float, ...], values: Any) -> Any:
+    return RegularGridInterpolator((azimuth_deg, elevation_deg), np.array(values))
 
-    return RegularGridInterpolator((table.azimuth_deg, table.elevation_deg), np.array(table.gain_db))
+
+def has_group_delays(scenario: Scenario) -> bool:
+    """Return whether any tag has one."""
+    return scenario.radio.group_delay is not None or any(tag.group_delay is not None for tag in scenario.tags)
+
+
+def group_delay_m(scenario: Scenario, tags: Ints, direction: Floats) -> Floats:
+    """Return the group delays of tags at places (n,) towards unit vectors (n, 3) in their bodies' frames.
+
+    In metres of path, (n,).
+    """
+    delay = np.zeros(len(tags))
+    for place in np.unique(tags).tolist():
+        model = scenario.tags[place].group_delay or scenario.radio.group_delay
+        if model is not None:
+            rows = np.flatnonzero(tags == place)
+            delay[rows] = _group_delay_cm(model, direction[rows]) * 1e-2
+    return delay
+
+
+def _group_delay_cm(model: GroupDelay, direction: Floats) -> Floats:
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0]) - np.radians(model.turned_deg)
+    sine = np.clip(direction[:, 2], -1, 1)
+    if isinstance(model, GroupDelayTable):
+        # Turned boards look beyond the table's ends, which are the same direction.
+        around = (np.degrees(azimuth) + 180) % 360 - 180
+        table = _interpolator(model.azimuth_deg, model.elevation_deg, model.delay_cm)
+        return np.asarray(table(np.column_stack([around, np.degrees(np.arcsin(sine))])))
+    around = np.zeros(len(azimuth))
+    for wave, heights in ((np.cos, model.cosine_cm), (np.sin, model.sine_cm)):
+        for order, height in enumerate(heights, start=1):
+            around += height * wave(order * azimuth)
+    return model.mean_cm + around * np.sqrt(1 - sine**2) + model.elevation_cm * sine
 
 
 def path_gain_db(radio: Radio, distance_m: Floats) -> Floats:
-    """First-path power over distance without antennas, in dBm, shape (n,)."""
+    """Return first-path power over distance without antennas, in dBm, (n,)."""
     nearest = np.maximum(distance_m, 0.05)
     return radio.first_path_at_1m_dbm - 10 * radio.path_loss_exponent * np.log10(nearest)
 
 
 def lifted(power_dbm: Floats) -> Floats:
-    """Lifted power 10^((p - alpha)/10) (ICRA 2023, section IV)."""
+    """Return lifted power 10^((p - alpha)/10) (ICRA 2023, section IV)."""
     return np.asarray(10 ** ((power_dbm - ALPHA_DBM) / 10))
 
 
 def reported_dbm(radio: Radio, power_dbm: Floats) -> Floats:
-    """Return what receivers make of first-path powers: the same, or saturating.
+    """Return the first-path powers that receivers read: the same, or saturating.
 
-    The lifted powers' inverses to the power of `SATURATION_SHARPNESS` add up with that of the highest.
+    The inverses of the lifted powers to the power of `sharpness` add up with that of the highest. The sharpness was
+    fitted to the ICRA 2023 flights, half of whose readings end within 3 dB of their highest.
     """
     if radio.saturation_dbm is None:
         return power_dbm
-    above = SATURATION_SHARPNESS / 10 * (power_dbm - radio.saturation_dbm)
-    return np.asarray(power_dbm - 10 / SATURATION_SHARPNESS * np.log10(1 + 10**above))
+    sharpness = 1.5
+    above = sharpness / 10 * (power_dbm - radio.saturation_dbm)
+    return np.asarray(power_dbm - 10 / sharpness * np.log10(1 + 10**above))
 
 
 def reception_bias_s(radio: Radio, power_dbm: Floats, total_dbm: Floats | None = None) -> Floats:
-    """What power adds to a receive stamp, in seconds: a spline goes by first-path power, a table by total power.
+    """Return what power adds to a receive stamp, in seconds: a spline over first-path, a table over total power.
 
     Each of the two receptions of a range carries it, so a range has the mean of the curve's values.
     """
     if isinstance(radio.bias, BiasTable):
-        return _table_bias_m(radio.bias, power_dbm if total_dbm is None else total_dbm) / SPEED_OF_LIGHT
+        order = np.argsort(radio.bias.power_dbm)
+        powers, biases = (np.array(column)[order] for column in (radio.bias.power_dbm, radio.bias.bias_m))
+        return np.asarray(np.interp(power_dbm if total_dbm is None else total_dbm, powers, biases)) / SPEED_OF_LIGHT
     return _spline(radio.bias, power_dbm) / SPEED_OF_LIGHT
 
 
-def _table_bias_m(table: BiasTable, total_dbm: Floats) -> Floats:
-    order = np.argsort(table.power_dbm)
-    return np.asarray(np.interp(total_dbm, np.array(table.power_dbm)[order], np.array(table.bias_m)[order]))
-
-
 def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:
-    """Standard deviation of a receive stamp, in seconds: white noise and the sigma curve.
+    """Return the standard deviation of a receive stamp, in seconds: white noise and the sigma curve.
 
     The curve gives the range's; a range has c sqrt(s^2/2 (1 + r + r^2)) (docs/theory.md).
     """
-    white = radio.rx_noise_s
     ratio = radio.sigma.reply_ratio if radio.sigma else 0.0
     factor = SPEED_OF_LIGHT * np.sqrt((1 + ratio + ratio**2) / 2)
-    return np.asarray(np.hypot(white, _spline(radio.sigma, power_dbm) / factor))
+    return np.asarray(np.hypot(radio.rx_noise_s, _spline(radio.sigma, power_dbm) / factor))
 
 
 def printed_power_dbm(radio: Radio, power_dbm: Floats, noise: Floats) -> Floats:
-    """First-path power as the boards print it: 10 log10 of a whole number, cut to four decimals.
+    """Return first-path power as the boards print it: 10 log10 of a whole number, cut to four decimals.
 
-    `noise` is standard normal, shape (n,).
+    `noise` is standard normal, (n,).
     """
     read = reported_dbm(radio, power_dbm + noise * radio.power_noise_db)
     if not radio.quantize:
@@ -144,19 +186,23 @@ def printed_power_dbm(radio: Radio, power_dbm: Floats, noise: Floats) -> Floats:
 
 
 def carrier_bias_ppm(radio: Radio, power_dbm: Floats) -> Floats:
-    """Return the bias of the carrier integrator's readings of frames with these first-path powers."""
-    return np.asarray(radio.skew_bias_ppm + radio.skew_bias_ppm_per_db * (power_dbm - CARRIER_REFERENCE_DBM))
+    """Return the bias of the carrier integrator's readings of frames with these first-path powers.
+
+    It is `skew_bias_ppm` at -90 dBm, in the middle of the boards' powers.
+    """
+    return np.asarray(radio.skew_bias_ppm + radio.skew_bias_ppm_per_db * (power_dbm + 90.0))
 
 
 def printed_skew_ppm(radio: Radio, skew_ppm: Floats, noise: Floats, power_dbm: Floats) -> Floats:
-    """Relative skew as the boards print it: whole counts of the carrier integrator, with its sign, bias and noise.
+    """Return relative skew as the boards print it: whole counts of the carrier integrator, with sign, bias and noise.
 
     `skew_ppm` is by how much the receiver's clock is faster than the sender's.
     """
     read = radio.carrier_sign * skew_ppm + carrier_bias_ppm(radio, power_dbm) + noise * radio.skew_noise_ppm
     if not radio.quantize:
         return read
-    return truncate4(np.rint(read / SKEW_GRID_PPM) * SKEW_GRID_PPM)
+    count_ppm = 9.3132e-4  # of the carrier integrator (firmware wire format, section 4)
+    return truncate4(np.rint(read / count_ppm) * count_ppm)
 
 
 def _spline(curve: Spline | SigmaSpline | None, power_dbm: Floats) -> Floats:

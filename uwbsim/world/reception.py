@@ -16,8 +16,9 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
 from uwbsim.units import PPM_PER_ONE
-from uwbsim.world.clocks import Clocks
-from uwbsim.world.propagation import Link
+from uwbsim.world.antenna_delays import AntennaDelays
+from uwbsim.world.channel import Link
+from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.radio import (
     printed_power_dbm,
     printed_skew_ppm,
@@ -25,8 +26,6 @@ from uwbsim.world.radio import (
     reception_noise_s,
     reported_dbm,
 )
-from uwbsim.world.temperature import AntennaDelays
-from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
 
 
 class Links(Protocol):

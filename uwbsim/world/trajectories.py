@@ -1,23 +1,26 @@
-"""Where bodies are: smooth trajectories, evaluated at many instants at once."""
+"""Trajectories of bodies, evaluated at many instants at once, and the readings of their inertial and height sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Floats
-from uwbsim.scenario.motion import Carried, Figure, RandomFlight, Recorded, Static, Waypoints
+from uwbsim.random_streams import stream
+from uwbsim.scenario.bodies import Carried, Figure, Height, Imu, RandomFlight, Recorded, Static, Waypoints
+from uwbsim.scenario.devices import Body
+from uwbsim.scenario.model import Scenario
+from uwbsim.tables import Columns, in_time_order
+from uwbsim.units import NS_PER_S
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body for a purpose."""
-
-TILT_RAD: Final = 0.12
-"""Standard deviation of roll and pitch of a quadcopter in calm flight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +43,14 @@ class Trajectory:
         if self.attitude is not None:
             return self.attitude(time_s)
         return _quaternions(self.angles(time_s))
+
+    def pose(self, time_s: Floats) -> tuple[Floats, Floats]:
+        """Return positions (n, 3) and rotations body to world (n, 3, 3)."""
+        return self.position_m(time_s), Rotation.from_quat(self.quaternion(time_s)).as_matrix()
+
+    def nearest_m(self, other: Trajectory, time_s: Floats) -> float:
+        """Return how close two bodies come at times (n,)."""
+        return float(np.linalg.norm(self.position_m(time_s) - other.position_m(time_s), axis=1).min())
 
     def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
         """Return where a point of the body is, shape (n, 3)."""
@@ -164,9 +175,10 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
     count = int(np.ceil(duration_s / leg_s)) + 8
     knots = (np.arange(count + 4, dtype=np.float64) - 5) * leg_s
     path = BSpline(knots, draw("position").uniform(lo, hi, (count, 3)), 3)
+    tilt_rad = 0.12  # standard deviation of roll and pitch of a quadcopter in calm flight
     turns = draw("yaw")
     yaw = turns.uniform(-np.pi, np.pi) + np.cumsum(turns.normal(0, 0.8, count))
-    angles = BSpline(knots, np.column_stack([yaw, draw("tilt").normal(0, TILT_RAD, (count, 2))]), 3)
+    angles = BSpline(knots, np.column_stack([yaw, draw("tilt").normal(0, tilt_rad, (count, 2))]), 3)
     # A little after the end, where the last exchange may still be under way, the body holds its place.
     last_s = duration_s + leg_s
     return Trajectory(
@@ -182,3 +194,62 @@ _MAKERS: Final[dict[type, Callable[[Any, float, Draw], Trajectory]]] = {
     Figure: _figure,
     Recorded: _recorded,
 }
+
+
+def inertial_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) -> Columns:
+    """Return the columns of the table `imu`, in order of time; none where no body has such a sensor."""
+    parts = [_imu_of(scenario, body, trajectories[body.name], body.imu) for body in scenario.bodies if body.imu]
+    return in_time_order(parts)
+
+
+def height_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) -> Columns:
+    """Return the columns of the table `height`, in order of time; none where no body has such a sensor."""
+    parts = [
+        _heights_of(scenario, body, trajectories[body.name], body.height) for body in scenario.bodies if body.height
+    ]
+    return in_time_order(parts)
+
+
+def _imu_of(scenario: Scenario, body: Body, path: Trajectory, imu: Imu) -> Columns:
+    time_s, time_ns = _times(scenario, imu.rate_hz)
+    rng = stream(scenario.run.seed, "imu", body.name)
+    gyro, force = true_motion(path, time_s)
+    gyro = gyro + _errors(rng, imu, "gyro", len(time_s))
+    force = force + _errors(rng, imu, "force", len(time_s)) + imu.vibration_mps2 * rng.normal(size=force.shape)
+    columns: Columns = {"time_ns": time_ns, "body": np.full(len(time_ns), body.name)}
+    columns |= dict(zip(("wx", "wy", "wz"), gyro.T, strict=True))
+    return columns | dict(zip(("ax", "ay", "az"), force.T, strict=True))
+
+
+def true_motion(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
+    """Return angular velocity (n, 3) in rad/s and specific force (n, 3) in m/s^2, both in the axes of the body."""
+    # Positions are exact to 1e-16, accelerations over 2 ms so to 1e-9.
+    step_s = 1e-3
+    before, after = (Rotation.from_quat(path.quaternion(time_s + sign * step_s)) for sign in (-1, 1))
+    gyro = (before.inv() * after).as_rotvec() / (2 * step_s)
+    early, now, late = (path.position_m(time_s + sign * step_s) for sign in (-1, 0, 1))
+    pull = (late - 2 * now + early) / step_s**2 + (0.0, 0.0, 9.81)
+    return np.asarray(gyro), np.asarray(Rotation.from_quat(path.quaternion(time_s)).inv().apply(pull))
+
+
+def _errors(rng: np.random.Generator, imu: Imu, which: str, count: int) -> Floats:
+    """Return a bias that wanders, and white noise (n, 3), in SI units."""
+    found = imu.errors(which)
+    root = np.sqrt(imu.rate_hz)
+    wander = np.cumsum(rng.normal(0.0, found.wander / root, (count, 3)), axis=0)
+    return np.asarray(rng.normal(0.0, found.bias, 3) + wander + rng.normal(0.0, found.noise * root, (count, 3)))
+
+
+def _heights_of(scenario: Scenario, body: Body, path: Trajectory, sensor: Height) -> Columns:
+    time_s, time_ns = _times(scenario, sensor.rate_hz)
+    rng = stream(scenario.run.seed, "height", body.name)
+    height = (
+        path.position_m(time_s)[:, 2] + rng.normal(0.0, sensor.bias_m) + rng.normal(0.0, sensor.noise_m, len(time_s))
+    )
+    return {"time_ns": time_ns, "body": np.full(len(time_ns), body.name), "height_m": height}
+
+
+def _times(scenario: Scenario, rate_hz: float) -> tuple[Floats, NDArray[np.int64]]:
+    count = int(np.ceil(scenario.run.duration_s * rate_hz)) + 1
+    time_ns = np.rint(np.arange(count) * NS_PER_S / rate_hz).astype(np.int64)
+    return time_ns / NS_PER_S, time_ns

@@ -1,7 +1,8 @@
-"""Where every tag is, how far apart two are, and how one hears the other."""
+"""Where every tag is, and what reaches one from another: exactly, or sampled a second ahead."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, Self
@@ -16,18 +17,13 @@ from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.units import NS, NS_PER_S
-from uwbsim.world.channel import Ends, PlacedShadow, link_between
+from uwbsim.world.channel import Ends, Link, PlacedShadow, link_between, paths_heard
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.geometric_responses import GeometricResponses
-from uwbsim.world.impulse_response import PathsHeard, Waves, paths_heard
-from uwbsim.world.pair_levels import PairLevels
-from uwbsim.world.propagation import Link
+from uwbsim.world.impulse_response import PathsHeard, Waves
+from uwbsim.world.pair_states import PairLevels, ReflectedStates
 from uwbsim.world.radio import shadowing_phases
-from uwbsim.world.reflected_states import ReflectedStates
 from uwbsim.world.trajectories import Trajectory, sample
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
-
-SEPARATION_STEP_S: Final = 0.05
-TRIES: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +44,7 @@ class World:
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         """Sample every body's trajectory from the seed; raises `ScenarioError` where they cannot keep apart."""
-        phases = np.array([shadowing_phases(scenario.run.seed, tag.id) for tag in scenario.tags])
+        phases = shadowing_phases(scenario)
         trajectories = _trajectories(scenario)
         states, levels = ReflectedStates.of(scenario), PairLevels.of(scenario)
         responses = GeometricResponses.of(scenario, trajectories, phases)
@@ -104,30 +100,43 @@ class World:
         shadowing = [body.name for body in self.scenario.bodies if body.shadow is not None]
         # Each body once, whether it carries one of the tags, stands in between, or both.
         names = dict.fromkeys([tags[i].body, tags[j].body, *shadowing])
-        bodies = {name: _placed(self.trajectories[name], time_s) for name in names}
-        turns = bodies[tags[i].body][1], bodies[tags[j].body][1]
+        bodies = {name: self.trajectories[name].pose(time_s) for name in names}
         return link_between(
-            Ends(
-                scenario=self.scenario,
-                phases=self.phases,
-                time_s=time_s,
-                places=(np.full(len(time_s), i), np.full(len(time_s), j)),
-                antennas_m=(self._antenna_m(i, bodies), self._antenna_m(j, bodies)),
-                rotations=turns,
-                shadows=self._shadows(bodies),
-                states=self.states,
-                levels=self.levels,
-                responses=self.responses,
+            self.ends(
+                (np.full(len(time_s), i), np.full(len(time_s), j)),
+                time_s,
+                (self._antenna_m(i, bodies), self._antenna_m(j, bodies)),
+                (bodies[tags[i].body][1], bodies[tags[j].body][1]),
+                bodies,
             )
         )
 
-    def _shadows(self, bodies: dict[str, tuple[Floats, Floats]]) -> list[PlacedShadow]:
-        """Place the bodies that have a shadow."""
-        return [
+    def ends(
+        self,
+        places: tuple[Ints, Ints],
+        time_s: Floats,
+        antennas_m: tuple[Floats, Floats],
+        rotations: tuple[Floats, Floats],
+        bodies: Mapping[str, tuple[Floats, Floats]],
+    ) -> Ends:
+        """Return the ends of n links; `bodies` has position and rotation of those with a shadow, at each instant."""
+        shadows = [
             PlacedShadow(shadow=body.shadow, position_m=bodies[body.name][0], rotation=bodies[body.name][1])
             for body in self.scenario.bodies
             if body.shadow is not None
         ]
+        return Ends(
+            scenario=self.scenario,
+            phases=self.phases,
+            time_s=time_s,
+            places=places,
+            antennas_m=antennas_m,
+            rotations=rotations,
+            shadows=shadows,
+            states=self.states,
+            levels=self.levels,
+            responses=self.responses,
+        )
 
     def _antenna_m(self, index: int, bodies: dict[str, tuple[Floats, Floats]]) -> Floats:
         tag = self.scenario.tags[index]
@@ -172,36 +181,98 @@ class World:
         return position, (Rotation.from_quat(body.quaternion(time_s)) * wobble).as_quat()
 
 
-def _placed(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
-    """Return a body's positions (n, 3) and rotations body to world (n, 3, 3)."""
-    return path.position_m(time_s), _matrices(path, time_s)
-
-
-def _matrices(path: Trajectory, time_s: Floats) -> Floats:
-    """Return rotations body to world, (n, 3, 3)."""
-    return Rotation.from_quat(path.quaternion(time_s)).as_matrix()
-
-
 def _trajectories(scenario: Scenario) -> dict[str, Trajectory]:
     """Sample trajectories one after the other, trying again where a body would come too near an earlier one."""
     seed, duration = scenario.run.seed, scenario.run.duration_s
     least = scenario.min_separation_m
-    time = np.arange(0, min(duration, 600.0) + SEPARATION_STEP_S, SEPARATION_STEP_S)
+    tries = 60
+    time = np.arange(0, min(duration, 600.0) + 0.05, 0.05)
     found: dict[str, Trajectory] = {}
     for body in scenario.bodies:
-        for attempt in range(TRIES if least else 1):
+        for attempt in range(tries if least else 1):
             names = (body.name, attempt) if attempt else (body.name,)
             path = sample(body.motion, duration, partial(stream, seed, "motion", *names))
-            if not least or all(_nearest_m(path, other, time) >= least for other in found.values()):
+            if not least or all(path.nearest_m(other, time) >= least for other in found.values()):
                 break
         else:
             raise ScenarioError(
-                f"min_separation_m: body {body.name!r} comes nearer than {least:g} m to another in {TRIES} tries; "
+                f"min_separation_m: body {body.name!r} comes nearer than {least:g} m to another in {tries} tries; "
                 "give bodies more room, or less separation"
             )
         found[body.name] = path
     return found
 
 
-def _nearest_m(one: Trajectory, other: Trajectory, time_s: Floats) -> float:
-    return float(np.linalg.norm(one.position_m(time_s) - other.position_m(time_s), axis=1).min())
+STEP_S: Final = 0.005
+STEPS: Final = 200
+"""Samples of a block. Linear interpolation between them is wrong by 30 um at most at 10 m/s^2, 0.01 ticks."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    """A block: positions (samples, things, 3) and rotations body to world (samples, things, 3, 3)."""
+
+    spots: Floats
+    turns: Floats
+
+    def at(self, index: int, into: float) -> tuple[Floats, Floats]:
+        """Interpolate between a sample and the next."""
+        return (
+            self.spots[index] + into * (self.spots[index + 1] - self.spots[index]),
+            self.turns[index] + into * (self.turns[index + 1] - self.turns[index]),
+        )
+
+
+class SampledWorld:
+    """The tags of a world at one instant after another; going back a little is cheap, going back far is not."""
+
+    def __init__(self, world: World) -> None:
+        """Begin at time zero."""
+        self._world = world
+        self._shadowing = [body.name for body in world.scenario.bodies if body.shadow is not None]
+        self._prepare(0)
+
+    def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
+        """Return what `World.link` does, for one frame: all rows have the same sender and time."""
+        return self.from_sender(int(initiator[0]), int(time[0]))[target]
+
+    def from_sender(self, sender: int, time: int) -> Link:
+        """Return what reaches every tag from a tag's place, shape (tags,)."""
+        step, into = divmod(time / SUBTICKS_PER_SECOND / STEP_S, 1)
+        block, index = divmod(int(step), STEPS)
+        if block != self._block:
+            self._prepare(block)
+        spots, turns = self._tags.at(index, into)
+        count, time_s = len(spots), time / SUBTICKS_PER_SECOND
+        origin = np.full(count, sender)
+        if self._world.responses is not None:
+            self._world.responses.look_ahead(sender, time_s)
+        poses = {}
+        if self._shadowing:
+            places, rotations = self._bodies.at(index, into)
+            for k, name in enumerate(self._shadowing):
+                poses[name] = np.broadcast_to(places[k], (count, 3)), np.broadcast_to(rotations[k], (count, 3, 3))
+        return link_between(
+            self._world.ends(
+                (origin, np.arange(count)),
+                np.full(count, time_s),
+                (spots[origin], spots),
+                (turns[origin], turns),
+                poses,
+            )
+        )
+
+    def _prepare(self, block: int) -> None:
+        """Sample a block."""
+        world = self._world
+        time = np.asarray((block * STEPS + np.arange(STEPS + 1)) * STEP_S, dtype=np.float64)
+        bodies = {name: path.pose(time) for name, path in world.trajectories.items()}
+        tags = world.scenario.tags
+        turned = np.stack([bodies[tag.body][1] for tag in tags], axis=1)
+        arms = np.array([tag.lever_arm_m for tag in tags])
+        middle = np.stack([bodies[tag.body][0] for tag in tags], axis=1)
+        self._tags = _Samples(middle + np.einsum("stij,tj->sti", turned, arms), turned)
+        if self._shadowing:
+            parts = [bodies[name] for name in self._shadowing]
+            self._bodies = _Samples(*(np.stack(column, axis=1) for column in zip(*parts, strict=True)))
+        self._block = block

@@ -17,7 +17,7 @@ from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
 from uwblink.twr import STAMPS, Exchanges
-from uwbsim.boards.live_poses import LivePoses
+from uwbsim.boards.server import LivePoses
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate
 from uwbsim.simulation.simulated import write

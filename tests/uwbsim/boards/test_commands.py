@@ -9,10 +9,8 @@ from uwblink.boards.board import Board
 from uwblink.errors import RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
-from uwbsim.boards.board_air import MS
-from uwbsim.boards.command_parser import atoi, read
-from uwbsim.boards.commands import EXECUTORS, register_command
-from uwbsim.boards.printing import printed_float
+from uwbsim.boards.commands import EXECUTORS, atoi, printed_float, read_commands, register_command
+from uwbsim.boards.frames import MS
 from uwbsim.boards.virtual_port import VirtualPorts
 from uwbsim.errors import UwbsimError
 
@@ -113,7 +111,7 @@ def test_numbers_are_read_as_c_reads_them(text, number):
 )
 def test_what_boards_take_otherwise_than_the_firmware_is_what_the_page_says(data, kinds, alive):
     """docs/firmware.md says it; the last of them has 255 bytes."""
-    reading = read(data)
+    reading = read_commands(data)
     assert [command.kind for command in reading.commands] == kinds
     assert reading.alive == alive
 
@@ -130,7 +128,7 @@ def test_the_driver_writes_no_text_that_boards_read_otherwise(text):
 
 
 def test_the_last_command_of_a_buffer_keeps_its_values():
-    reading = read(b"C01\rC05|258|1|2|0|more\rjunk")
+    reading = read_commands(b"C01\rC05|258|1|2|0|more\rjunk")
     assert [c.kind for c in reading.commands] == [m.GetId, m.RangeCommand]
     assert reading.commands[1].values == (258, True, True, False)
     assert (reading.rest, reading.alive) == (b"junk", True)

@@ -6,7 +6,7 @@ import struct
 from tests.boards import bench_scenario
 from uwblink.boards.board import Board
 from uwblink.wire import messages as m
-from uwbsim.boards.board_air import MS
+from uwbsim.boards.frames import MS
 from uwbsim.boards.virtual_port import VirtualPorts
 
 COMMANDS = 100_000

@@ -8,7 +8,7 @@ import pytest
 from tests.boards import bench_scenario, served
 from uwblink.boards.board import Board
 from uwblink.importers.poses import read_poses
-from uwbsim.boards.live_poses import LivePoses
+from uwbsim.boards.server import LivePoses
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.world import World
 

@@ -3,7 +3,7 @@
 import math
 
 import uwbsim
-from uwbsim.boards.stays import stays_s
+from uwbsim.boards.server import stays_s
 
 
 def scenario(stays=((0.2, 0.1),), places=3):

@@ -17,7 +17,7 @@ from uwbsim.pages.scenario_figures import room, timing
 from uwbsim.pages.scenario_page import page as scene_page
 from uwbsim.pages.sweep_figures import Swept, figure_over_keys
 from uwbsim.pages.sweep_page import write_sweep_page
-from uwbsim.protocols.error_curves import ErrorCurve
+from uwbsim.protocols.comparison import ErrorCurve
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 BENCH, OFFICE = SCENARIOS / "two_boards_on_a_bench/bench.toml", SCENARIOS / "office/office.toml"

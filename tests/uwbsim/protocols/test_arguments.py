@@ -8,8 +8,7 @@ import pytest
 
 import uwbsim
 from uwblink import PROTOCOLS
-from uwbsim.protocols.comparison import compare
-from uwbsim.protocols.reply_delay import optimum
+from uwbsim.protocols.comparison import compare, optimum
 
 NOISELESS = Path(__file__).parents[3] / "scenarios" / "noiseless.toml"
 SHORT = uwbsim.load(NOISELESS, {"run.duration_s": 2.0, "radio.rx_noise_ps": 100.0})

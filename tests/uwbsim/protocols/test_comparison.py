@@ -9,14 +9,12 @@ import pytest
 
 from tests import processes
 from uwblink.protocols.table import PROTOCOLS
-from uwbsim.protocols.comparison import compare, costs, winners
+from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew, paper_bias_m, winners
 from uwbsim.protocols.conditions import calibrated, conditions_of
-from uwbsim.protocols.error_curves import over_reply, over_skew, paper_bias_m
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
-from uwbsim.protocols.reply_delay import optimum
-from uwbsim.scenario.airtime import TURNAROUND_S
 from uwbsim.scenario.loading import load
+from uwbsim.scenario.ranging import TURNAROUND_S
 from uwbsim.simulation.run import simulate
 
 ROOT = Path(__file__).parents[3]

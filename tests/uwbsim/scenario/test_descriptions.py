@@ -3,8 +3,8 @@
 import pytest
 
 from docs.site.schema import UNITS, described, reference, unit_of
+from uwbsim.scenario.base import BY_UNIT
 from uwbsim.scenario.faults import Faults
-from uwbsim.scenario.limits import BY_UNIT
 from uwbsim.scenario.model import Scenario
 
 SCHEMAS = {"Scenario": Scenario.model_json_schema(), "Faults": Faults.model_json_schema()}

@@ -6,7 +6,7 @@ import pytest
 
 from uwbsim import Scenario
 from uwbsim.errors import ScenarioError
-from uwbsim.scenario.limits import check_limits, limit_of
+from uwbsim.scenario.base import check_limits, limit_of
 from uwbsim.scenario.loading import load
 
 NOISELESS = (Path(__file__).parents[3] / "scenarios" / "noiseless.toml").read_text()

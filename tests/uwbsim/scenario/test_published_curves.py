@@ -8,8 +8,7 @@ from tests.uwbsim.simulation.test_protocols import bench
 from uwblink import PROTOCOLS
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.prediction import predict
-from uwbsim.scenario.published_curves import SIGMA
-from uwbsim.scenario.radio import Radio
+from uwbsim.scenario.radio import SIGMA, Radio
 from uwbsim.world.radio import lifted
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from uwblink.protocols.table import PROTOCOLS
-from uwbsim.scenario.airtime import before_marker_s, exchange_air_s, frame_s
 from uwbsim.scenario.loading import load
+from uwbsim.scenario.ranging import before_marker_s, exchange_air_s, frame_s
 from uwbsim.simulation import air
 from uwbsim.simulation.run import simulate
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 US = SUBTICKS_PER_SECOND // 1_000_000
 DS = PROTOCOLS["ds"]

@@ -7,12 +7,12 @@ from tests.uwbsim.simulation.test_air import DS, US, columns, played, slot
 from tests.uwbsim.simulation.test_protocols import bench
 from uwblink.ticks import TICK_S, elapsed
 from uwbsim.random_streams import stream
-from uwbsim.scenario.airtime import after_marker_s, before_marker_s
 from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.ranging import after_marker_s, before_marker_s
 from uwbsim.simulation import air
 from uwbsim.simulation.run import simulate
 from uwbsim.simulation.timestamps import draw, draw_reply_s
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 
 def paused(number, at_us, pause_us):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from uwbsim.scenario.model import Scenario
+from uwbsim.simulation.air import schedule
 from uwbsim.simulation.run import simulate
-from uwbsim.simulation.schedule import schedule
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 
 def ring(count=6, **ranging):

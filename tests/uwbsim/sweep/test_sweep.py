@@ -294,7 +294,7 @@ def test_functions_that_other_processes_cannot_import_are_refused(tmp_path, stra
 
 
 def test_without_a_function_and_without_a_distribution_that_offers_one(tmp_path, monkeypatch):
-    monkeypatch.setattr("uwbsim.sweep.extensions.entry_points", lambda **_: ())
+    monkeypatch.setattr("uwbsim.sweep.executors.entry_points", lambda **_: ())
     with pytest.raises(ParameterError, match="no installed distribution offers one"):
         run_sweep(plan(tmp_path, CALIBRATE), tmp_path / "out", workers=1)
     assert not (tmp_path / "out").exists()

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from uwblink import PROTOCOLS, Exchanges, Tag
-from uwbsim.twins.flight import Flight
-from uwbsim.twins.persistence import autocovariance, effective_size, lag_one, lasting, some_rows
+from uwbsim.twins.flight import Flight, autocovariance, effective_size, lag_one, lasting, some_rows
 from uwbsim.twins.reflections import fit_reflections
 
 

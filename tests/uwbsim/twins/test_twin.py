@@ -12,7 +12,7 @@ from tests.uwbsim.twins.worlds import known, world
 from uwblink import Poses, UwblinkError, load
 from uwbsim.cli import main
 from uwbsim.cli.commands import app
-from uwbsim.cli.twins import _print
+from uwbsim.cli.workbench import _print
 
 
 @pytest.fixture(scope="module")

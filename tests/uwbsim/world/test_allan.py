@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from tests.uwbsim.simulation.test_protocols import bench
-from uwbsim.world.clocks import Clocks
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 
 NOMINAL = {
     "white_ppm_sqrt_s": lambda tau: 0.01e-6 / np.sqrt(tau),

@@ -6,9 +6,8 @@ import pytest
 import uwbsim
 from uwblink import Board, raw_range
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwbsim.world.impulse_response import ACCUMULATED, EDGE_TO_PEAK, TAP_S, peak_amplitude
-from uwbsim.world.lookahead import SampledWorld
-from uwbsim.world.world import World
+from uwbsim.world.impulse_response import EDGE_TO_PEAK, TAP_S, peak_amplitude
+from uwbsim.world.world import SampledWorld, World
 
 ROOM = {"min_m": [-4.0, -4.0, 0.0], "max_m": [8.0, 4.0, 3.0], "reflection_loss_db": 6.0}
 LOSS_DB = 36.0
@@ -72,6 +71,16 @@ def test_flights_served_boards_and_sampled_worlds_take_the_same_reflection():
         np.testing.assert_allclose(getattr(sampled(world), name), getattr(link(world), name), atol=1e-9)
 
 
+def test_reflections_have_the_lengths_of_their_two_legs():
+    """By the image method by hand: walls at x = -4 and 8 m, y = -4 and 4 m, floor and ceiling at z = 0 and 3 m."""
+    found = sampled(scenario(places=((0.0, 1.0, 1.0), (4.0, 1.0, 1.0)), room=ROOM))
+    expected = [4.0, 12.0, 12.0, np.hypot(4, 10), np.hypot(4, 6), np.hypot(4, 2), np.hypot(4, 4)]
+    np.testing.assert_allclose(found.paths_m[0], expected, atol=1e-9)
+    powers = -70 - 20 * np.log10(expected) - 6 * (np.arange(7) > 0)
+    np.testing.assert_allclose(found.paths_dbm[0], powers, atol=1e-9)
+    assert found.total_dbm[0] == pytest.approx(10 * np.log10(np.sum(10 ** (powers / 10))), abs=1e-9)
+
+
 def test_echoes_have_the_gains_of_their_own_directions():
     """One dipole above the other: the direct path lies in both nulls, the way by a wall does not."""
     world = scenario(places=((0.0, 0.0, 0.5), (0.0, 0.0, 2.5)), room=ROOM, radio={"antenna": "dipole"})
@@ -112,7 +121,7 @@ def test_impulse_responses_follow_the_power_of_the_link(at_1m_dbm):
     for row in flight.cirs:
         after = np.floor(row.first_path_index).astype(int) + np.arange(1, 4)
         squares = np.sum(np.array(row.magnitudes, dtype=float)[after] ** 2)
-        found.append(10 * np.log10(squares / ACCUMULATED**2) - 121.74)
+        found.append(10 * np.log10(squares / 118**2) - 121.74)
     # Diffuse paths, the firmware's estimate of magnitudes and where the taps lie scatter it.
     assert np.median(found) == pytest.approx(flight.exchanges.fpp2_dbm[0], abs=1.5)
 

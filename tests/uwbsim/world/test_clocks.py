@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tests.uwbsim.simulation.test_protocols import bench
-from uwbsim.world.clocks import LONGEST_RUN_S, Clocks
-from uwbsim.world.true_time import SUBTICKS, SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import LONGEST_RUN_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 
 
 def clocks(skews=(12.0, -7.0), drift=0.01, duration=100.0):

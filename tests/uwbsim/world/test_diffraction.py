@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from uwbsim.scenario.surroundings import Obstacle, Shadow
+from uwbsim.scenario.bodies import Obstacle, Shadow
 from uwbsim.world.diffraction import body_gain, box_cover, covered, edge_gain
 
 WAVELENGTH_M = 299_702_547 / 3993.6e6

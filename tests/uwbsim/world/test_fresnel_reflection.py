@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from uwbsim.scenario.surroundings import properties
-from uwbsim.world.fresnel_reflection import METAL, fresnel, permittivity, roughness_factor
+from uwbsim.scenario.bodies import Material
+from uwbsim.world.diffraction import fresnel, permittivity, roughness_factor
 
 COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 89.0]))
 
@@ -30,7 +30,7 @@ def test_nothing_comes_back_in_the_plane_at_brewsters_angle():
 
 
 def test_metal_gives_all_back():
-    s, p = fresnel(METAL, COSINES[:-1])
+    s, p = fresnel(permittivity("metal"), COSINES[:-1])
     np.testing.assert_allclose(s, -1, atol=2e-3)
     np.testing.assert_allclose(p, 1, atol=2e-3)
 
@@ -38,13 +38,13 @@ def test_metal_gives_all_back():
 @pytest.mark.parametrize(("name", "loss_db"), [("concrete", 7.7), ("drywall", 12.7), ("glass", 7.4), ("metal", 0.0)])
 def test_reflection_loss_of_materials_straight_on(name, loss_db):
     """20 log10((n + 1)/(n - 1)) of their refractive index, whose imaginary part hardly matters."""
-    s, _ = fresnel(permittivity(*properties(name), metal=name == "metal"), np.ones(1))
+    s, _ = fresnel(permittivity(name), np.ones(1))
     assert -20 * np.log10(abs(s[0])) == pytest.approx(loss_db, abs=0.1)
 
 
 def test_a_lossy_material_loses_what_it_says():
     """A wave exp(-j k n z) through a metre of it."""
-    n = np.sqrt(permittivity(80.0, 2.4))
+    n = np.sqrt(permittivity(Material(loss_db_per_m=80.0, index=2.4)))
     wavelength_m = 299_702_547 / 3993.6e6
     assert -20 * np.log10(abs(np.exp(-2j * np.pi / wavelength_m * n))) == pytest.approx(80.0, rel=1e-9)
     assert n.real == pytest.approx(2.4)

@@ -10,9 +10,8 @@ from uwblink.wire.codec import Decoder
 from uwblink.wire.messages import REPORTS, Overheard
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
-from uwbsim.world.lookahead import SampledWorld
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
-from uwbsim.world.world import World
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.world import SampledWorld, World
 
 ROOM = {"min_m": [0.0, 0.0, 0.0], "max_m": [8.0, 6.0, 3.0], "roughness_mm": 0.0}
 A, B = (1.0, 2.0, 1.0), (5.0, 3.5, 1.6)

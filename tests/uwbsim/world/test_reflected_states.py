@@ -9,9 +9,9 @@ from uwblink.wire.codec import Decoder
 from uwblink.wire.messages import REPORTS, Overheard
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.prediction import predict
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import EDGE_TO_PEAK, TAP_S
-from uwbsim.world.reflected_states import ReflectedStates
-from uwbsim.world.true_time import SUBTICKS_PER_SECOND
+from uwbsim.world.pair_states import ReflectedStates
 from uwbsim.world.world import World
 
 PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8)}
@@ -184,8 +184,8 @@ def test_pairs_shares_and_lives_spread_as_asked_for():
         }
     )
     states = ReflectedStates.of(world)
-    which = np.searchsorted(np.arange(1, 780) * states.span_s, states.begin, side="right")
-    shares = np.bincount(which, weights=states.paths.reflected) / np.bincount(which)
+    which = np.searchsorted(np.arange(1, 780) * states.redraws.span_s, states.redraws.begin, side="right")
+    shares = np.bincount(which, weights=states.states[0]) / np.bincount(which)
     # 780 pairs with 1400 paths each.
     assert shares.mean() == pytest.approx(0.2, abs=0.015)
     assert shares.std() == pytest.approx(0.1, rel=0.12)

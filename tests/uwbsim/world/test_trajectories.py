@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import uwbsim
 from uwbsim.random_streams import stream
-from uwbsim.scenario.motion import Carried, RandomFlight, Static, Waypoints
+from uwbsim.scenario.bodies import Carried, RandomFlight, Static, Waypoints
 from uwbsim.world.trajectories import sample
 
 

@@ -1,7 +1,10 @@
-"""A fitted flight as the tables of a scenario."""
+"""A fitted flight as the tables of a scenario, their text, and what the recording could not tell."""
 
 from __future__ import annotations
 
+import json
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -23,6 +26,72 @@ from uwbsim.twins.reflections import ReflectionFit
 from uwbsim.twins.schedules import SHORTEST_LIFE_S, ScheduleFit, plan_rows
 from uwbsim.units import NS, NS_PER_S
 from uwbsim.world.radio import lifted
+
+WIDTH: Final = 120
+DIGITS: Final = 8
+
+
+def scenario_text(table: Mapping[str, Any], head: str) -> str:
+    """Return a scenario file: a comment, and a table each; what is one line is written as one."""
+    parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, WIDTH - 2))]
+    for name, section in table.items():
+        if isinstance(section, list):
+            parts += [f"[[{name}]]\n{_lines(one)}" for one in section]
+        else:
+            short = {key: value for key, value in section.items() if not _is_long(value)}
+            parts.append(f"[{name}]\n{_lines(short)}{_tables(name, section)}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _lines(section: Mapping[str, Any]) -> str:
+    return "\n".join(f"{key} = {_value(value)}" for key, value in section.items())
+
+
+def _tables(name: str, section: Mapping[str, Any]) -> str:
+    return "".join(f"\n\n[{name}.{key}]\n{_lines(value)}" for key, value in section.items() if _is_long(value))
+
+
+def _is_long(value: Any) -> bool:
+    return isinstance(value, Mapping) and len(_value(value)) > WIDTH // 2
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, float):
+        return _number(value)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_value(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return _listed([_value(one) for one in value])
+    return str(value)
+
+
+def _number(value: float) -> str:
+    """Return a number with as many digits as there can be meaning in, and a point."""
+    text = f"{value:.{DIGITS}g}"
+    return text if "." in text or "e" in text else f"{text}.0"
+
+
+def _listed(values: list[str]) -> str:
+    line = f"[{', '.join(values)}]"
+    if len(line) <= WIDTH:
+        return line
+    return "[\n" + textwrap.indent("\n".join(_wrapped(values)), "  ") + "\n]"
+
+
+def _wrapped(values: list[str]) -> list[str]:
+    """Return lines of values; a value that is long itself has one of its own."""
+    lines, line = [], ""
+    for value in values:
+        if len(line) + len(value) + 2 > WIDTH - 2 and line:
+            lines.append(line.rstrip())
+            line = ""
+        line += f"{value}, "
+    return [*lines, line.rstrip()]
+
 
 STILL_M: Final = 0.01
 LEVEL_RAD: Final = 0.01
@@ -285,3 +354,73 @@ def _cut(mine: Poses, origin_ns: int, duration_s: float) -> Poses:
     position = np.column_stack([np.interp(at, times.astype(np.float64), mine.position_m[:, k]) for k in range(3)])
     turns = attitude(mine, str(mine.body[0]), wanted)
     return Poses(wanted, np.full(len(wanted), str(mine.body[0])), position, turns.as_quat())
+
+
+ALWAYS: Final = (
+    "How fast true time runs: rates of clocks are about their mean at the start (skew_ppm), which no range depends on.",
+    "White and flicker noise of clocks (white_ppm_sqrt_s, flicker_ppm: none): in a flight they look like noise of "
+    "stamps and like a walk of the rate.",
+    "Noise of transmissions (tx_noise_ps: none): it is in that of receptions.",
+    "How a delay splits into transmission and reception: 0.44 to 0.56.",
+    "What a reflection does to total power and to impulse responses (total_loss_db, rise_ns).",
+    "The shape of detours: exponential (excess_shape).",
+    "Which of antenna, transmitter and receiver makes a tag's powers weak: what differs between the two directions is "
+    "put on one of transmitter and receiver (the median tag has no difference), and the rest on the antenna.",
+    "Powers that were never heard: sensitivity_dbm is the default or just below the weakest reading; capture_db and "
+    "dynamic_range_db have their defaults.",
+    "Errors of poses: those recorded are taken for true, so what they add is in direct_std_m.",
+    "Walls, obstacles and shadows of bodies: what they do is in antennas, fading and reflections of pairs, and stays "
+    "when bodies take other ways.",
+)
+
+RATIO_BIAS_PPM: Final = 0.02
+Untold = Callable[[Flight, Fitted], bool]
+SOMETIMES: Final[tuple[tuple[Untold, str], ...]] = (
+    (
+        lambda flight, fitted: not len(fitted.noise.std_s),
+        "Noise of stamps apart from that of ranges: only a third message from the target shows it. All noise of ranges "
+        "is taken to last as long as a path (direct_std_m).",
+    ),
+    (
+        lambda flight, fitted: abs(fitted.clocks.ratio_bias_ppm) > RATIO_BIAS_PPM,
+        "Why dt64/dt53 is off by {ratio_bias:+.2g} ppm against the carrier readings: nothing in a scenario makes that.",
+    ),
+    (
+        lambda flight, fitted: fitted.reflections.life_s is None and fitted.reflections.share > 0,
+        "How long reflections last (life_s): a pair ranges again after {interval:.2g} s, and by then nothing is left "
+        "that is seen.",
+    ),
+    (
+        lambda flight, fitted: fitted.reflections.share > 0 and fitted.reflections.share_std == 0,
+        "Whether pairs have different shares of reflections: they differ no more than by chance, and have the same.",
+    ),
+    (
+        lambda flight, fitted: fitted.powers.exponent is None,
+        "The path-loss exponent: all distances are much the same.",
+    ),
+    (
+        lambda flight, fitted: fitted.powers.fading_db >= LEAST_DB and fitted.powers.fading_life_s is None,
+        "How long fading lasts (radio.fading.life_s): a pair ranges again after {interval:.2g} s.",
+    ),
+    (
+        lambda flight, fitted: fitted.powers.reflection_loss_db is None,
+        "How much weaker reflections are: there are too few.",
+    ),
+    (
+        lambda flight, fitted: fitted.powers.pattern_db.shape[1] == 1,
+        "Antennas of tags by direction: each has too few readings.",
+    ),
+    (
+        lambda flight, fitted: fitted.schedule.lost_share == 0,
+        "How many exchanges fail: the recording has no failed ones and no gaps in a round robin.",
+    ),
+)
+
+
+def unknowns(flight: Flight, fitted: Fitted) -> Iterator[str]:
+    """Yield a sentence for everything that keeps its default, or was decided without the recording."""
+    interval = shortest_interval_s(flight)
+    for untold, text in SOMETIMES:
+        if untold(flight, fitted):
+            yield text.format(interval=interval, ratio_bias=fitted.clocks.ratio_bias_ppm)
+    yield from ALWAYS

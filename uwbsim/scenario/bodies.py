@@ -1,0 +1,298 @@
+"""The bodies of a scenario (motion, inertial and height sensors, shadow), and the room and obstacles around them."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
+from uwbsim.units import MM
+
+
+class RandomFlight(Section):
+    """Smooth flight through random points of a box."""
+
+    model: Literal["random-flight"] = Field(description="Smoothly through random points of a box.")
+    box_min_m: Vector = Field(description="Lowest corner of the box.")
+    box_max_m: Vector = Field(description="Highest corner of the box.")
+    speed_mps: Positive = Field(
+        1.0,
+        description="Speed, roughly: that at which it would go straight from each point to the next.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(lo >= hi for lo, hi in zip(self.box_min_m, self.box_max_m, strict=True)):
+            raise ValueError("box_min_m: must be below box_max_m in every direction")
+        return self
+
+
+class Waypoints(Section):
+    """Through points: at times, on a smooth spline; or straight, with limits of speed and acceleration."""
+
+    model: Literal["waypoints"] = Field(description="Through given points.")
+    points_m: tuple[Vector, ...] = Field(description="The points, two or more.")
+    times_s: tuple[float, ...] | None = Field(
+        None,
+        description="When it is at each of them, on a smooth spline; or give speed_mps.",
+    )
+    speed_mps: Positive | None = Field(
+        None,
+        description="Highest speed on straight ways between the points; or give times_s.",
+    )
+    acceleration_mps2: Positive = Field(2.0, description="Highest acceleration on straight ways.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.times_s is None) == (self.speed_mps is None):
+            raise ValueError("times_s: give either times_s or speed_mps")
+        if len(self.points_m) < 2:
+            raise ValueError(f"points_m: found {len(self.points_m)} points, give two or more")
+        if self.times_s is not None:
+            if len(self.times_s) != len(self.points_m):
+                raise ValueError(
+                    f"points_m: found {len(self.points_m)} points at {len(self.times_s)} times, give one time each"
+                )
+            if any(b <= a for a, b in zip(self.times_s, self.times_s[1:], strict=False)):
+                raise ValueError("times_s: must increase")
+        if any(a == b for a, b in zip(self.points_m, self.points_m[1:], strict=False)) and self.times_s is None:
+            raise ValueError("points_m: found the same point twice in a row")
+        return self
+
+
+class Figure(Section):
+    """A structured training figure around a centre, turning all the way: every direction and distance comes up."""
+
+    model: Literal["figure"] = Field(description="A training figure, turning all the way.")
+    shape: Literal["circle", "eight", "helix"] = Field(description="Which figure.")
+    centre_m: Vector = Field(description="Its centre.")
+    radius_m: Positive = Field(description="Its radius.")
+    period_s: Positive = Field(12.0, description="How long one round takes.")
+    climb_m: float = Field(0.0, description="How far its lowest point is below its highest.")
+    phase_deg: float = Field(0.0, description="Where on it the body begins.")
+    turns_per_period: float = Field(1.0, description="How often the body turns about its z axis in a round.")
+
+
+class Static(Section):
+    """A body that does not move, such as an anchor."""
+
+    model: Literal["static"] = Field(description="Does not move, such as an anchor.")
+    position_m: Vector = Field(description="Where it stands.")
+    yaw_deg: float = Field(0.0, description="How far it is turned about the z axis.")
+
+
+class Carried(Section):
+    """A body that stands still in one place after the other, and is carried from each to the next; then stays."""
+
+    model: Literal["carried"] = Field(description="Put in one place after the other.")
+    places_m: tuple[Vector, ...] = Field(description="The places, one or more, in the order of its stays.")
+    stay_s: Positive = Field(description="How long it stands in each place.")
+    carry_s: Positive = Field(10.0, description="How long it is carried from a place to the next.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.places_m:
+            raise ValueError("places_m: found no place, give one or more")
+        return self
+
+
+class Recorded(Section):
+    """A trajectory from a file: TUM, CSV, or the poses of a recording, of `body` there; filled in on reading."""
+
+    model: Literal["recorded"] = Field(description="As a file says.")
+    file: str = Field(description="TUM, CSV, or a recording (.uwb); from the folder of the scenario.")
+    body: str | None = Field(None, description="Which body of the file; needed where it has several.")
+    times_s: tuple[float, ...] = Field((), description="Filled in on reading.")
+    positions_m: tuple[Vector, ...] = Field((), description="Filled in on reading.")
+    quaternions: tuple[tuple[float, float, float, float], ...] = Field(
+        (),
+        description="Filled in on reading: x y z w, body to world.",
+    )
+
+
+Motion = Annotated[RandomFlight | Waypoints | Figure | Static | Carried | Recorded, Field(discriminator="model")]
+
+
+DEGREE: Final = math.pi / 180
+
+
+class Errors(NamedTuple):
+    """Of a gyroscope or accelerometer, in SI units: a constant bias, its walk in a second, noise a root of Hz."""
+
+    bias: float
+    wander: float
+    noise: float
+
+
+GRADES: Final = {
+    "consumer": {"gyro": Errors(0.5 * DEGREE, 0.01 * DEGREE, 0.01 * DEGREE), "force": Errors(0.1, 2e-3, 3e-3)},
+    "industrial": {"gyro": Errors(0.1 * DEGREE, 2e-3 * DEGREE, 5e-3 * DEGREE), "force": Errors(0.03, 5e-4, 1e-3)},
+    "tactical": {"gyro": Errors(5e-3 * DEGREE, 1e-4 * DEGREE, 1e-3 * DEGREE), "force": Errors(0.01, 5e-5, 3e-4)},
+    "perfect": {"gyro": Errors(0.0, 0.0, 0.0), "force": Errors(0.0, 0.0, 0.0)},
+}
+"""Orders of magnitude of data sheets: phones and small drones, better drones, aircraft."""
+
+
+class Imu(Section):
+    """A gyroscope and an accelerometer in the middle of a body, along its axes.
+
+    What is not given follows from the grade. Consumer: 0.5 deg/s and 0.1 m/s^2 of constant bias an axis, 0.01 deg/s and
+    0.003 m/s^2 a root of Hz of noise; industrial: 0.1, 0.03, 0.005, 0.001; tactical: 0.005, 0.01, 0.001, 0.0003. Biases
+    walk, too.
+    """
+
+    grade: Literal["consumer", "industrial", "tactical", "perfect"] = Field(
+        "consumer", description="How good it is: consumer, industrial, tactical or perfect."
+    )
+    rate_hz: Positive = Field(200.0, description="Readings a second.")
+    gyro_bias_dps: NotNegative | None = Field(
+        None, description="Standard deviation of the gyroscope's constant bias an axis, degrees a second."
+    )
+    gyro_noise_dps_per_sqrt_hz: NotNegative | None = Field(
+        None, description="White noise of the gyroscope, degrees a second a root of Hz."
+    )
+    accel_bias_mps2: NotNegative | None = Field(
+        None, description="Standard deviation of the accelerometer's constant bias an axis."
+    )
+    accel_noise_mps2_per_sqrt_hz: NotNegative | None = Field(
+        None, description="White noise of the accelerometer, m/s^2 a root of Hz."
+    )
+    vibration_mps2: NotNegative = Field(
+        0.0, description="What propellers add to each reading of the accelerometer, standard deviation."
+    )
+
+    def errors(self, which: str) -> Errors:
+        """Return the errors of the "gyro" or of the "force", in SI units."""
+        bias, wander, noise = GRADES[self.grade][which]
+        if which == "gyro":
+            own = self.gyro_bias_dps, self.gyro_noise_dps_per_sqrt_hz
+            given = [None if value is None else DEGREE * value for value in own]
+        else:
+            given = [self.accel_bias_mps2, self.accel_noise_mps2_per_sqrt_hz]
+        return Errors(bias if given[0] is None else given[0], wander, noise if given[1] is None else given[1])
+
+
+class Height(Section):
+    """A sensor of the height of a body's middle above the world's zero."""
+
+    rate_hz: Positive = Field(30.0, description="Readings a second.")
+    noise_m: NotNegative = Field(0.02, description="White noise of a reading, standard deviation.")
+    bias_m: NotNegative = Field(0.0, description="Standard deviation of its constant bias.")
+
+
+MATERIALS: Final = {
+    "air": (0.0, 1.0),
+    "drywall": (15.0, 1.6),
+    "wood": (25.0, 1.5),
+    "glass": (40.0, 2.5),
+    "brick": (45.0, 2.0),
+    "concrete": (80.0, 2.4),
+    "person": (60.0, 6.0),
+    "metal": (2000.0, 1.0),
+}
+
+
+"""Loss in dB a metre and refractive index near 4 GHz: round values from ITU-R P.2040-3 (building materials; person as
+wet tissue). Excess delay is (index - 1) times the thickness."""
+
+
+class Material(Section):
+    """What an obstacle is made of: loss in dB a metre, and refractive index."""
+
+    loss_db_per_m: NotNegative = Field(description="Loss of waves on their way through.")
+    index: Annotated[float, Field(ge=1)] = Field(1.0, description="Refractive index.")
+
+
+def _known(material: Any) -> Any:
+    if isinstance(material, str) and material not in MATERIALS:
+        raise ValueError(f"found {material!r}, known are {', '.join(MATERIALS)}")
+    return material
+
+
+KnownMaterial = Annotated[str | Material, AfterValidator(_known)]
+
+
+class Obstacle(Section):
+    """A box that waves go through, at a loss and late. `material` is a name or a table of its own.
+
+    In the geometric model its faces reflect; `roughness_mm` is the standard deviation of their heights.
+    """
+
+    name: str = Field("obstacle", description="What it is called.")
+    min_m: Vector = Field(description="Lowest corner.")
+    max_m: Vector = Field(description="Highest corner.")
+    material: KnownMaterial = Field(description="A known material by its name, or a table of its own.")
+    roughness_mm: NotNegative = Field(
+        3.0,
+        description="Standard deviation of its faces' heights, in the geometric model.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
+            raise ValueError("min_m: must be below max_m in every direction")
+        return self
+
+    def properties(self) -> tuple[float, float]:
+        """Return loss in dB a metre, and refractive index."""
+        return properties(self.material)
+
+    @property
+    def roughness_m(self) -> float:
+        """Return the standard deviation of its surface's heights in metres."""
+        return self.roughness_mm * MM
+
+
+def properties(material: str | Material) -> tuple[float, float]:
+    """Return loss in dB a metre and refractive index of a material, by its name or as given."""
+    if isinstance(material, str):
+        return MATERIALS[material]
+    return material.loss_db_per_m, material.index
+
+
+class Room(Section):
+    """The room: a box, whose six surfaces reflect with `reflection_loss_db` where it is given.
+
+    In the geometric model they reflect as their `material` does, or `floor` and `ceiling` where these are given;
+    `roughness_mm` is the standard deviation of their heights.
+    """
+
+    min_m: Vector = Field(description="Lowest corner.")
+    max_m: Vector = Field(description="Highest corner.")
+    reflection_loss_db: NotNegative | None = Field(
+        None,
+        description="How much weaker surfaces give waves back; they reflect nothing where it is left out. Not in the "
+        "geometric model.",
+    )
+    material: KnownMaterial = Field("concrete", description="Of walls, in the geometric model.")
+    floor: KnownMaterial | None = Field(None, description="Material of the floor, if not that of the walls.")
+    ceiling: KnownMaterial | None = Field(None, description="Material of the ceiling, if not that of the walls.")
+    roughness_mm: NotNegative = Field(
+        3.0,
+        description="Standard deviation of surfaces' heights, in the geometric model.",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
+            raise ValueError("min_m: must be below max_m in every direction")
+        return self
+
+    @property
+    def roughness_m(self) -> float:
+        """Return the standard deviation of its surfaces' heights in metres."""
+        return self.roughness_mm * MM
+
+    def materials(self) -> tuple[str | Material, ...]:
+        """Return those of the six surfaces: two walls across x, two across y, floor and ceiling."""
+        return (*[self.material] * 4, self.floor or self.material, self.ceiling or self.material)
+
+
+class Shadow(Section):
+    """The part of a body that waves do not pass unharmed: an ellipsoid in the body's frame."""
+
+    semi_axes_m: tuple[Positive, Positive, Positive] = Field(description="Semi-axes of the ellipsoid along x, y, z.")
+    centre_m: Vector = Field((0.0, 0.0, 0.0), description="Its centre in the frame of the body.")
+    loss_db_per_m: NotNegative = Field(40.0, description="Loss of waves on their way through.")
