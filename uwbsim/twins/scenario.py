@@ -15,12 +15,10 @@ from uwblink.arrays import Bools, Floats
 from uwblink.recording.schema import Poses
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.linked_files import MOST_POSES
-from uwbsim.scenario.multipath import TwoStateMultipath
-from uwbsim.scenario.radio import Radio
+from uwbsim.scenario.radio import Radio, TwoStateMultipath
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.twins.clocks import ClockFit
-from uwbsim.twins.flight import Flight, attitude
-from uwbsim.twins.persistence import bulk_spread
+from uwbsim.twins.flight import Flight, attitude, bulk_spread
 from uwbsim.twins.powers import PowerFit
 from uwbsim.twins.reflections import ReflectionFit
 from uwbsim.twins.schedules import SHORTEST_LIFE_S, ScheduleFit, plan_rows

@@ -47,7 +47,7 @@ GRID: Final = 42
 LONGEST: Final = 59
 """The longest tents are 2^59 sub-ticks, 8810 s: flicker ends below that frequency, white noise goes on."""
 
-PIECE: Final = 1024
+PIECE: Final = 2048
 """Instants of which all octaves are added up at once: as many numbers as fit into a core's cache."""
 
 WALK_STEP_S: Final = 0.1
@@ -64,9 +64,9 @@ Words = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True)
 class ClockNoise:
-    """The phases of all tags' clocks, rows by a tag's place in the scenario; octaves in columns, lengths 2^30 and up.
+    """The phases of all tags' clocks, in columns by a tag's place in the scenario; octaves in rows, from 2^30 on.
 
-    `keys` seed the hash and `peaks` are the tents' deviations in sub-ticks, (tags, octaves) each; `shift` is where the
+    `keys` seed the hash and `peaks` are the tents' deviations in sub-ticks, (octaves, tags) each; `shift` is where the
     intervals begin, (tags,); `knots` the sum of the long ones at multiples of the grid's step from time zero.
     """
 
@@ -82,11 +82,11 @@ class ClockNoise:
             return None
         drawn = [stream(seed, "clock noise", tag.id) for tag in tags]
         octaves = np.arange(SHORTEST, LONGEST + 1)
-        keys = np.array([rng.integers(0, 1 << 63, len(octaves), dtype=np.uint64) for rng in drawn])
+        keys = np.stack([rng.integers(0, 1 << 63, len(octaves), dtype=np.uint64) for rng in drawn], axis=1)
         # A whole number of steps, so that the grid begins at time zero; less than 2^62, so that no run overflows.
         steps = np.array([rng.integers(0, 1 << (62 - GRID), dtype=np.uint64) for rng in drawn])
         count = int(duration_s * SUBTICKS_PER_SECOND / 2**GRID) + 64
-        peaks = np.array([_peaks(tag, octaves) for tag in tags])
+        peaks = np.stack([_peaks(tag, octaves) for tag in tags], axis=1)
         knots = np.zeros((len(tags), count))
         noise = cls(keys, peaks, steps << np.uint64(GRID), knots)
         time = np.arange(count, dtype=np.int64) << GRID
@@ -114,8 +114,8 @@ class ClockNoise:
         at = time.astype(np.uint64) + self.shift[tag]
         index = at >> exponents[:, None]
         into = (at - (index << exponents[:, None])).astype(np.float64) * np.exp2(-exponents.astype(np.float64))[:, None]
-        height = _normal(index, self.keys[tag, octaves].T) * self.peaks[tag, octaves].T
-        return np.asarray(np.add.accumulate(height * (1 - np.abs(2 * into - 1)), axis=0)[-1])
+        height = _normal(index, self.keys[octaves][:, tag]) * self.peaks[octaves][:, tag]
+        return np.asarray(np.sum(height * (1 - np.abs(2 * into - 1)), axis=0))
 
     def _trend(self, place: int, tag: Tag, rng: np.random.Generator, time: Ints) -> Floats:
         """Return the random walk of white noise from one of the longest intervals to the next, linear in between."""

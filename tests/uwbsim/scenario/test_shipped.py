@@ -8,11 +8,11 @@ import pytest
 
 import uwbsim
 from tests import processes
-from uwbsim.scenario import copy_scenarios, listed, shipped, shipped_scenarios
+from uwbsim.scenario import copy_scenarios, listed, loading, shipped_scenarios
 
 
 def test_the_examples_run():
-    assert doctest.testmod(shipped).failed == 0
+    assert doctest.testmod(loading).failed == 0
 
 
 def test_every_one_is_told_of():
