@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
+from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
 from calib.estimator.rows import projected
@@ -73,7 +74,7 @@ def sandwich(
             if size > largest:
                 best, largest, chosen, several = matrix, size, length * seconds / blocks, count
     count = len(rows)
-    used = float(np.sum(optimum.covariance * optimum.information))
+    used = trace_of_product(optimum.covariance, optimum.information)
     fresh = count / max(count - used, 0.2 * count)
     prior = reach.T @ optimum.priors.precision() @ reach
     return Covariance(matrix=fresh * best + prior, block_s=chosen, stretches=several)

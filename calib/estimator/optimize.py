@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
+from calib.estimator.inverse import Inverse, Matrix, inverse_of
 from calib.estimator.rows import Rows, sum_rows
 from calib.estimator.unknowns import Layout, Priors
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Floats
 
 SETTLED = 1e-2
 """A step that promises less log likelihood than this moves no unknown by more than a tenth of its standard error."""
@@ -33,8 +33,8 @@ class Optimum:
     layout: Layout
     priors: Priors
     x: Floats
-    covariance: Floats
-    information: Floats
+    covariance: Inverse
+    information: Matrix
     value: float
     steps: int
     success: bool
@@ -61,7 +61,6 @@ def maximize(
     """
     layout, free = priors.layout, priors.layout.free()
     best, top, step, shorter, length, promised = -np.inf, x, np.zeros_like(x), 0, 1.0, 0.0
-    sums, covariance = None, np.zeros((len(x),) * 2)
     for taken in range(1, steps + 1):
         found = sum_rows(rows, x)
         value = found.value + priors.value(x)
@@ -105,30 +104,8 @@ def maximize(
         priors=priors,
         x=top,
         covariance=covariance,
-        information=sums.information if sums else covariance,
+        information=sums.information,
         value=best,
         steps=steps,
         success=False,
     )
-
-
-def inverse_of(matrix: Floats, free: Ints) -> Floats:
-    """Return the inverse (p, p) of a positive definite matrix among the free unknowns, zero elsewhere.
-
-    Unknowns are scaled to the same size first; what neither rows nor priors determine is held by a share of 1e-13.
-    """
-    found = np.zeros_like(matrix)
-    if not len(free):
-        return found
-    own = matrix[np.ix_(free, free)]
-    scale = 1 / np.sqrt(np.maximum(np.diag(own), 1e-300))
-    unit = own * scale[:, None] * scale
-    unit[np.diag_indices_from(unit)] += 1e-13
-    try:
-        factor = linalg.cho_factor(unit, lower=True, check_finite=False)
-        inverse = linalg.cho_solve(factor, np.eye(len(free)), check_finite=False)
-    except linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(unit)
-        inverse = (vectors / np.maximum(np.abs(values), 1e-13)) @ vectors.T
-    found[np.ix_(free, free)] = inverse * scale[:, None] * scale
-    return found

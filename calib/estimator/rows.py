@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 from scipy import sparse
 
+from calib.estimator.inverse import MOST_DENSE, Matrix
 from calib.estimator.unknowns import Layout
 from uwblink.arrays import Floats, Ints
 
@@ -58,17 +59,18 @@ class Rows(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """Log likelihood of all rows, its slope (p,), and what the rows know of the unknowns (p, p)."""
+    """Log likelihood of all rows, its slope (p,), and what the rows know of the unknowns (p, p), sparse for many."""
 
     value: float
     gradient: Floats
-    information: Floats
+    information: Matrix
 
 
 def sum_rows(rows: Sequence[Rows], x: Floats, *, information: bool = True) -> Sums:
     """Sum over all rows at unknowns (p,); without `information` that is zero."""
     size, value = len(x), 0.0
-    gradient, square = np.zeros(size), np.zeros(size * size if information else 0)
+    many = size > MOST_DENSE
+    gradient, square = np.zeros(size), np.zeros(size * size if information and not many else 0)
     loose: list[sparse.csr_matrix] = []
     for kind in rows:
         for terms in kind.terms(x):
@@ -80,11 +82,16 @@ def sum_rows(rows: Sequence[Rows], x: Floats, *, information: bool = True) -> Su
             entries = terms.slopes if terms.entries is None else terms.entries
             weighed = entries if terms.weight is None else entries * terms.weight
             if entries.shape[1] >= LONG_BLOCKS * len(terms.columns):
-                products = _block_products(weighed, entries, terms.starts)
-                place = terms.columns[:, :, None] * size + terms.columns[:, None, :]
-                np.add.at(square, place.ravel(), products.ravel())
+                products = _block_products(weighed, entries, terms.starts).ravel()
+                place = (terms.columns[:, :, None] * size + terms.columns[:, None, :]).ravel()
+                if many:
+                    loose.append(sparse.csr_matrix((products, divmod(place, size)), shape=(size, size)))
+                else:
+                    np.add.at(square, place, products)
             else:
                 loose.append(terms.as_matrix(weighed, size).T @ terms.as_matrix(entries, size))
+    if many and information:
+        return Sums(value, gradient, sparse.csc_matrix(sum(loose, sparse.csr_matrix((size, size)))))
     found = square.reshape((size, size) if information else (0, 0))
     for part in loose:
         found += part.toarray()

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from calib.errors import BadInputError
+from calib.estimator.inverse import MOST_DENSE, Inverse, Matrix, trace_of_product
 from calib.information import Unknown as NamedUnknown
 from uwblink.arrays import Bools, Floats, Ints
 
@@ -23,13 +24,15 @@ from uwblink.arrays import Bools, Floats, Ints
 class Prior:
     """A Gaussian prior with the precision `weight` times `structure` (k, k), about `centre` (k,).
 
-    `structure` None is the identity. With `bounds` the weight is estimated between them, starting at `weight`.
+    `structure` None is the identity; that of many unknowns is sparse, and made of as many independent rows as `rows`
+    says. With `bounds` the weight is estimated between them, starting at `weight`.
     """
 
     weight: float
-    structure: Floats | None = None
+    structure: Floats | sparse.csc_matrix | None = None
     centre: Floats | float = 0.0
     bounds: tuple[float, float] | None = None
+    rows: int | None = None
 
     @classmethod
     def of_deviation(cls, deviation: float, centre: Floats | float = 0.0) -> Prior:
@@ -44,7 +47,9 @@ class Prior:
     @property
     def rank(self) -> int | None:
         """Return the rank of the structure, None for the identity."""
-        return None if self.structure is None else int(np.linalg.matrix_rank(self.structure, hermitian=True))
+        if self.rows is not None or not isinstance(self.structure, np.ndarray):
+            return self.rows
+        return int(np.linalg.matrix_rank(self.structure, hermitian=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,22 +124,22 @@ class Priors:
         self.weights = [prior.weight for _, prior in self.all] if weights is None else list(weights)
         self._ranks = [prior.rank for _, prior in self.all]
 
-    def precision(self) -> Floats:
-        """Return the precision of all priors (p, p)."""
-        found = np.zeros((self.layout.size,) * 2)
+    def precision(self) -> Matrix:
+        """Return the precision of all priors (p, p); a sparse one for many unknowns."""
+        size = self.layout.size
+        if size > MOST_DENSE:
+            entries = [
+                (weight * own.data, own.row + where.start, own.col + where.start)
+                for weight, (where, prior) in zip(self.weights, self.all, strict=True)
+                for own in [sparse.coo_matrix(_structure(prior, where))]
+            ]
+            value, row, column = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*entries, strict=True))
+            return sparse.csc_matrix((value, (row.astype(np.int64), column.astype(np.int64))), shape=(size, size))
+        found = np.zeros((size, size))
         for weight, (where, prior) in zip(self.weights, self.all, strict=True):
-            found[where, where] += weight * _structure(prior, where)
+            structure = _structure(prior, where)
+            found[where, where] += weight * (structure if isinstance(structure, np.ndarray) else structure.toarray())
         return found
-
-    def sparse_precision(self) -> sparse.csc_matrix:
-        """Return the same as a sparse matrix, for many unknowns."""
-        blocks = {block.kind: sparse.csc_matrix((len(block.start),) * 2) for block in self.layout.blocks}
-        at = iter(self.weights)
-        for block in self.layout.blocks:
-            for prior in block.priors:
-                own = sparse.eye(len(block.start)) if prior.structure is None else sparse.csc_matrix(prior.structure)
-                blocks[block.kind] = blocks[block.kind] + next(at) * own
-        return sparse.csc_matrix(sparse.block_diag(list(blocks.values()), format="csc"))
 
     def value(self, x: Floats) -> float:
         """Return the log density of the priors at unknowns (p,), less its constant."""
@@ -151,15 +156,15 @@ class Priors:
             found[where] -= weight * _times(prior, x[where] - prior.centre)
         return found
 
-    def update(self, x: Floats, covariance: Floats) -> None:
+    def update(self, x: Floats, covariance: Inverse) -> None:
         """Estimate the weights that may be, from unknowns (p,) and their covariance (p, p)."""
         for k, (where, prior) in enumerate(self.all):
             if prior.bounds is None:
                 continue
-            own, away = covariance[where, where], x[where] - prior.centre
-            structure = _structure(prior, where)
+            away, structure = x[where] - prior.centre, _structure(prior, where)
             rank = len(away) if self._ranks[k] is None else self._ranks[k]
-            used = max(float(rank or 0) - self.weights[k] * float(np.sum(own * structure)), 1e-2)
+            left = float(rank or 0) - self.weights[k] * trace_of_product(covariance, structure, where)
+            used = max(left, 1e-2)
             size = max(float(away @ structure @ away), 1e-300)
             self.weights[k] = float(np.clip(used / size, *prior.bounds))
 
@@ -170,7 +175,7 @@ class Priors:
         return float(weights[-1] ** -0.5)
 
 
-def _structure(prior: Prior, where: slice) -> Floats:
+def _structure(prior: Prior, where: slice) -> Matrix:
     return np.eye(where.stop - where.start) if prior.structure is None else prior.structure
 
 
