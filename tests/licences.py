@@ -130,11 +130,13 @@ ELSEWHERE: Final = {
 
 
 def table(found: list[tuple[str, str, str]]) -> str:
-    """Return the rows as a table in Markdown."""
-    lines = ["| distribution | licence | installed |", "|---|---|---|"]
+    """Return the rows as a table in Markdown: a line for each licence and way to be installed."""
     notes = {name: f" ({told})" for name, told in JUDGED.items()}
-    lines += [f"| {name} | {licence}{notes.get(name, '')} | {purpose} |" for name, licence, purpose in found]
-    return "\n".join(lines)
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name, licence, purpose in found:
+        groups.setdefault((purpose, licence + notes.get(name, "")), []).append(name)
+    lines = [f"| {purpose} | {licence} | {', '.join(names)} |" for (purpose, licence), names in sorted(groups.items())]
+    return "\n".join(["| installed | licence | distributions |", "|---|---|---|", *lines])
 
 
 def allowed(name: str, licence: str) -> bool:

@@ -6,9 +6,10 @@ import pytest
 
 from tests.licences import JUDGED, LINKED, LOCK, PAGE, allowed, names_of
 
-ROWS = re.findall(
-    r"^\| (\S+) \| (.*?)(?: \([^|]*\))? \| ([^|]+) \|$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE
+LINES = re.findall(
+    r"^\| ([^|]+) \| (.*?)(?: \([^|]*\))? \| ([^|]+) \|$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE
 )[1:]
+ROWS = sorted((name, licence, purpose) for purpose, licence, names in LINES for name in names.split(", "))
 
 
 def test_the_page_lists_what_the_lock_does():
