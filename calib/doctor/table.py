@@ -276,12 +276,6 @@ LEVEL: Final = BUDGET / sum(not check.certain for check in CHECKS)
 """p-value below which a check's fault is told: each has an equal share of the budget."""
 
 
-def rows() -> list[str]:
-    """Return the table in Markdown."""
-    head = ["| question | faults | statistic | distribution on sound data |", "|---|---|---|---|"]
-    return head + [f"| {c.question} | {', '.join(c.remedies)} | {c.statistic} | {c.sound} |" for c in CHECKS]
-
-
 def certain(seen: Seen) -> bool:
     """Return whether what was seen is a finding."""
     return seen.p_value < LEVEL

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from calib.calibration.file_keys import FILE_KEYS as CALIBRATION
 from calib.cli.commands import app as calib_app
-from docs.site import commands, doors, file_keys, schema
+from docs.site import checks, commands, doors, file_keys, schema
 from uwblink.boards.ranging_plan import FILE_KEYS as PLAN
 from uwblink.cli.commands import app as uwblink_app
 from uwblink.importers.column_map import FILE_KEYS as COLUMN_MAP
@@ -26,6 +26,7 @@ PAGES: Final[dict[str, Callable[[], str]]] = {
     "plan": lambda: file_keys.reference(PLAN),
     "sweep": lambda: file_keys.reference(SWEEP),
     "calibration": lambda: file_keys.reference(CALIBRATION),
+    "checks": checks.reference,
     "uwbsim": lambda: commands.reference(uwbsim_app, "uwbsim"),
     "uwblink": lambda: commands.reference(uwblink_app, "uwblink"),
     "calib": lambda: commands.reference(calib_app, "calib"),

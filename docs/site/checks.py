@@ -1,0 +1,27 @@
+"""The table of the doctor's checks, out of the code that makes them."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from calib.doctor.table import CHECKS
+
+HEAD: Final = "| question | statistic; distribution on sound data | faults, and what to do |\n|---|---|---|"
+
+
+def reference() -> str:
+    """Return the Markdown of the checks, with each fault's remedy."""
+    rows = [
+        f"| {check.question} | {check.statistic}; {check.sound} | "
+        f"{'<br>'.join(f'**{fault}**: {_plain(remedy)}' for fault, remedy in check.remedies.items())} |"
+        for check in CHECKS
+    ]
+    return "\n".join([HEAD, *rows])
+
+
+def _plain(remedy: str) -> str:
+    """Return a remedy with its fields in capitals, as in help texts."""
+    if remedy == "{more}":
+        return "depends on the recording; the finding says it"
+    return re.sub(r"\{(\w+)\}", lambda found: found[1].upper(), remedy).replace("|", "\\|")
