@@ -106,10 +106,10 @@ bench-hours: setup ## record eight hours in virtual time, then all commands on 5
 bench-import: setup ## measure how long tables and poses take to come in (2 minutes, 1 GB)
 	$(BIN)/python -m benchmarks.importing
 
-trajectories: setup ## fits without known distances over 50 seeds a world, into docs/fit-from-ranges.md (30 minutes)
+trajectories: setup ## fits without known distances over 50 seeds a world, into docs/accuracy.md (30 minutes)
 	$(BIN)/python -m benchmarks.trajectories --write
 
-plans: setup ## plans of flights beside fits of them, into docs/planning.md (15 minutes)
+plans: setup ## plans of flights beside fits of them, into docs/accuracy.md (15 minutes)
 	$(BIN)/python -m benchmarks.plans --write
 
 golden: setup ## fit some forty cases again and compare with tests/golden/fits.json (5 minutes)
@@ -118,7 +118,7 @@ golden: setup ## fit some forty cases again and compare with tests/golden/fits.j
 accuracy: setup ## write docs/accuracy.md: 200 seeds, planted beside fitted (15 minutes)
 	$(BIN)/python -m benchmarks.accuracy
 
-campaigns: setup ## what a training flight needs, into docs/tutorials/motion-capture.md (5 minutes)
+campaigns: setup ## what a training flight needs, into docs/motion-capture.md (5 minutes)
 	$(BIN)/python -m benchmarks.campaigns
 
 worlds: setup ## fits in worlds that share nothing with the simulator, into docs/accuracy.md (20 minutes)
@@ -127,7 +127,7 @@ worlds: setup ## fits in worlds that share nothing with the simulator, into docs
 places: setup ## fits where errors belong to places, into docs/accuracy.md (20 minutes)
 	$(BIN)/python -m benchmarks.rooms --write
 
-surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/without-motion-capture.md (10 minutes)
+surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/accuracy.md (10 minutes)
 	$(BIN)/python -m benchmarks.surveys --write
 
 doctor-table: setup ## write docs/doctor.md's table: planted faults, hits and false alarms (15 minutes)
@@ -139,7 +139,7 @@ bench-boards: setup ## measure driver, recorder and served boards (5 minutes)
 twins: setup ## how well twins of simulated recordings find what was planted, over six seeds (3 minutes)
 	$(BIN)/python -m benchmarks.twins --seeds 6
 
-fidelity: setup ## write docs/fidelity.md, simulated beside measured
+fidelity: setup ## write a section of docs/accuracy.md, simulated beside measured
 	$(BIN)/python -m benchmarks.fidelity
 
 endurance: setup ## kill the recorder 50 times, and serve boards for 10 minutes

@@ -1,6 +1,6 @@
 """What a training flight needs: length, room, motion and pairs, planted beside fitted, into a tutorial's table.
 
-`python -m benchmarks.campaigns` writes it into docs/tutorials/motion-capture.md. Every flight is that of
+`python -m benchmarks.campaigns` writes it into docs/motion-capture.md. Every flight is that of
 scenarios/icra2023/train.toml with one thing changed; what it gives is judged on the test flight, which is not changed.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 import calib
 import uwbsim
 
-PAGE: Final = Path("docs/tutorials/motion-capture.md")
+PAGE: Final = Path("docs/motion-capture.md")
 FLIGHTS: Final = Path("scenarios/icra2023")
 LENGTH_S: Final = 60.0
 COLUMNS: Final = (

@@ -416,9 +416,9 @@ def row(case: Case, seeds: range) -> tuple[str, int, int]:
     wrong = Counter(fault for one in found for fault in one - case.expected - case.also)
     alarms = sum(bool(one - case.expected - case.also) for one in found)
     also = Counter(fault for one in found for fault in one & case.also)
-    told = ", ".join(f"{fault} ({n})" for fault, n in wrong.most_common()) or "nothing"
+    told = ", ".join(f"{fault} ({n})" for fault, n in wrong.most_common())
     true = ", ".join(f"{fault} ({n})" for fault, n in also.most_common())
-    named_by = " or ".join(sorted(case.expected)) or "nothing"
+    named_by = " or ".join(sorted(case.expected))
     share = f"{hits} of {len(found)}" if case.expected else ""
     return f"| {case.name} | {named_by} | {share} | {told} | {true} |", hits, alarms
 
@@ -434,10 +434,10 @@ def table(first: int) -> str:
     alarms, hits = sum(one[2] for one in clean), sum(one[1] for one in faulty)
     planted = sum(len(seeds) for _, seeds in jobs[len(CLEAN) :])
     beside = sum(one[2] for one in faulty)
-    head = "| recording | should be named | named | said beside | said, and there |\n|---|---|---|---|---|"
+    head = "| planted | expected finding | found | false | further, true |\n|---|---|---|---|---|"
     return "\n".join([
-        f"Nothing planted: {alarms} of {runs} recordings with a false alarm ({100 * alarms / runs:.1f} %). Planted: "
-        f"{hits} of {planted} named ({100 * hits / planted:.0f} %), {beside} with something else said beside.",
+        f"Sound recordings: {alarms} of {runs} with a false alarm ({100 * alarms / runs:.1f} %). Planted faults: "
+        f"{hits} of {planted} found ({100 * hits / planted:.0f} %), {beside} with a false finding besides.",
         "", head,
         *(one[0] for one in clean), *(one[0] for one in faulty),
     ])  # fmt: skip

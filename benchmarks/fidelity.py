@@ -1,7 +1,8 @@
-"""Write docs/fidelity.md: what simulated recordings look like beside measured ones (`make fidelity`)."""
+"""Write a section of docs/accuracy.md: simulated recordings beside measured ones (`make fidelity`)."""
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,19 +28,14 @@ from uwbsim.simulation.run import simulate
 from uwbsim.simulation.simulated import Simulated
 
 ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "accuracy.md"
 ICRA = ROOT / "scenarios" / "icra2023"
 BENCH = ROOT / "scenarios" / "two_boards_on_a_bench" / "bench.toml"
 CLOCKS = "range noise of clocks with white noise of 0.01 ppm sqrt(s): DS, SS (mm)"
 ALOHA = ROOT / "scenarios" / "collisions" / "aloha.toml"
 
-HEAD = """# Fidelity
-
-What a simulated recording looks like beside measured ones. This page is written by `make fidelity`; do not edit it.
-
-Measured figures: the boards' timing and grids from 1833 exchanges of real boards (MILUV), raw and residual errors from Shalaby et al., ICRA 2023, sections V and VI, errors by power from 17 118 training samples published with it,
-dependence from the 317 exchanges of one MILUV flight among obstacles (cirObstacles_3_random_0). Simulated: the flights of `scenarios/icra2023`; errors by power those of the training flight with its planted delays taken out.
-
-A figure is *built in* where the program follows the boards' arithmetic, *tuned* where a setting was chosen to hit it, and *predicted* where it follows from other settings.
+BEGIN, END = "<!-- fidelity -->", "<!-- end of fidelity -->"
+HEAD = """`make fidelity`. Measured: 1833 exchanges of real boards (MILUV); raw and residual errors of Shalaby et al., ICRA 2023, sections V and VI; 17 118 samples published with the paper; 317 exchanges of one MILUV flight among obstacles. Simulated: the flights of `scenarios/icra2023`. A figure is *built in* if the program follows the boards' arithmetic, *tuned* if a setting was chosen to hit it, *predicted* if it follows from other settings.
 
 | what | measured | simulated | how |
 |---|---|---|---|
@@ -61,38 +57,18 @@ def main() -> None:
         *clock_rows(),
         *detour_rows(),
     ]
-    text = HEAD + _table(rows) + TWIN + _table(twin_rows()) + NOTES
-    (ROOT / "docs" / "fidelity.md").write_text(text, encoding="utf-8")
+    text = HEAD + _table(rows) + TWIN + _table(twin_rows())
+    page = PAGE.read_text(encoding="utf-8")
+    block = f"{BEGIN}\n{text}{END}"
+    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.DOTALL), encoding="utf-8")
     print(text)
 
 
 TWIN = """
-## The real flight beside its twin
-
-`uwbsim twin` fitted a scenario to the MILUV flight among obstacles, with the delays and curves published for its boards; 317 exchanges beside 3 simulated flights of as many. All of it was *tuned* to this very flight, so it shows what the
-simulator can express, and predicts nothing; alike is what chance explains at 1 %.
+**A recorded flight and its twin.** `uwbsim twin` fitted a scenario to the MILUV flight. Everything is tuned to this flight, so the table shows what the simulator can express and predicts nothing.
 
 | quantity: 10 %, median, 90 % | measured | its twin | autocorrelation to the pair's next | largest difference of shares | |
 |---|---|---|---|---|---|
-"""
-
-NOTES = """
-What is not alike, or not known:
-
-- The icra2023 flights plant the core of the errors and one tail, fitted together to the published samples: power readings that saturate at -80 dBm (half of the samples lie within 3 dB of it), curves of bias and standard deviation of the core,
-  and reflections of 14 % with 35 cm on average, so that raw errors come out as in the paper. Antenna delays are the published ones. Their tail is the same at all powers; the samples' is heavier in the middle than at the ends.
-- In the samples reflected ranges are not weaker: fitted to them, their first path has 0.4 dB less power; in the MILUV flight it has more. So power tells no reflection there (total less first-path power alone has an AUC of a half), but the rise time does: before what the chip takes
-  for the first path there is a weaker one below its threshold. That feature was chosen with the flight in view (from where the response leaves the noise to the first path's own peak; the distance from the first path to the strongest tap has an AUC of 0.38), its weight was learnt in simulated rooms alone. With 27 ranges beyond 30 cm an AUC is known to 0.06.
-- The geometric channel has one reflection by each surface, not two in a row: what bounces further is in its scatterers, whose strength was chosen to hit the total powers of the MILUV flight. Noise and threshold of its responses are that flight's, too: 0.9 % of the strongest tap and more where signals are weak, first paths
-  down to 18 dB below the strongest tap, placed where their edge has half its height. Behind obstacles the ways by walls and scatterers lose what the obstacle takes, with hard edges; soft ones have the direct way and bodies.
-- In the MILUV flight the carrier readings of the two boards do not add up with the ratio of their intervals: by 0.11 ppm, which no setting of the simulator has.
-- The MILUV flight was among obstacles, which the icra2023 flights have none of: it has twice the errors beyond 30 cm.
-- How long reflections last was not measured: pairs of the MILUV flight come 5 to 12 times in 78 s. The icra2023 flights have 0.15 s, about the time in which a quadcopter at 1 m/s moves by two wavelengths; `scenarios/lasting_reflections` has
-  seconds, and was fitted to nothing.
-- Success against the number of initiators was not measured on boards; the simulated figures follow from frame durations, capture and preamble time-out.
-- The boards' receive noise was measured among obstacles; in the icra2023 scenarios all noise is in the curve of standard deviation.
-- Capture (6 dB) and the first-path detector's dynamic range (15 dB) are typical values, not measured ones; materials are round values from ITU-R P.2040-3.
-- The chip is not said to go deaf after a reception error without a reset. What temperature and voltage do to delays is the manual's typical figure, without a sign there.
 """
 
 

@@ -1,4 +1,4 @@
-"""The rows of docs/fidelity.md on responses: what tells a detour, in simulated rooms and in a real flight."""
+"""The rows of docs/accuracy.md on responses: what tells a detour, in simulated rooms and in a real flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of simulated flights beside measured ones, for docs/fidelity.md: by power, by pair, and of a twin."""
+"""Errors of simulated flights beside measured ones, for docs/accuracy.md: by power, by pair, and of a twin."""
 
 from __future__ import annotations
 

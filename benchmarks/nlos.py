@@ -1,6 +1,6 @@
 """Which ranges went by a detour, told from impulse responses: what simulated rooms teach of a real flight.
 
-Run as a script it prints figures of docs/fidelity.md; the tests use the same functions.
+Run as a script it prints figures of docs/accuracy.md; the tests use the same functions.
 """
 
 from __future__ import annotations

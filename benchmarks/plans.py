@@ -1,4 +1,4 @@
-"""Plans of flights beside fits of them: what was promised, and what errors came out over seeds; a table of planning.md.
+"""Plans of flights beside fits of them over seeds: promised and actual errors; a table of docs/accuracy.md.
 
 The worlds are those of `benchmarks.trajectories`, which share nothing with plan or fit. A plan is made of a recording
 of the flight (the first seed; positions and attitudes as they are recorded, ranges are not looked at), and of robots
@@ -24,7 +24,7 @@ from tests.calib.trajectories.sines import flight
 from uwblink import KnownDistance
 
 ROOT: Final = Path(__file__).parents[1]
-PAGE: Final = ROOT / "docs" / "planning.md"
+PAGE: Final = ROOT / "docs" / "accuracy.md"
 TWO_SIDED: Final = 1.959963984540054
 ROOM: Final[dict[str, Any]] = {"size_m": (7.0, 7.0, 3.0), "apart_m": 0.68, "speed_m_s": 0.7}
 FOUR: Final = (11, 12, 13, 14)

@@ -1,6 +1,6 @@
 """Surveys of boards that stand still, over many seeds: errors of delays beside what was promised, and coverage.
 
-`python -m benchmarks.surveys --write` writes the table of docs/without-motion-capture.md (`make surveys`). With
+`python -m benchmarks.surveys --write` writes the table of docs/accuracy.md (`make surveys`). With
 `--results FILE` outcomes are kept, a line each, and what stands there is not surveyed again.
 """
 
@@ -28,7 +28,7 @@ from calib.planning.having import having
 from calib.planning.promise import promises
 from uwblink.arrays import Floats
 
-PAGE = Path(__file__).parents[1] / "docs" / "without-motion-capture.md"
+PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
 C_M_PER_NS = 0.299702547
 PAIR_M = 0.02
 LINE: dict[str, Any] = {"shape": "line", "boards": 5, "arrangements": 8}

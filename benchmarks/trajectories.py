@@ -1,4 +1,4 @@
-"""How well delays are found without known distances, planted beside fitted, over seeds: tables of fit-from-ranges.md.
+"""How well delays are found without known distances, planted beside fitted, over seeds: a table of docs/accuracy.md.
 
 Worlds of `tests.calib.trajectories.sines` share nothing with the fit or the simulator: bodies on sums of sines, ranges
 by plain geometry, attitudes and known places with errors. Those of scenarios are the simulator's, each seed another
@@ -27,7 +27,7 @@ import uwbsim
 from tests.calib.trajectories.sines import flight
 
 ROOT: Final = Path(__file__).parents[1]
-PAGE: Final = ROOT / "docs" / "fit-from-ranges.md"
+PAGE: Final = ROOT / "docs" / "accuracy.md"
 CORNERS: Final = [[3.5, 3.5, 0.3], [-3.5, 3.5, 2.6], [-3.5, -3.5, 0.5], [3.5, -3.5, 2.5]]
 ERRING: Final = {"wander_deg": 3.0, "tilt_deg": 1.0, "place_noise_m": 0.02}
 IMU: Final = {"grade": "consumer", "vibration_mps2": 1.0}
@@ -235,8 +235,8 @@ def main(argv: list[str]) -> int:
                 sys.stdout.flush()
     if given.write:
         page = PAGE.read_text(encoding="utf-8")
-        table = "\n".join(["<!-- flights -->", *lines, "<!-- end of flights -->"])
-        page = re.sub(r"<!-- flights -->.*<!-- end of flights -->", lambda _: table, page, flags=re.DOTALL)
+        table = "\n".join(["<!-- trajectories -->", *lines, "<!-- end of trajectories -->"])
+        page = re.sub(r"<!-- trajectories -->.*<!-- end of trajectories -->", lambda _: table, page, flags=re.DOTALL)
         PAGE.write_text(page, encoding="utf-8")
     return 0
 

@@ -1,4 +1,4 @@
-"""How well twins of simulated recordings find what was planted (`make twins`): a table over seeds, as in docs/twin.md.
+"""How well twins of simulated recordings find what was planted (`make twins`): as in docs/accuracy.md.
 
 The world is of this file alone: nothing in `uwbsim.twins` was chosen on it but how offsets of tags are told from their
 antennas. Two robots and three anchors, pairs whose

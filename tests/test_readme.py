@@ -18,7 +18,7 @@ from tests import processes
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-BOARDS = (ROOT / "docs" / "tutorials" / "boards.md").read_text(encoding="utf-8")
+BOARDS = (ROOT / "docs" / "boards.md").read_text(encoding="utf-8")
 NUMBER = r"[+-]?\d+\.\d+|\d+"
 BIN = Path(sys.executable).parent
 TRAIN = "scenarios/icra2023/train.toml"

@@ -35,7 +35,7 @@ GUESS_NS: Final = 0.2
 LOOSEST: Final = 0.5
 """A direction of delays counts as determined if it is known to half of so much (3 cm of range), by standard error.
 
-Calibrated by simulation (docs/fit-from-ranges.md): intervals beyond were seen not to hold.
+Calibrated by simulation (docs/theory.md): intervals beyond were seen not to hold.
 """
 
 GROWTH: Final = 3.0
@@ -43,7 +43,7 @@ GROWTH: Final = 3.0
 
 ALONE: Final = 3.0
 """By geometry alone a fit is linear no further: errors of up to 4.2 of its standard errors were seen, which are so many
-times as large there as linear propagation has them (docs/fit-from-ranges.md)."""
+times as large there as linear propagation has them (docs/theory.md)."""
 
 LOOKED_AT: Final = 400
 

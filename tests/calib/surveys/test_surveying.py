@@ -197,7 +197,7 @@ def test_errors_that_last_within_an_arrangement_widen_intervals():
 
 def test_few_arrangements_widen_intervals_by_students_quantile():
     result = calib.survey(standing_boards(5, boards=3, arrangements=3).ranges, known="line")
-    # What is known of pairs' errors beforehand counts as three degrees of freedom (docs/without-motion-capture.md).
+    # What is known of pairs' errors beforehand counts as three degrees of freedom (docs/theory.md).
     freedom = result.calibration.provenance["rests_on"]["freedom"] + 3
     wider = student.ppf(0.975, freedom) / norm.ppf(0.975)
     assert wider > 1.05

@@ -1,4 +1,4 @@
-"""The ROS 2 node of docs/streaming.md, against a stand-in for rclpy that takes what the real one takes and no more."""
+"""The ROS 2 node of docs/boards.md, against a stand-in for rclpy that takes what the real one takes and no more."""
 
 import re
 import types
@@ -12,7 +12,7 @@ import uwblink
 from tests.boards import bench_scenario
 from uwbsim.boards.virtual_port import VirtualPorts
 
-PAGE = Path(__file__).parents[3] / "docs" / "streaming.md"
+PAGE = Path(__file__).parents[3] / "docs" / "boards.md"
 
 
 class Stamp:
@@ -87,7 +87,7 @@ def node():
     (text,) = (found for found in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S) if "rclpy" in found)
     body = text.split("class RangeNode")[1].split("if __name__")[0]
     assert body.count("\n") <= 40
-    return compile(text, "docs/streaming.md", "exec")
+    return compile(text, "docs/boards.md", "exec")
 
 
 def test_the_node_publishes_corrected_ranges_until_ros_ends(node, monkeypatch):

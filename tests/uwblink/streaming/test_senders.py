@@ -174,7 +174,7 @@ def test_a_port_that_is_taken_and_a_missing_extra_are_said(monkeypatch):
 
 
 def test_a_range_is_at_somebody_else_s_20_ms_after_its_poll(ear):
-    """By the boards' own time, so that no other work of this machine counts; docs/streaming.md has the figures."""
+    """By the boards' own time, so that no other work of this machine counts; docs/boards.md has the figures."""
     ports, late_ms = VirtualPorts(bench_scenario()), []
     names = list(ports.names.values())
     with UdpSender(str(ear.getsockname()[1])) as sender:

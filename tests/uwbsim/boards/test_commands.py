@@ -110,7 +110,7 @@ def test_numbers_are_read_as_c_reads_them(text, number):
     ],
 )
 def test_what_boards_take_otherwise_than_the_firmware_is_what_the_page_says(data, kinds, alive):
-    """docs/firmware.md says it; the last of them has 255 bytes."""
+    """docs/boards.md says it; the last of them has 255 bytes."""
     reading = read_commands(data)
     assert [command.kind for command in reading.commands] == kinds
     assert reading.alive == alive

@@ -1,7 +1,7 @@
 """The twin of a flight that nobody here made: one of MILUV among obstacles, with the calibration published with it.
 
 317 exchanges of 48 pairs in 78 s. Tolerances are those asked of a twin: 10 % of medians and 90 % quantiles, 0.1 of
-autocorrelations; powers in dB, of which 10 % would say nothing. What is not met stands in docs/twin.md.
+autocorrelations; powers in dB, of which 10 % would say nothing. What is not met stands in docs/accuracy.md.
 """
 
 import tarfile
