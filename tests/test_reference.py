@@ -9,7 +9,7 @@ import typer
 import calib
 import uwblink
 import uwbsim
-from calib.calibration.file_keys import FILE_KEYS as CALIBRATION
+from calib.calibration.document import FILE_KEYS as CALIBRATION
 from docs.site import commands, doors, file_keys
 from uwblink.boards import ranging_plan
 from uwblink.importers import column_map

@@ -6,7 +6,7 @@ from uwblink.lazy import offer
 
 if TYPE_CHECKING:
     from calib.calibration.formats import antenna_delays_warning, free_delays, programmed, read_miluv
-    from calib.calibration.foundations import rests_on
+    from calib.calibration.model import rests_on
 
 __all__ = [
     "antenna_delays_warning",
@@ -21,7 +21,7 @@ _HOMES: Final = {
     "free_delays": "calib.calibration.formats",
     "programmed": "calib.calibration.formats",
     "read_miluv": "calib.calibration.formats",
-    "rests_on": "calib.calibration.foundations",
+    "rests_on": "calib.calibration.model",
 }
 
 if not TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from calib.calibration.applying import PiecewiseCurve
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve as PowerCurve
-from calib.calibration.runtime import PiecewiseCurve
 from calib.data.ranges import FAINTEST_DBM, LOUDEST_DBM
 
 _HEAD: Final = """\
@@ -24,14 +24,14 @@ _HEAD: Final = """\
 
 _CODE: Final = """
 /* A curve's value in metres: a polynomial between each two knots, held constant where nothing was measured. */
-static double uwb_curve(const double *left, const double *scale, const double *coefficients, size_t pieces,
-                        size_t terms, double low, double high, double lifted)
+static double uwb_curve(const double *left, const double *coefficients, size_t pieces, size_t terms, double low,
+                        double high, double lifted)
 {
     size_t piece = 0, k;
     double x = lifted < low ? low : lifted > high ? high : lifted, t, value = 0.0;
     while (piece + 1 < pieces && x >= left[piece + 1])
         piece++;
-    t = (x - left[piece]) * scale[piece];
+    t = x - left[piece];
     for (k = 0; k < terms; k++)
         value = value * t + coefficients[piece * terms + k];
     return value;
@@ -189,17 +189,14 @@ def _error_tables(model: ErrorModel, bias: PowerCurve) -> list[str]:
 
 
 def _curve(name: str, curve: PiecewiseCurve) -> list[str]:
-    left, scale, rows = curve.table()
-    terms = len(rows[0])
-    upper = name.upper()
+    terms, upper = len(curve.pieces[0]), name.upper()
     return [
-        f"static const double uwb_{name}_left[] = {{{_numbers(left)}}};",
-        f"static const double uwb_{name}_scale[] = {{{_numbers(scale)}}};",
+        f"static const double uwb_{name}_left[] = {{{_numbers(curve.left)}}};",
         f"static const double uwb_{name}_coefficients[] = {{",
-        *(f"    {_numbers(row)}," for row in rows),
+        *(f"    {_numbers(row)}," for row in curve.pieces),
         "};",
-        f"#define UWB_{upper}(lifted) uwb_curve(uwb_{name}_left, uwb_{name}_scale, uwb_{name}_coefficients, \\",
-        f"    {len(rows)}, {terms}, {_number(curve.low)}, {_number(curve.high)}, lifted)",
+        f"#define UWB_{upper}(lifted) uwb_curve(uwb_{name}_left, uwb_{name}_coefficients, {len(curve.pieces)}, \\",
+        f"    {terms}, {_number(curve.low)}, {_number(curve.high)}, lifted)",
     ]
 
 

@@ -1,19 +1,18 @@
-"""Two calibrations side by side: are the delays the same within what is known of them?"""
+"""Compares two calibrations: whether their delays are the same within their standard errors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from calib.calibration.model import Calibration, require_calibration
 from calib.errors import UnanswerableError
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
-
-SIGNIFICANT: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -38,7 +37,7 @@ class Comparison:
     @property
     def same(self) -> bool:
         """Whether differences as large as these come by chance more than once in twenty; False where not tested."""
-        return self.probability >= SIGNIFICANT
+        return self.probability >= 0.05
 
     @property
     def verdict(self) -> str:
@@ -48,7 +47,7 @@ class Comparison:
         return "same" if self.same else "different"
 
     def __repr__(self) -> str:
-        """Return the table: a line a tag, and what it comes to."""
+        """Return the table."""
         return self.table()
 
     def table(self, first: str = "the first", second: str = "the second") -> str:
@@ -99,7 +98,7 @@ def _or_none(value: float) -> float | None:
 
 
 def compare(first: Calibration, second: Calibration) -> Comparison:
-    """Say whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
+    """Test whether the delays of two calibrations differ by more than their standard errors explain, by chi-square.
 
     Differences in ns are second minus first, less the shift common to all delays. Raises `UnanswerableError` where
     fewer than two tags have a determined delay in both.
@@ -111,8 +110,6 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     """
     require_calibration(first, "first")
     require_calibration(second, "second")
-    from scipy.special import chdtrc
-
     if first.pair_offsets or second.pair_offsets:
         raise UnanswerableError("constants of pairs are no delays, and only delays can be compared")
     known = [{t for t in c.delays_ns if not np.isinf(c.delays_std_ns.get(t, np.nan))} for c in (first, second)]

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,10 @@ from uwblink.recording.contents import READING_MB, exchanges_with_poses
 from uwblink.recording.file import Recording
 from uwblink.twr import Exchanges
 
-NUMBERS: Final = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
-"""Columns of the table `corrected` that are NaN where a range has no power."""
-
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """How many ranges were corrected, how many of them at powers beyond the fitted ones, how many without power.
+    """Number of corrected ranges, of those at powers beyond the fitted ones, and of those without power.
 
     A range without power is corrected by its delays alone where the calibration has curves, and has no sigma.
     """
@@ -89,24 +86,20 @@ def _write(source: str | os.PathLike[str], calibration: Calibration, output: Pat
 
 def _append(written: Recording, exchanges: Exchanges, applied: CorrectedRanges) -> tuple[int, int, int]:
     """Add corrected exchanges; returns how many there are, how many are clamped, how many have no power."""
-    table, powered = _table(exchanges, applied), np.isfinite(applied.lifted)
-    with written.transaction():
-        written.append_exchanges(replace(exchanges, range_m=table["corrected_m"]))
-        written.append_columns("corrected", table)
-    return len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered))
-
-
-def _table(exchanges: Exchanges, applied: CorrectedRanges) -> dict[str, NDArray[Any]]:
-    """Return the rows of the table `corrected`, one an exchange."""
     powered = np.isfinite(applied.lifted)
-    known = {name: np.where(powered, getattr(applied, name), np.nan) for name in NUMBERS}
-    return {
+    numbers = ("sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
+    corrected_m = np.where(powered, applied.corrected_m, applied.delay_corrected_m)
+    table: dict[str, NDArray[Any]] = {
         "time_ns": exchanges.time_ns,
         "initiator": exchanges.initiator,
         "target": exchanges.target,
         "raw_m": applied.raw_m,
-        "corrected_m": np.where(powered, applied.corrected_m, applied.delay_corrected_m),
+        "corrected_m": corrected_m,
         "clamped": applied.clamped,
         "outlier": applied.outlier,
-        **known,
+        **{name: np.where(powered, getattr(applied, name), np.nan) for name in numbers},
     }
+    with written.transaction():
+        written.append_exchanges(replace(exchanges, range_m=corrected_m))
+        written.append_columns("corrected", table)
+    return len(exchanges), int(np.count_nonzero(applied.clamped & powered)), int(np.count_nonzero(~powered))

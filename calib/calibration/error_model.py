@@ -11,24 +11,17 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr
 
-from calib.calibration.json_format import METRES, POSITIVE, SHARE, STD_M, Reader, is_tag
 from calib.calibration.power_curves import Curve
 from calib.densities import ROOT_2PI, LongDetours, densities
 from calib.errors import BadInputError
 from uwblink.arrays import Floats, Ints
-
-BISECTIONS: Final = 50
-FARTHEST_SIGMAS: Final = 12.0
-FARTHEST_MEANS: Final = 25.0
-"""How far quantiles are searched for, in the largest noise and the longest mean detour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +157,12 @@ class ErrorModel:
         shapes = ErrorShapes(
             noise_m=flat.noise_m[:, None], tail_share=flat.tail_share[:, None], detour_m=flat.detour_m[:, None]
         )
-        reach = FARTHEST_SIGMAS * (shapes.noise_m + self.outlier_m)
+        # Quantiles lie within 12 sigmas of noise or outliers and 25 means of the longest detour; 50 halvings of that
+        # leave nothing of it.
+        reach = 12.0 * (shapes.noise_m + self.outlier_m)
         low = np.broadcast_to(self.location_m - reach, (len(pair), len(levels))).copy()
-        high = low + 2 * reach + self.least_m + FARTHEST_MEANS * self.long.longest * shapes.detour_m
-        for _ in range(BISECTIONS):
+        high = low + 2 * reach + self.least_m + 25.0 * self.long.longest * shapes.detour_m
+        for _ in range(50):
             middle = (low + high) / 2
             above = self.below(middle, shapes) > levels
             high, low = np.where(above, middle, high), np.where(above, low, middle)
@@ -204,10 +199,6 @@ class ErrorModel:
         found = np.full(len(asked), len(codes), dtype=np.int64)
         found[known] = order[place[known]]
         return found
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what stands in a calibration's JSON."""
-        return asdict(self)
 
 
 class ErrorsAtOnce:
@@ -253,44 +244,3 @@ class ErrorsAtOnce:
         part = (lifted - nodes[k - 1]) / (nodes[k] - nodes[k - 1])
         (a, b), (c, d) = self._rows[k - 1 : k + 1]
         return a + part * (c - a), b + part * (d - b)
-
-
-def read_errors(read: Reader) -> ErrorModel:
-    """Return the model from its table; raises `BadInputError` that names the key."""
-    lifted, noise, share = (read.numbers(name) for name in ("lifted", "noise_m", "tail_share"))
-    fit = len(lifted) == len(noise) == len(share) and len(lifted) > 1
-    fit = fit and all(one < two for one, two in pairwise(lifted))
-    if not fit or min(noise) <= 0 or not all(0 < value < 1 for value in share):
-        raise read.wrong("lifted", "ascending powers, with as many noises above 0 and shares between 0 and 1")
-    pairs = read.inside("pairs")
-    names = list(read.table("pairs"))
-    if not all(_is_pair(name) for name in names):
-        raise read.wrong("pairs", "names of pairs, as in 1-2")
-    return ErrorModel(
-        lifted=lifted,
-        noise_m=noise,
-        tail_share=share,
-        **{name: read.number(name, STD_M) for name in ("least_m", "detour_m", "outlier_m")},
-        outlier_share=read.number("outlier_share", SHARE),
-        location_m=read.number("location_m", METRES),
-        scale=read.number("scale", POSITIVE),
-        levels=read.couples("levels", SHARE),
-        **_long(read),
-        pairs={name: _pair(pairs.inside(name)) for name in names},
-    )
-
-
-def _long(read: Reader) -> dict[str, float]:
-    """Return the second kind of detour, which calibrations of uwbcal up to 0.2.0 do not have."""
-    if not read.has("long_share"):
-        return {}
-    return {"long_share": read.number("long_share", SHARE), "long_factor": read.number("long_factor", POSITIVE)}
-
-
-def _is_pair(name: str) -> bool:
-    ends = name.split("-")
-    return len(ends) == 2 and all(map(is_tag, ends))
-
-
-def _pair(read: Reader) -> PairErrors:
-    return PairErrors(**{name: read.number(name, POSITIVE) for name in ("noise", "odds", "detour")})

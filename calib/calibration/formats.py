@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
 from calib.calibration.c_header import c_header
-from calib.calibration.json_format import is_tag
+from calib.calibration.document import finite, is_tag
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.sources import antenna_delays_in
@@ -31,8 +32,7 @@ from uwblink.text_files import read_text
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
 
 TX_SHARE: Final = 0.44
-RX_SHARE: Final = 0.56
-"""How an aggregate delay is split between transmitter and receiver (APS014, section 2; the authors' code)."""
+"""The transmitter's share of an aggregate delay; the receiver has the rest (APS014, section 2; the authors' code)."""
 
 
 def programmed(path: str | os.PathLike[str]) -> AntennaDelays:
@@ -127,15 +127,7 @@ REGISTERS_HEAD: Final = """\
 """
 
 
-def _registers(calibration: Calibration, base: AntennaDelays | None = None) -> str:
-    return REGISTERS_HEAD + text_of_delays(registers(calibration, base))
-
-
-def _firmware(calibration: Calibration, base: AntennaDelays | None = None) -> str:
-    return REGISTERS_HEAD + text_of_delays(registers(calibration, base, firmware=True))
-
-
-def _csv(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
+def _csv(calibration: Calibration) -> str:
     rows = [
         f"{tag},{delay!r},{calibration.delays_std_ns.get(tag, '')!s}"
         for tag, delay in sorted(calibration.delays_ns.items())
@@ -143,29 +135,18 @@ def _csv(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
     return "\n".join(["tag,delay_ns,delay_std_ns", *rows]) + "\n"
 
 
-def _one_curve(calibration: Calibration, form: str) -> None:
-    if calibration.groups:
-        raise BadInputError(
-            f"{form} has one curve for all tags, this calibration one for each of the groups "
-            f"{', '.join(calibration.groups)}; export it as json",
-            parameter="to",
-        )
-
-
-def _miluv(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
-    _one_curve(calibration, "miluv")
+def _miluv(calibration: Calibration) -> str:
     original = calibration.provenance.get("miluv")
     document = dict(original) if isinstance(original, dict) else {}
     document["delays_ns"] = {str(t): d for t, d in sorted(calibration.delays_ns.items())}
     for key, curve in (("bias_spline_m", calibration.bias_curve), ("std_spline_m", calibration.sigma_curve)):
         document[key] = {"knots": list(curve.knots), "coeffs": list(curve.coefficients), "degree": curve.degree}
-    document.setdefault("tx_rx_split", {"tx": TX_SHARE, "rx": RX_SHARE})
+    document.setdefault("tx_rx_split", {"tx": TX_SHARE, "rx": round(1 - TX_SHARE, 2)})
     document.setdefault("c_mps", SPEED_OF_LIGHT)
     return json.dumps(document, indent=1) + "\n"
 
 
-def _ros_yaml(calibration: Calibration, base: AntennaDelays | None = None) -> str:
-    _one_curve(calibration, "ros-yaml")
+def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
     lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}"]
     lines += [f"  power_at: {calibration.power_at}", "  tags:"]
     to_program = _on_top(calibration, base)
@@ -207,32 +188,19 @@ def _error_lines(calibration: Calibration) -> list[str]:
     return lines
 
 
-def _json(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
-    return calibration.to_json()
-
-
-def _c_header(calibration: Calibration, _base: AntennaDelays | None = None) -> str:
-    _one_curve(calibration, "c-header")
-    return c_header(calibration)
-
-
-class Format(Protocol):
-    """What turns a calibration, and what was programmed into its devices, into text."""
-
-    def __call__(self, calibration: Calibration, base: AntennaDelays | None = None, /) -> str:
-        """Return the text; raises `BadInputError`."""
-        ...
-
-
-FORMATS: Final[dict[str, Format]] = {
-    "registers": _registers,
-    "firmware": _firmware,
-    "json": _json,
-    "csv": _csv,
-    "miluv": _miluv,
-    "ros-yaml": _ros_yaml,
-    "c-header": _c_header,
+FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = {
+    "registers": lambda calibration, base: REGISTERS_HEAD + text_of_delays(registers(calibration, base)),
+    "firmware": lambda calibration, base: REGISTERS_HEAD + text_of_delays(registers(calibration, base, firmware=True)),
+    "json": lambda calibration, _: calibration.to_json(),
+    "csv": lambda calibration, _: _csv(calibration),
+    "miluv": lambda calibration, _: _miluv(calibration),
+    "ros-yaml": lambda calibration, base: _ros_yaml(calibration, base),
+    "c-header": lambda calibration, _: c_header(calibration),
 }
+"""What turns a calibration, and what was programmed into its devices, into text, by the name of the format."""
+
+ONE_CURVE: Final = ("miluv", "ros-yaml", "c-header")
+"""Formats that have one curve for all tags."""
 
 
 def export(
@@ -248,9 +216,8 @@ def export(
     `to` is "registers" (values for the DW1000's antenna-delay registers, as TOML), "firmware" (those, and the constants
     of its build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and a function that corrects a
     range). Registers are on top of what was programmed when the devices were recorded, which the calibration says, or
-    `base` (`programmed`). Raises `BadInputError` for
-    another form, for a calibration with groups of tags in a form that has one curve, and for registers of tags whose
-    delays the data left free.
+    `base` (`programmed`). Raises `BadInputError` for another form, for a calibration with groups of tags in a form that
+    has one curve, and for registers of tags whose delays the data left free.
 
     >>> import calib
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])
@@ -261,6 +228,12 @@ def export(
         raise BadInputError(f"found {to!r}, allowed: {', '.join(FORMATS)}", parameter="to")
     if calibration.pair_offsets and to != "json":
         raise BadInputError(f"{to} has no place for constants of pairs; export it as json", parameter="to")
+    if calibration.groups and to in ONE_CURVE:
+        raise BadInputError(
+            f"{to} has one curve for all tags, this calibration one for each of the groups "
+            f"{', '.join(calibration.groups)}; export it as json",
+            parameter="to",
+        )
     text = FORMATS[to](calibration, base)
     if path is not None:
         write_text(Path(path), text, force=force)
@@ -276,7 +249,7 @@ def read_miluv(path: Path) -> Calibration:
     """
     text = read_text(path, BadInputError, "calibration of MILUV (.json)")
     try:
-        table = json.loads(text, parse_float=_finite, parse_constant=_finite)
+        table = json.loads(text, parse_float=finite, parse_constant=finite)
         delays = {_tag(tag): float(delay) for tag, delay in table["delays_ns"].items()}
         bias, sigma = (_curve(table[key]) for key in ("bias_spline_m", "std_spline_m"))
         speed = float(table.get("c_mps", SPEED_OF_LIGHT))
@@ -299,13 +272,6 @@ def read_miluv(path: Path) -> Calibration:
         provenance={"imported_from": path.name, "miluv": {key: rest.get(key) for key in order}},
     )
     return Calibration.from_json(found.to_json(), str(path))
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text} is no finite number")
-    return value
 
 
 def _tag(text: str) -> int:

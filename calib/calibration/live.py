@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from calib.calibration.model import load_calibration
-from calib.calibration.runtime import CorrectedColumns
+from calib.calibration.parts import CorrectedColumns
 from calib.data.ranges import Ranges, columns_of
 from uwblink.arrays import Floats
 from uwblink.twr import Exchanges

@@ -1,34 +1,42 @@
-"""Antenna delays, curves and what errors are made of: a frozen value that corrects ranges."""
+"""A calibration: antenna delays, curves and error model, as a frozen value that corrects ranges and prints itself."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import Any, Final, Literal, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.calibration.applying import corrected_ranges
-from calib.calibration.content import CalibrationContent
-from calib.calibration.display import as_html, as_text
+from calib.calibration.applying import RangeCorrector, corrected_ranges
 from calib.calibration.document import fields_of, text_of
-from calib.calibration.parts import CorrectedRanges
-from calib.calibration.power_curves import basis
-from calib.calibration.runtime import CorrectedColumns, CorrectedRange, RangeCorrector
+from calib.calibration.error_model import ErrorModel
+from calib.calibration.parts import (
+    CorrectedColumns,
+    CorrectedRange,
+    CorrectedRanges,
+    PairOffset,
+    TagGroup,
+    Uncertainty,
+    pair_name,
+)
+from calib.calibration.power_curves import Curve, basis, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
+from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.output import write_text
+from uwblink.recording.antenna_delays import AntennaDelays
 from uwblink.text_files import read_text
-
-SCALAR: Final = (float, int, np.generic)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Calibration(CalibrationContent):
+class Calibration:
     """Antenna delays of tags, in nanoseconds, and the curves of bias and standard deviation.
 
     A standard error is infinite where the data did not determine the delay. `power_at` says where the bias curve is
@@ -41,15 +49,68 @@ class Calibration(CalibrationContent):
     when they were recorded, which delays are on top of; empty where that is not known.
     """
 
+    delays_ns: dict[int, float]
+    delays_std_ns: dict[int, float]
+    loss: str
+    scale_ns: float
+    lift: str
+    alpha_dbm: float
+    speed_of_light: float
+    bias_curve: Curve
+    sigma_curve: Curve
+    provenance: dict[str, Any] = field(default_factory=dict)
+    uncertainty: Uncertainty | None = None
+    groups: dict[str, TagGroup] = field(default_factory=dict)
+    power_at: str = "exchange"
+    errors: ErrorModel | None = None
+    pair_offsets: dict[tuple[int, int], PairOffset] = field(default_factory=dict)
+    antenna_delays: AntennaDelays = field(default_factory=dict)
     _corrector: RangeCorrector | None = field(default=None, init=False, compare=False)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the fit behind it stopped before it settled, so that delays and intervals are not final."""
+        return self.provenance.get("converged") is False
+
+    @property
+    def needs_power(self) -> bool:
+        """Whether ranges without any power cannot be corrected whole."""
+        curves = [self.bias_curve, self.sigma_curve]
+        curves += [curve for group in self.groups.values() for curve in (group.bias_curve, group.sigma_curve)]
+        return not all(curve.flat for curve in curves)
+
+    def lifted(self, ranges: Ranges) -> Floats:
+        """Return the lifted power of each range, as this calibration defines it."""
+        lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, self.lift, self.alpha_dbm)
+        # Where nothing depends on power, a range without any is as good as another.
+        return lifted if self.needs_power else np.where(np.isfinite(lifted), lifted, self.bias_curve.range[0])
 
     def __repr__(self) -> str:
         """Return a table of delays, and of the curves at a few powers."""
-        return as_text(self)
+        lines = [_headline(self)]
+        apart = self.pair_offsets and not any(self.delays_ns.values())
+        for name, value, interval in () if apart else (DELAY_HEAD, *delay_rows(self)):
+            lines.append(f"  {name:>5}  {value:>11}  {interval}")
+        if self.pair_offsets:
+            for name, value, interval in (PAIR_HEAD, *pair_rows(self)):
+                lines.append(f"  {name:>9}  {value:>13}  {interval}")
+        power, *curves = curve_rows(self)
+        for name, *cells in (power, *curves):
+            lines.append(f"  {name:18s}" + "".join(f"{cell:>9s}" for cell in cells))
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         """Return the same as HTML, for notebooks."""
-        return as_html(self)
+        delays = [DELAY_HEAD, *delay_rows(self)]
+        pairs = [PAIR_HEAD, *pair_rows(self)] if self.pair_offsets else []
+        tables: list[Sequence[tuple[str, ...]]] = [delays, pairs, curve_rows(self)]
+        return f"<p>{escape(_headline(self))}</p>" + "".join(
+            "<table>"
+            + "".join(f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>" for row in rows)
+            + "</table>"
+            for rows in tables
+            if rows
+        )
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write the calibration as JSON, whole or not at all; replaces a file only with `force`."""
@@ -131,20 +192,14 @@ class Calibration(CalibrationContent):
         '2.94 m, sigma 0.03 m'
         """
         given = (range_m, fpp1_dbm, fpp2_dbm, initiator, target, *weights)
-        if all([isinstance(value, SCALAR) for value in given]):  # noqa: C419 - a list takes half the time of a generator
-            return self._one()(range_m, fpp1_dbm, fpp2_dbm, initiator, target, weights)
+        if all([isinstance(value, float | int | np.generic) for value in given]):  # noqa: C419 - a list takes half the time of a generator
+            corrector = self._corrector or RangeCorrector(self)
+            object.__setattr__(self, "_corrector", corrector)
+            return corrector(range_m, fpp1_dbm, fpp2_dbm, initiator, target, weights)
         ranges = Ranges.from_arrays(
             range_m, initiator=initiator, target=target, fpp1_dbm=fpp1_dbm, fpp2_dbm=fpp2_dbm, weights=weights
         )
         return CorrectedColumns.of(self.apply(ranges))
-
-    def _one(self) -> RangeCorrector:
-        """Return the corrector of single ranges, made when it is first asked for."""
-        if self._corrector is not None:
-            return self._corrector
-        made = RangeCorrector(self)
-        object.__setattr__(self, "_corrector", made)
-        return made
 
     def band(self, lifted: Floats, which: Literal["bias", "sigma"]) -> Floats | None:
         """Return the standard error of a curve at lifted powers (n,), in metres; None where it is not known."""
@@ -186,3 +241,80 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     calib.errors.BadInputError: nowhere.json: no such calibration file (.json)
     """
     return Calibration.from_json(read_text(path, BadInputError, "calibration file (.json)"), str(path))
+
+
+DELAY_HEAD: Final = ("tag", "delay (ns)", "95 % interval")
+PAIR_HEAD: Final = ("pair", "constant (cm)", "95 % interval")
+MAX_ROWS: Final = 40
+"""Tags or pairs that are listed; of more, the first are: a screen."""
+
+
+def pair_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield each pair, the constant of its ranges in cm, and its interval in words."""
+    rows = sorted(calibration.pair_offsets.items())
+    for pair, one in rows[:MAX_ROWS]:
+        yield pair_name(pair), f"{100 * one.offset_m:+.2f}", f"± {100 * TWO_SIDED_95 * one.std_m:.2f}"
+    if len(rows) > MAX_ROWS:
+        yield "...", "", f"{len(rows) - MAX_ROWS} more"
+
+
+def delay_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield tag, delay in ns, and its interval in words."""
+    rows = sorted(calibration.delays_ns.items())
+    for tag, delay in rows[:MAX_ROWS]:
+        half = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, math.nan)
+        if math.isinf(half):
+            interval = "undetermined"
+        elif half == 0:
+            interval = "pinned"
+        else:
+            interval = f"± {half:.4f}" if math.isfinite(half) else "unknown"
+        yield str(tag), f"{delay:+.4f}", interval
+    if len(rows) > MAX_ROWS:
+        yield "...", "", f"{len(rows) - MAX_ROWS} more"
+
+
+def curve_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+    """Return lifted powers, and the curves there: of each group of tags, or the one of all."""
+    shown = np.linspace(*calibration.bias_curve.range, 6)
+    named: dict[str, Calibration | TagGroup] = dict(calibration.groups) or {"": calibration}
+    rows = [("lifted power", *(f"{power:.3g}" for power in shown))]
+    for name, curves in named.items():
+        of = f" {name}" if name else ""
+        rows.append((f"bias (cm){of}", *(f"{100 * value:+.1f}" for value in curves.bias_curve(shown))))
+        rows.append((f"sigma (cm){of}", *(f"{100 * value:.1f}" for value in curves.sigma_curve(shown))))
+    return rows
+
+
+def _headline(calibration: Calibration) -> str:
+    fitted = calibration.provenance.get("exchanges")
+    of = f" from {fitted} ranges" if fitted else ""
+    return (
+        f"Calibration of {len(calibration.delays_ns)} tags{of}: {calibration.loss} loss, scale "
+        f"{calibration.scale_ns:.3g} ns, {calibration.lift} power above {calibration.alpha_dbm:g} dBm"
+        f"{'; NOT SETTLED, its fit stopped' if calibration.stopped else ''}"
+    )
+
+
+def rests_on(provenance: Mapping[str, Any]) -> str:
+    """Return what stands in the place of known distances, as one phrase; "" where distances were known."""
+    known = provenance.get("rests_on")
+    if provenance.get("truth") != "ranges" or not isinstance(known, Mapping):
+        return ""
+    parts = [f"ranges alone, of {_listed(known.get('moving'), 'moving body', 'moving bodies')}"]
+    seconds = known.get("known_s")
+    if isinstance(seconds, int | float) and seconds > 0:
+        parts.append(f"positions known for {seconds:.1f} s")
+    for key, word in (("anchors_given", "given"), ("anchors_sought", "found")):
+        if known.get(key):
+            parts.append(f"{_listed(known[key], 'anchor', 'anchors')} at places that were {word}")
+    parts.append(f"attitudes from {known.get('attitudes', 'nowhere')}")
+    off = provenance.get("distance_std_m")
+    if isinstance(off, int | float):
+        parts.append(f"distances found to {100 * off:.1f} cm (standard error)")
+    return ", ".join(parts)
+
+
+def _listed(names: object, one: str, many: str) -> str:
+    count = len(names) if isinstance(names, list) else 0
+    return f"{count} {one if count == 1 else many}"

@@ -1,13 +1,77 @@
-"""What calibrations are made of and what they make: groups of tags, uncertainty, corrected ranges."""
+"""What calibrations are made of, and what they make: groups of tags, constants of pairs, corrected ranges."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
-from calib.calibration.json_format import Matrix
+import numpy as np
+
 from calib.calibration.power_curves import Curve
+from calib.data.ranges import Ranges
+from calib.errors import BadInputError
 from uwblink.arrays import Bools, Floats
 from uwblink.display import as_text, excerpt
+
+Matrix = tuple[tuple[float, ...], ...]
+"""A matrix as a tuple of rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class TagGroup:
+    """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""
+
+    tags: tuple[int, ...]
+    bias_curve: Curve
+    sigma_curve: Curve
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Covariance matrices of a fit.
+
+    `delays_ns2` (tags, tags) goes with `tags`; `bias_m2` and `sigma_m2` (m, m) go with the coefficients of the curves.
+    """
+
+    tags: tuple[int, ...]
+    delays_ns2: Matrix
+    bias_m2: Matrix
+    sigma_m2: Matrix
+
+
+class PairOffset(NamedTuple):
+    """By how much the ranges of a pair are too long, and its standard error, in metres."""
+
+    offset_m: float
+    std_m: float
+
+
+def offset_of(offsets: Mapping[tuple[int, int], PairOffset], first: int, second: int) -> PairOffset:
+    """Return the constant of a pair, whoever initiates; raises `BadInputError` for a pair that has none."""
+    try:
+        return offsets[min(first, second), max(first, second)]
+    except KeyError as error:
+        known = ", ".join(pair_name(pair) for pair in sorted(offsets)[:6])
+        raise BadInputError(
+            f"no constant for pair {pair_name(error.args[0])} in the calibration, which knows {known}"
+            f"{' and others' if len(offsets) > 6 else ''}"
+        ) from None
+
+
+def offsets_m(offsets: Mapping[tuple[int, int], PairOffset], ranges: Ranges) -> Floats:
+    """Return the constant of each range's pair (n,), zeros where there are none; raises what `offset_of` raises."""
+    if not offsets or not len(ranges):
+        return np.zeros(len(ranges))
+    ends = np.sort(np.column_stack([ranges.initiator, ranges.target]), axis=1)
+    pairs, place = np.unique(ends, axis=0, return_inverse=True)
+    values = [offset_of(offsets, *pair).offset_m for pair in pairs.tolist()]
+    return np.asarray(np.array(values)[place.ravel()])
+
+
+def pair_name(pair: tuple[int, int]) -> str:
+    """Return a pair as files and tables name it: 1-2."""
+    return "-".join(map(str, pair))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,12 +79,12 @@ class CorrectedRanges:
     """Ranges in three stages, metres, and what is known of them, shape (n,).
 
     `sigma_m` is the noise of direct ranges. `sigma_total_m` is the standard deviation of all of them, reflected ones
-    included, about a mean of `mean_error_m`; `tail_share` is how many such ranges of this pair at this power are
-    reflected. `tail_probability` is the same after a look at the range itself, where its true distance is known, and
+    included, about a mean of `mean_error_m`; `tail_share` is the share of such ranges of this pair at this power that
+    are reflected. `tail_probability` is the same given the range itself, where its true distance is known, and
     `outlier` marks what is then neither noise nor a reflection; elsewhere it equals `tail_share`, and nothing is
     marked. `clamped` marks lifted powers at which the curves had no data and are held constant; `sigma_total_m` grows
-    there by what they would go on by. All but `sigma_m` and `clamped` are NaN where a calibration does not say what
-    errors are made of (`Calibration.errors`), and without a power.
+    there by the slope of the curve at its end. All but `sigma_m` and `clamped` are NaN where a calibration has no error
+    model (`Calibration.errors`), and without a power.
 
     >>> import calib
     >>> flight = calib.load_ranges(calib.sample_flight())
@@ -47,23 +111,42 @@ class CorrectedRanges:
         return as_text(f"{len(self.raw_m)} corrected ranges", excerpt(columns))
 
 
-@dataclass(frozen=True, slots=True)
-class TagGroup:
-    """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""
+class CorrectedRange(NamedTuple):
+    """A corrected range and its standard deviation, metres; `clamped` where its power is beyond the curves'.
 
-    tags: tuple[int, ...]
-    bias_curve: Curve
-    sigma_curve: Curve
-
-
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
-    """What is known of a fit's errors: covariance matrices as tuples of rows.
-
-    `delays_ns2` (tags, tags) goes with `tags`; `bias_m2` and `sigma_m2` (m, m) go with the coefficients of the curves.
+    `sigma_m` is the noise of a direct range; `sigma_total_m` includes reflections, which are the share `tail_share` of
+    the ranges of this pair at this power; both are NaN without an error model. Without a power at either end the range
+    has the delays' part only, and its standard deviations are NaN.
     """
 
-    tags: tuple[int, ...]
-    delays_ns2: Matrix
-    bias_m2: Matrix
-    sigma_m2: Matrix
+    range_m: float
+    sigma_m: float
+    clamped: bool
+    sigma_total_m: float
+    tail_share: float
+
+
+class CorrectedColumns(NamedTuple):
+    """What `CorrectedRange` holds, for arrays of ranges (n,)."""
+
+    range_m: Floats
+    sigma_m: Floats
+    clamped: Bools
+    sigma_total_m: Floats
+    tail_share: Floats
+
+    @classmethod
+    def of(cls, applied: CorrectedRanges) -> CorrectedColumns:
+        """Return corrected ranges as columns; those without a power have the delays' part only."""
+        powered = np.isfinite(applied.lifted)
+        return cls(
+            np.where(powered, applied.corrected_m, applied.delay_corrected_m),
+            np.where(powered, applied.sigma_m, np.nan),
+            applied.clamped,
+            applied.sigma_total_m,
+            applied.tail_share,
+        )
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        return as_text(f"{len(self.range_m)} corrected ranges", excerpt(self._asdict()))

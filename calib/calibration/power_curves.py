@@ -12,17 +12,15 @@ from scipy.interpolate import BSpline
 from uwblink.arrays import Bools, Floats, Ints
 
 ALPHA_DBM: Final = -82.0
+"""The power whose lifted power is 1 (ICRA 2023, section IV)."""
+
 DEGREE: Final = 3
+"""Curves that are fitted are cubic splines: smooth to the second derivative, which their roughness is measured by."""
+
 SIGMA_SEGMENTS: Final = 4
 SIGMA_BINS: Final = 30
 SIGMA_FLOOR_M: Final = 0.002
 """A tick is 4.7 mm long; no range is better than half of one."""
-
-END_PART: Final = 0.1
-"""Part of its range at either end from which a curve's slope there is taken."""
-
-POPULATED: Final = (0.005, 0.995)
-"""Quantiles of lifted power between which a curve is fitted; beyond them it is held constant."""
 
 
 def lift(power_dbm: Floats, alpha_dbm: float) -> Floats:
@@ -31,18 +29,11 @@ def lift(power_dbm: Floats, alpha_dbm: float) -> Floats:
     return np.asarray(np.exp((power_dbm - alpha_dbm) * (np.log(10) / 10)))
 
 
-def _mean_of_lifted(fpp1: Floats, fpp2: Floats, alpha: float) -> Floats:
-    return (lift(fpp1, alpha) + lift(fpp2, alpha)) / 2
-
-
-def _lift_of_mean(fpp1: Floats, fpp2: Floats, alpha: float) -> Floats:
-    return lift((fpp1 + fpp2) / 2, alpha)
-
-
 LIFTS: Final[dict[str, Callable[[Floats, Floats, float], Floats]]] = {
-    "mean-of-lifted": _mean_of_lifted,
-    "lift-of-mean": _lift_of_mean,
+    "mean-of-lifted": lambda fpp1, fpp2, alpha: (lift(fpp1, alpha) + lift(fpp2, alpha)) / 2,
+    "lift-of-mean": lambda fpp1, fpp2, alpha: lift((fpp1 + fpp2) / 2, alpha),
 }
+"""How the powers of both ends (n,) make the lifted power of an exchange: the authors' code, and the paper's formula."""
 
 
 def lifted_power(fpp1_dbm: Floats, fpp2_dbm: Floats, how: str, alpha_dbm: float) -> Floats:
@@ -94,7 +85,7 @@ class Curve:
         Zero at powers that it was fitted at. It is what a range there may be off by.
         """
         low, high = self.range
-        step = END_PART * (high - low)
+        step = 0.1 * (high - low)  # the slope at an end is that of a tenth of the range
         ends = self(np.array([low, low + step, high - step, high]))
         below, above = (ends[1] - ends[0]) / step, (ends[3] - ends[2]) / step
         away = np.abs(below) * np.maximum(low - lifted, 0.0) + np.abs(above) * np.maximum(lifted - high, 0.0)
@@ -110,8 +101,8 @@ def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:
 
 
 def populated(ordered: Floats) -> tuple[float, float]:
-    """Return the range of lifted power, sorted (n,), in which there are data to fit a curve to."""
-    low, high = _quantiles(ordered, np.array(POPULATED))
+    """Return the range of lifted power, sorted (n,), in which a curve is fitted: all but half a percent at each end."""
+    low, high = _quantiles(ordered, np.array([0.005, 0.995]))
     return float(low), float(high)
 
 

@@ -7,10 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.calibration.json_format import Matrix
 from calib.calibration.model import Calibration
-from calib.calibration.pair_offsets import PairOffset
-from calib.calibration.parts import TagGroup, Uncertainty
+from calib.calibration.parts import Matrix, PairOffset, TagGroup, Uncertainty
 from calib.calibration.power_curves import DEGREE, Curve
 from calib.error_mixture import fit_error_mixture
 from calib.estimation.error_model import error_model

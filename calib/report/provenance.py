@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from typing import Final
 
-from calib.calibration.foundations import rests_on
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, rests_on
 from calib.report.blocks import Block, Heading, Listing, Table, Text
 from calib.report.origin import Origin
 

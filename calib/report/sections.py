@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from calib.calibration.display import pair_rows as offset_rows
 from calib.calibration.model import Calibration
+from calib.calibration.model import pair_rows as offset_rows
 from calib.data.ranges import Ranges
 from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, PlantedComparison, pair_rows
 from calib.report.blocks import Block, Picture, Table, Text

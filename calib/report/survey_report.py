@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from calib.calibration.display import curve_rows
-from calib.calibration.model import Calibration, require_calibration
+from calib.calibration.model import Calibration, curve_rows, require_calibration
 from calib.report import sections
 from calib.report.blocks import Document, Heading, Table, Text
 from calib.report.grades import BAD, Criterion, judgement

@@ -12,8 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.calibration.foundations import rests_on
-from calib.calibration.model import Calibration
+from calib.calibration.model import Calibration, rests_on
 from calib.report.blocks import Block, Heading, Picture, Table, Text
 from calib.report.grades import Criterion, graded
 from calib.spread import TWO_SIDED_95

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 import uwblink
-from calib.calibration.json_format import Matrix
 from calib.calibration.model import Calibration
-from calib.calibration.parts import Uncertainty
+from calib.calibration.parts import Matrix, Uncertainty
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, flat_curve
 from calib.information import Verdict
 from calib.surveys.adjustment import Adjusted

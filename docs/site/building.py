@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from calib.calibration.file_keys import FILE_KEYS as CALIBRATION
+from calib.calibration.document import FILE_KEYS as CALIBRATION
 from calib.cli.commands import app as calib_app
 from docs.site import checks, commands, doors, file_keys, schema
 from uwblink.boards.ranging_plan import FILE_KEYS as PLAN

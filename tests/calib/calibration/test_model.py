@@ -5,11 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from calib.calibration.model import Calibration, load_calibration
+from calib.calibration.model import Calibration, load_calibration, rests_on
 from calib.errors import BadInputError
 from calib.estimation.fitting import fit
 from tests.calib.synthetic import ranges
 from uwblink.ticks import SPEED_OF_LIGHT
+
+KNOWN = {"known_s": 9.9, "moving": ["a", "b", "c"], "anchors_given": ["m"], "anchors_sought": [], "attitudes": "imu"}
 
 
 @pytest.fixture(scope="module")
@@ -73,3 +75,20 @@ def test_a_damaged_file_is_one_clear_error(fitted, old, new):
     assert old in text
     with pytest.raises(BadInputError, match=r"^here"):
         Calibration.from_json(text.replace(old, new), "here")
+
+
+@pytest.mark.parametrize(
+    ("provenance", "told"),
+    [
+        (
+            {"truth": "ranges", "rests_on": KNOWN, "distance_std_m": 0.0123},
+            "ranges alone, of 3 moving bodies, positions known for 9.9 s, 1 anchor at places that were given, "
+            "attitudes from imu, distances found to 1.2 cm (standard error)",
+        ),
+        ({}, ""),
+        ({"truth": "ranges", "rests_on": "a lake"}, ""),
+        ({"truth": "recorded", "rests_on": KNOWN}, ""),
+    ],
+)
+def test_what_a_fit_without_known_distances_rests_on_is_one_phrase(provenance, told):
+    assert rests_on(provenance) == told
