@@ -8,7 +8,7 @@ expectation and maximization (Shumway and Stoffer 1982, there with a Kalman smoo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from scipy.sparse import csr_array, hstack, vstack
@@ -18,28 +18,11 @@ from uwblink.ticks import TICK_S
 from uwblink.twr import intervals
 from uwbsim.twins.flight import Flight, bulk_spread, some_rows
 
-UNKNOWNS: Final = 300
-"""Rates that are solved for at most, tags times knots."""
-
-SHORTEST_STEP_S: Final = 0.5
-ROUNDS: Final = 40
-WARM_UPS_S: Final = (10.0, 25.0, 60.0)
-WARM_UP_PPM: Final = 5.0
-"""How much faster clocks are thought to run at first before anything is seen."""
-
-LONG_WALK_PPM: Final = 0.15
-"""Over a flight; who walks that far may be warming up."""
-
-NEEDED: Final = 3.0
 SAMPLED: Final = 10_000
-"""Readings of which the noise is taken in each round, at most."""
-
-PRIOR_STEPS: Final = 1.0
-"""How many steps of an average clock each clock's walk is taken together with: a short flight has few of its own."""
+"""Readings of which the noise is taken in each round, at most: known to 1 % then."""
 
 OUTLIER: Final = 5.0
-SETTLED: Final = 3e-3
-"""Relative change of a deviation, below which it is taken as found."""
+"""Readings further off than so many standard deviations do not count."""
 
 KINDS: Final = 2
 """Of readings, each with a bias of its own: ratios and carriers."""
@@ -73,25 +56,17 @@ class ClockFit:
         return np.asarray(self.ratio_left_ppm * 1e-6 * intervals(flight.exchanges).dt53 * TICK_S / np.sqrt(2))
 
 
-@dataclass(slots=True)
-class _Readings:
-    """Observations: differences of rates (m,) by the design (m, unknowns), of kind 0 (ratio) or 1 (carrier)."""
-
-    design: csr_array
-    value: Floats
-    kind: Ints
-
-
 def fit_clocks(flight: Flight) -> ClockFit:
     """Fit the clocks of a flight; with warming up where walks would have to be long without."""
-    found = _Search(flight, None).run(ROUNDS)
+    found = _Search(flight, None).run()
     span = float(flight.time_s[-1])
-    if np.max(found.walk) * np.sqrt(span) > LONG_WALK_PPM:
-        tries = [_Search(flight, decay).run(ROUNDS) for decay in WARM_UPS_S if decay < 2 * span]
+    # A clock that walks further than 0.15 ppm over a flight may be warming up.
+    if np.max(found.walk) * np.sqrt(span) > 0.15:
+        tries = [_Search(flight, decay).run() for decay in (10.0, 25.0, 60.0) if decay < 2 * span]
         best = min(tries, key=lambda one: float(np.sum(np.log(one.walk))), default=found)
         # Each clock pays for its warming up with a walk that is shorter by more than one number explains.
         shorter = float(np.sum(np.log(found.walk / best.walk))) * (best.knots - 1)
-        if shorter > NEEDED * len(flight.tags) and best.warmed_up() > NEEDED:
+        if shorter > 3 * len(flight.tags) and best.warmed_up() > 3:
             found = best
     return found.result()
 
@@ -102,49 +77,94 @@ class _Search:
     def __init__(self, flight: Flight, decay_s: float | None) -> None:
         tags, span = len(flight.tags), max(float(flight.time_s[-1]), 1e-3)
         self.flight, self.decay_s, self.tags = flight, decay_s, tags
-        self.knots = int(np.clip(min(UNKNOWNS // tags, span / SHORTEST_STEP_S), 2, 400))
+        # Knots half a second apart at least, and 300 unknown rates in all at most.
+        self.knots = int(np.clip(min(300 // tags, span / 0.5), 2, 400))
         self.step_s = span / (self.knots - 1)
-        self.readings = _readings(flight, self.knots, self.step_s, decay_s)
-        self.noise, self.walk = _first_guess(flight), np.full(tags, 3e-3)
-        self.weight = np.ones(len(self.readings.value))
+        self._read()
+        self.noise, self.walk = _initial_noise(flight), np.full(tags, 3e-3)
+        self.weight = np.ones(len(self.value))
         self.some = some_rows(len(self.weight), SAMPLED)
-        self.stiffness = _walk_precision(self.knots)
+        difference = np.diff(np.eye(self.knots), axis=0)
+        self.stiffness = difference.T @ difference
 
-    def run(self, rounds: int) -> _Search:
-        """Go on for so many rounds, or until nothing changes any more."""
-        readings, some = self.readings, self.some
-        for _ in range(rounds):
+    def _read(self) -> None:
+        """Line up ratios and carriers: differences of rates (m,) by `design` (m, unknowns), of kind 0 or 1.
+
+        Carriers read by the target are positive where it is faster. Rates are linear between knots, and warm up.
+        """
+        flight, count = self.flight, self.tags * self.knots
+        first, second = flight.ends
+        x = flight.exchanges
+        parts = ((flight.ratio_ppm, first, second), (x.skew1_ppm, second, first), (x.skew2_ppm, first, second))
+        designs, values = [], []
+        for value, plus, minus in parts:
+            rows = np.flatnonzero(np.isfinite(value))
+            time = flight.time_s[rows]
+            knot = np.clip((time / self.step_s).astype(np.int64), 0, self.knots - 2)
+            into = time / self.step_s - knot
+            warm = np.zeros(len(rows)) if self.decay_s is None else np.exp(-time / self.decay_s)
+            columns, entries = [], []
+            for tag, sign in ((plus[rows], 1), (minus[rows], -1)):
+                columns += [tag * self.knots + knot, tag * self.knots + knot + 1, count + tag]
+                entries += [sign * (1 - into), sign * into, sign * warm]
+            place = (np.tile(np.arange(len(rows)), len(columns)), np.concatenate(columns))
+            designs.append(csr_array((np.concatenate(entries), place), shape=(len(rows), count + self.tags)))
+            values.append(value[rows])
+        self.value = np.concatenate(values)
+        self.kind = np.minimum(np.repeat(np.arange(3), [len(part) for part in values]), 1)
+        self.design = csr_array(hstack([vstack(designs), csr_array(np.eye(KINDS)[self.kind])]))
+
+    def run(self) -> Self:
+        """Go on until nothing changes any more."""
+        for _ in range(40):
             before = np.append(self.noise, self.walk)
             self._solve()
-            scatter = self.left[some] ** 2 + _own_variance(readings.design[some], self.covariance)
-            self.weight = (np.abs(self.left) < OUTLIER * self.noise[readings.kind]).astype(np.float64)
-            self._set_noise(scatter, self.weight[some], readings.kind[some])
-            self.walk = _walks(self.found, self.covariance, self.tags, self.knots, self.step_s)
-            if np.max(np.abs(np.log(np.append(self.noise, self.walk) / before))) < SETTLED:
+            self.weight = (np.abs(self.left) < OUTLIER * self.noise[self.kind]).astype(np.float64)
+            self._set_noise(self.some)
+            self.walk = self._walks()
+            if np.max(np.abs(np.log(np.append(self.noise, self.walk) / before))) < 3e-3:
                 break
         return self
 
     def _solve(self) -> None:
         """Find the most likely rates, warming up and biases, and their covariance."""
-        readings, knots, tags = self.readings, self.knots, self.tags
-        precision = self.weight / self.noise[readings.kind] ** 2
-        normal = (readings.design.T @ readings.design.multiply(precision[:, None])).toarray()
-        towards = readings.design.T @ (precision * readings.value)
+        knots, tags = self.knots, self.tags
+        precision = self.weight / self.noise[self.kind] ** 2
+        normal = (self.design.T @ self.design.multiply(precision[:, None])).toarray()
+        towards = self.design.T @ (precision * self.value)
         for k, walk in enumerate(self.walk):
             block = slice(k * knots, (k + 1) * knots)
             normal[block, block] += self.stiffness / (walk**2 * self.step_s)
-        # The mean of the rates at the start is zero, tightly; and a bias that nothing tells is zero.
+        # The mean of the rates at the start is zero, tightly; clocks are thought to run 5 ppm faster at first; and a
+        # bias that nothing tells is zero.
         start = np.arange(tags) * knots
         normal[np.ix_(start, start)] += 1e6
         warm = np.arange(tags * knots, tags * (knots + 1))
-        normal[warm, warm] += 1e12 if self.decay_s is None else WARM_UP_PPM**-2
+        normal[warm, warm] += 1e12 if self.decay_s is None else 5.0**-2
         normal[range(-KINDS, 0), range(-KINDS, 0)] += 1e-6
         self.covariance = np.linalg.inv(normal)
         self.found = self.covariance @ towards
-        self.left = readings.value - readings.design @ self.found
+        self.left = self.value - self.design @ self.found
 
-    def _set_noise(self, scatter: Floats, weight: Floats, kind: Ints) -> None:
-        self.noise = np.array([_spread(scatter, weight, kind == k, self.noise[k]) for k in range(KINDS)])
+    def _set_noise(self, rows: Ints) -> None:
+        """Set the noise of each kind to the most likely, of some rows: their scatter and what the model leaves open."""
+        pieces = [rows[k : k + SAMPLED] for k in range(0, len(rows), SAMPLED)]
+        parts = [self.design[piece] for piece in pieces]
+        own = [np.asarray(part.multiply(part @ self.covariance).sum(axis=1)).ravel() for part in parts]
+        scatter, weight, kind = self.left[rows] ** 2 + np.concatenate(own), self.weight[rows], self.kind[rows]
+        total, count = (np.bincount(kind, v, minlength=KINDS) for v in (weight * scatter, weight))
+        self.noise = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), self.noise)
+
+    def _walks(self) -> Floats:
+        """Return the deviations of the walks that expected steps have, each clock's with one of the average's."""
+        variance = np.zeros(self.tags)
+        for k in range(self.tags):
+            block = slice(k * self.knots, (k + 1) * self.knots)
+            own = self.covariance[block, block]
+            between = np.diag(own)[1:] + np.diag(own)[:-1] - 2 * np.diag(own, 1)
+            variance[k] = np.sum(np.diff(self.found[block]) ** 2 + between)
+        together = variance.mean() / (self.knots - 1)
+        return np.asarray(np.sqrt((variance + together) / self.knots / self.step_s))
 
     def warmed_up(self) -> float:
         """Return how much more than its walk does meanwhile the clock that warms up most does, from all others."""
@@ -153,16 +173,14 @@ class _Search:
 
     def result(self) -> ClockFit:
         """Return what was found; the noise is taken of all readings."""
-        readings, found, count = self.readings, self.found, self.tags * self.knots
-        pieces = range(0, len(self.left), SAMPLED)
-        own = [_own_variance(readings.design[k : k + SAMPLED], self.covariance) for k in pieces]
-        self._set_noise(self.left**2 + np.concatenate(own), self.weight, readings.kind)
+        found, count = self.found, self.tags * self.knots
+        self._set_noise(np.arange(len(self.left)))
         variance = np.diag(self.covariance)[:count].reshape(self.tags, self.knots)
         ratio = np.full(len(self.flight), np.nan)
-        rows = readings.kind == 0
+        rows = self.kind == 0
         if rows.any():
             # The rates follow the ratios a little; what is left is scaled to the noise that is most likely.
-            scale = self.noise[0] / _rms(self.left[rows & (self.weight > 0)])
+            scale = self.noise[0] / np.sqrt(np.mean(self.left[rows & (self.weight > 0)] ** 2))
             ratio[np.isfinite(self.flight.ratio_ppm)] = self.left[rows] * scale
         return ClockFit(
             skew_ppm=found[:count].reshape(self.tags, self.knots)[:, 0],
@@ -177,80 +195,13 @@ class _Search:
         )
 
 
-def _readings(flight: Flight, knots: int, step_s: float, decay_s: float | None) -> _Readings:
-    """Line up ratios and carriers; those of the target's receiver are positive where the target is faster."""
-    first, second = flight.ends
-    x = flight.exchanges
-    parts = ((flight.ratio_ppm, first, second, 0), (x.skew1_ppm, second, first, 1), (x.skew2_ppm, first, second, 1))
-    designs, values, kinds = [], [], []
-    for value, plus, minus, kind in parts:
-        rows = np.flatnonzero(np.isfinite(value))
-        designs.append(_design(flight, rows, plus[rows], minus[rows], knots, step_s, decay_s))
-        values.append(value[rows])
-        kinds.append(np.full(len(rows), kind))
-    which = np.concatenate(kinds)
-    biases = csr_array(np.eye(KINDS)[which])
-    return _Readings(csr_array(hstack([vstack(designs), biases])), np.concatenate(values), which)
-
-
-def _design(
-    flight: Flight, rows: Ints, plus: Ints, minus: Ints, knots: int, step_s: float, decay_s: float | None
-) -> csr_array:
-    """Return rows of the difference of two rates: linear between knots, and warming up."""
-    at = flight.time_s[rows] / step_s
-    knot = np.clip(at.astype(np.int64), 0, knots - 2)
-    into, count = at - knot, len(flight.tags) * knots
-    warm = np.zeros(len(rows)) if decay_s is None else np.exp(-flight.time_s[rows] / decay_s)
-    columns, values = [], []
-    for tag, sign in ((plus, 1), (minus, -1)):
-        columns += [tag * knots + knot, tag * knots + knot + 1, count + tag]
-        values += [sign * (1 - into), sign * into, sign * warm]
-    place = np.tile(np.arange(len(rows)), len(columns))
-    shape = (len(rows), count + len(flight.tags))
-    return csr_array((np.concatenate(values), (place, np.concatenate(columns))), shape=shape)
-
-
-def _first_guess(flight: Flight) -> Floats:
+def _initial_noise(flight: Flight) -> Floats:
     """Return rough noise of ratios and of carriers, from values that do not depend on rates."""
     x = flight.exchanges
-    both = x.skew1_ppm + x.skew2_ppm
-    carrier = _robust(both) / np.sqrt(2) if np.isfinite(both).any() else 0.2
-    apart = flight.ratio_ppm - (x.skew2_ppm - x.skew1_ppm) / 2
-    ratio = np.sqrt(max(_robust(apart) ** 2 - carrier**2 / 2, (0.3 * _robust(apart)) ** 2))
-    return np.array([ratio if np.isfinite(ratio) and ratio > 0 else 0.1, max(carrier, 1e-6)])
-
-
-def _robust(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return bulk_spread(finite) if len(finite) else float("nan")
-
-
-def _walk_precision(knots: int) -> Floats:
-    difference = np.diff(np.eye(knots), axis=0)
-    return np.asarray(difference.T @ difference)
-
-
-def _own_variance(design: csr_array, covariance: Floats) -> Floats:
-    """Return the variances of what the model says of readings, (m,)."""
-    return np.asarray(design.multiply(design @ covariance).sum(axis=1)).ravel()
-
-
-def _spread(scatter: Floats, weight: Floats, rows: Floats, before: float) -> float:
-    total = float(np.sum(weight[rows]))
-    return float(np.sqrt(np.sum((weight * scatter)[rows]) / total)) if total else before
-
-
-def _walks(found: Floats, covariance: Floats, tags: int, knots: int, step_s: float) -> Floats:
-    """Return the deviations of the walks that expected steps have, each clock's with a little of the average."""
-    variance = np.zeros(tags)
-    for k in range(tags):
-        block = slice(k * knots, (k + 1) * knots)
-        own = covariance[block, block]
-        between = np.diag(own)[1:] + np.diag(own)[:-1] - 2 * np.diag(own, 1)
-        variance[k] = np.sum(np.diff(found[block]) ** 2 + between)
-    together = variance.mean() / (knots - 1)
-    return np.asarray(np.sqrt((variance + PRIOR_STEPS * together) / (knots - 1 + PRIOR_STEPS) / step_s))
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    both, apart = x.skew1_ppm + x.skew2_ppm, flight.ratio_ppm - (x.skew2_ppm - x.skew1_ppm) / 2
+    carrier = bulk_spread(both[np.isfinite(both)]) / np.sqrt(2) if np.isfinite(both).any() else 0.2
+    ratio = 0.1
+    if np.isfinite(apart).any():
+        spread = bulk_spread(apart[np.isfinite(apart)])
+        ratio = np.sqrt(max(spread**2 - carrier**2 / 2, (0.3 * spread) ** 2)) or ratio
+    return np.array([ratio, max(carrier, 1e-6)])

@@ -34,13 +34,6 @@ from uwbsim.twins.schedules import fit_schedule
 LEVEL: Final = 0.01
 """Below this probability chance does not explain a difference."""
 
-SIMULATED: Final = 6000
-"""Exchanges that are simulated in all, at least, unless there are four times as many measured."""
-
-MOST_SEEDS: Final = 8
-SHOWN: Final = 4000
-"""Values that are kept of each side for pictures."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
@@ -109,7 +102,8 @@ def compare_flights(
     """Simulate a scenario with seeds 1, 2 and so on, and compare; raises `ParameterError` for less than one seed."""
     if seeds is not None and (isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 1):
         raise ParameterError(f"found {seeds!r}, expected a whole number from 1 on", parameter="seeds")
-    count = seeds or int(np.clip(-(-SIMULATED // len(measured)), 1, MOST_SEEDS))
+    # Without a wish 6000 simulated exchanges or more, by eight seeds at most.
+    count = seeds or int(np.clip(-(-6000 // len(measured)), 1, 8))
     flights = []
     for k in range(count):
         one = scenario.model_copy(update={"run": scenario.run.model_copy(update={"seed": k + 1})})
@@ -131,15 +125,17 @@ def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | 
     theirs = np.concatenate([values for values, _ in parts])
     theirs_group = np.concatenate([pairs + k * span for k, (_, pairs) in enumerate(parts)])
     worth = effective_size(mine, group), float(sum(effective_size(*part) for part in parts))
-    distance = _distance(mine, theirs)
-    low, middle, high = (
-        (float(np.quantile(mine, level)), float(np.quantile(theirs, level))) for level in (0.1, 0.5, 0.9)
-    )
+    # The largest difference of the two cumulative shares.
+    at = np.sort(np.concatenate([mine, theirs]))
+    shares = [np.searchsorted(np.sort(values), at, side="right") / len(values) for values in (mine, theirs)]
+    distance = float(np.max(np.abs(shares[0] - shares[1])))
+    low, middle, high = ([float(np.quantile(values, level)) for values in (mine, theirs)] for level in (0.1, 0.5, 0.9))
+    shown = 4000  # values of each side for pictures
     return Compared(
         name=name,
         unit=unit,
-        measured=_thinned(mine),
-        simulated=_thinned(theirs),
+        measured=mine[some_rows(len(mine), shown)],
+        simulated=theirs[some_rows(len(theirs), shown)],
         count=len(mine),
         median_measured=middle[0],
         median_simulated=middle[1],
@@ -160,18 +156,6 @@ def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | 
 def _finite(values: Floats, pair: Ints) -> tuple[Floats, Ints]:
     good = np.isfinite(values)
     return np.asarray(values[good], dtype=np.float64), pair[good]
-
-
-def _distance(one: Floats, other: Floats) -> float:
-    """Return the largest difference of the two cumulative shares."""
-    at = np.sort(np.concatenate([one, other]))
-    shares = (np.searchsorted(np.sort(values), at, side="right") / len(values) for values in (one, other))
-    first, second = shares
-    return float(np.max(np.abs(first - second)))
-
-
-def _thinned(values: Floats) -> Floats:
-    return values[some_rows(len(values), SHOWN)]
 
 
 def _by_pair(measured: Flight, values: Floats, simulated: list[tuple[Flight, Floats]]) -> dict[str, dict[str, float]]:
@@ -196,15 +180,6 @@ def _by_pair(measured: Flight, values: Floats, simulated: list[tuple[Flight, Flo
             "lag1_simulated": lag_one(together, groups),
         }
     return found
-
-
-ENOUGH: Final = 50_000
-"""Exchanges to which clocks and powers are fitted at most; more would only take longer."""
-
-HEAD: Final = (
-    "The twin of {recording} with {calibration}: fitted to it by `uwbsim twin`, which also wrote what lies beside this "
-    "file. What nothing is said of here has its default."
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -263,27 +238,23 @@ class Twin:
             check_output(file, force=force)
         table = _linked(self.table, path)
         if self.paths:
-            self._save_poses(path.with_suffix(".poses.uwb"), force)
+            order = np.argsort(np.concatenate([one.time_ns for one in self.paths.values()]), kind="stable")
+            columns = ("time_ns", "body", "position_m", "quaternion")
+            poses = Poses(*(np.concatenate([getattr(p, name) for p in self.paths.values()]) for name in columns))
+            with Recording.create(
+                path.with_suffix(".poses.uwb"), meta={"source": "uwbsim twin"}, force=force
+            ) as recording:
+                recording.append_tags([Tag(tag.id, tag.body, tag.lever_arm_m) for tag in self.scenario.tags])
+                recording.append_poses(poses[order])
         if isinstance(table["ranging"].get("plan"), dict):
-            rows = [dict(zip(("time_s", "initiator", "target"), r, strict=True)) for r in self._slots()]
+            slots = self.table["ranging"]["plan"]["slots"]
+            rows = [dict(zip(("time_s", "initiator", "target"), slot, strict=True)) for slot in slots]
             write_csv(path.with_suffix(".plan.csv"), rows, force=force)
-        head = HEAD.format(recording=Path(self.recording).name, calibration=Path(self.calibration).name)
-        write_text(path, scenario_text(table, head), force=force)
-
-    def _slots(self) -> list[tuple[float, int, int]]:
-        return list(self.table["ranging"]["plan"]["slots"])
-
-    def _save_poses(self, path: Path, force: bool) -> None:
-        parts = list(self.paths.values())
-        poses = Poses(
-            np.concatenate([part.time_ns for part in parts]),
-            np.concatenate([part.body for part in parts]),
-            np.concatenate([part.position_m for part in parts]),
-            np.concatenate([part.quaternion for part in parts]),
+        head = (
+            f"The twin of {Path(self.recording).name} with {Path(self.calibration).name}: fitted to it by "
+            "`uwbsim twin`, which also wrote what lies beside this file. What nothing is said of here has its default."
         )
-        with Recording.create(path, meta={"source": "uwbsim twin"}, force=force) as recording:
-            recording.append_tags([Tag(tag.id, tag.body, tag.lever_arm_m) for tag in self.scenario.tags])
-            recording.append_poses(poses[np.argsort(poses.time_ns, kind="stable")])
+        write_text(path, scenario_text(table, head), force=force)
 
     def __repr__(self) -> str:
         """Return what was found, a line each."""
@@ -321,7 +292,15 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
     flight = Flight.of(flown, known, where)
     # One thread: the same bytes on any machine, and small matrices are quicker so.
     with threadpool_limits(limits=1, user_api="blas"):
-        fitted = _fit(flight, flown.faults)
+        # More than 50,000 exchanges would only take longer for clocks and powers.
+        rows = flight.some(50_000)
+        clocks = fit_clocks(flight[rows])
+        noise = receive_noise(flight[rows], clocks)
+        std = np.sqrt(np.mean([noise.at(power) ** 2 for power in flight.power_dbm], axis=0))
+        reflections = fit_reflections(flight, std)
+        powers = fit_powers(flight[rows], reflections.reflected[rows])
+        schedule = fit_schedule(flight, flown.faults)
+    fitted = Fitted(clocks=clocks, noise=noise, reflections=reflections, powers=powers, schedule=schedule)
     name = f"twin of {Path(where).stem}"
     table, paths = tables(flight, known, flown.poses, fitted, name)
     try:
@@ -340,23 +319,6 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         known=known,
         paths=paths,
         table=table,
-    )
-
-
-def _fit(flight: Flight, faults: list[Any]) -> Fitted:
-    rows = flight.some(ENOUGH)
-    part = flight[rows]
-    clocks = fit_clocks(part)
-    noise = receive_noise(part, clocks)
-    std = np.sqrt(np.mean([noise.at(power) ** 2 for power in flight.power_dbm], axis=0))
-    reflections = fit_reflections(flight, std)
-    powers = fit_powers(part, reflections.reflected[rows])
-    return Fitted(
-        clocks=clocks,
-        noise=noise,
-        reflections=reflections,
-        powers=powers,
-        schedule=fit_schedule(flight, faults),
     )
 
 

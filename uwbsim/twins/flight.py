@@ -10,142 +10,96 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Protocol, Self
+from typing import Final, Self
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.recording.contents import Contents
 from uwblink.recording.distances import antennas_m
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Fault, Poses, Tag
+from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges, intervals, without_stamps
 from uwbsim.errors import ScenarioError, UnanswerableError
 from uwbsim.random_streams import stream
+from uwbsim.simulation.simulated import Simulated
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.units import NS
 
-BINS: Final = 24
-MOST_STEPS: Final = 80
-MOST_PRODUCTS: Final = 4_000_000
-SHORTEST_LAG_S: Final = 1e-3
 LONGEST_SHARE: Final = 0.25
-"""Of a flight's length, up to which lags count."""
+"""Share of a flight's length up to which lags count: longer ones have few independent products."""
 
-LONGEST_SUM: Final = 3000
-"""Lags that are added up at most."""
+BLOCK: Final = 2000
+"""Exchanges that stay together where only some are taken, so that short lags stay."""
 
-SIGNIFICANT: Final = 4.0
+MIN_EXCHANGES: Final = 100
+"""Exchanges below which a flight has no twin: quantiles of residuals would be wrong by a tenth of their spread."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Autocovariance:
-    """Mean products of values of a pair that lie some time apart: lags in seconds, covariances, counts, (bins,) each.
+def lasting(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> tuple[float, float | None]:
+    """Return variance and life in seconds of what lasts in values (n,) of pairs, about their pair's mean.
 
-    `variance` is that of the values, `span_s` how long the flight was.
+    An exponential is fitted to the autocovariance over all pairs. Means of pairs are those of a flight as long as it
+    is (`span_s`), which takes a little off every lag; that is in the fit. The life is None, and the variance 0, where
+    the lags that there are do not tell.
     """
+    centred = value - (np.bincount(pair, value) / np.maximum(np.bincount(pair), 1))[pair]
+    variance = float(np.mean(centred**2))
+    lag_s, covariance, count = _autocovariance(time_s, pair, centred, span_s)
+    if len(lag_s) < 3 or variance <= 0:
+        return 0.0, None
+    error = variance / np.sqrt(count)
+    if np.max(covariance / error) < 4:  # standard errors
+        return 0.0, None
 
-    lag_s: Floats
-    covariance: Floats
-    count: Floats
-    variance: float
-    span_s: float
+    def misfit(at: Floats) -> Floats:
+        life = np.exp(at[1])
+        # The share of a variance that the mean over a span has, where the autocovariance is exponential.
+        ratio = life / span_s
+        taken = 2 * ratio * (1 - ratio * (1 - np.exp(-1 / ratio)))
+        return np.asarray((np.exp(at[0]) * (np.exp(-lag_s / life) - taken) - covariance) / error)
+
+    peak = max(covariance.max(), 1e-3 * variance)
+    low, high = np.log([1e-4 * variance, lag_s[0] / 20]), np.log([4 * variance, span_s / 2])
+    starts = [np.clip(np.log([peak, life]), low + 1e-6, high - 1e-6) for life in np.geomspace(lag_s[0], span_s / 8, 4)]
+    tries = [least_squares(misfit, start, bounds=(low, high)) for start in starts]
+    found, life = np.exp(min(tries, key=lambda one: float(one.cost)).x)
+    if life < lag_s[0] / 3 or found > 1.5 * variance:
+        return 0.0, None
+    return float(found), float(life)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lasting:
-    """What lasts: its variance and its life in seconds; None where the lags that there are do not tell."""
-
-    variance: float
-    life_s: float | None
-
-
-def autocovariance(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> Autocovariance:
-    """Return the autocovariance of values (n,) about their pair's mean, over all pairs."""
+def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) -> tuple[Floats, Floats, Ints]:
+    """Return mean products of values of a pair that lie some time apart: lags in seconds, covariances, counts."""
     lags, products = [], []
     for key in np.unique(pair):
         rows = np.flatnonzero(pair == key)
         if len(rows) < 8:
             continue
-        time, centred = time_s[rows], value[rows] - value[rows].mean()
-        for step in _steps(len(rows), len(value)):
+        time, values = time_s[rows], centred[rows]
+        # Products lie 1, 2, ... values of the pair apart, denser where they are few; 4 million of them are enough.
+        most = int(np.clip(4_000_000 // len(centred), 12, 80))
+        steps = np.rint(np.geomspace(1, max(int(len(rows) * LONGEST_SHARE), 2), most)).astype(np.int64)
+        for step in np.unique(steps).tolist():
             apart = time[step:] - time[:-step]
             if apart.min() > LONGEST_SHARE * span_s:
                 break
             lags.append(apart)
-            products.append(centred[step:] * centred[:-step])
-    centred_all = value - (np.bincount(pair, value) / np.maximum(np.bincount(pair), 1))[pair]
-    variance = float(np.mean(centred_all**2))
-    if not lags:
-        nothing = np.zeros(0)
-        return Autocovariance(lag_s=nothing, covariance=nothing, count=nothing, variance=variance, span_s=span_s)
-    lag, product = np.concatenate(lags), np.concatenate(products)
-    near = (lag >= SHORTEST_LAG_S) & (lag <= LONGEST_SHARE * span_s)
+            products.append(values[step:] * values[:-step])
+    lag, product = (np.concatenate(parts) if parts else np.zeros(0) for parts in (lags, products))
+    near = (lag >= 1e-3) & (lag <= LONGEST_SHARE * span_s)
     lag, product = lag[near], product[near]
     if not len(lag):
-        lag, product = np.full(1, SHORTEST_LAG_S), np.zeros(1)
-    edges = np.geomspace(lag.min() * 0.999, lag.max() * 1.001, BINS + 1)
-    which = np.digitize(lag, edges) - 1
-    count = np.bincount(which, minlength=BINS)[:BINS]
+        return lag, product, np.zeros(0, dtype=np.int64)
+    bins = 24
+    which = np.digitize(lag, np.geomspace(lag.min() * 0.999, lag.max() * 1.001, bins + 1)) - 1
+    count, total, where = (np.bincount(which, v, minlength=bins)[:bins] for v in (None, product, lag))
     some = count > 20
-    total, where = (np.bincount(which, v, minlength=BINS)[:BINS] for v in (product, lag))
-    return Autocovariance(
-        lag_s=where[some] / count[some],
-        covariance=total[some] / count[some],
-        count=count[some].astype(np.float64),
-        variance=variance,
-        span_s=span_s,
-    )
-
-
-def _steps(count: int, total: int) -> list[int]:
-    """Return by how many values of a pair products lie apart, denser where they are few."""
-    most = int(np.clip(MOST_PRODUCTS // max(total, 1), 12, MOST_STEPS))
-    longest = max(int(count * LONGEST_SHARE), 2)
-    return sorted(set(np.rint(np.geomspace(1, longest, most)).astype(np.int64).tolist()))
-
-
-def lasting(found: Autocovariance) -> Lasting:
-    """Fit variance and life of an exponential to an autocovariance.
-
-    Means of pairs are those of a flight as long as it is, which takes a little off every lag; that is in the fit.
-    """
-    if len(found.lag_s) < 3 or found.variance <= 0:
-        return Lasting(variance=0.0, life_s=None)
-    error = found.variance / np.sqrt(found.count)
-    if np.max(found.covariance / error) < SIGNIFICANT:
-        return Lasting(variance=0.0, life_s=None)
-
-    def model(at: Floats) -> Floats:
-        life = np.exp(at[1])
-        return np.asarray(np.exp(at[0]) * (np.exp(-found.lag_s / life) - _taken(life, found.span_s)))
-
-    def misfit(at: Floats) -> Floats:
-        return np.asarray((model(at) - found.covariance) / error)
-
-    peak = max(found.covariance.max(), 1e-3 * found.variance)
-    starts = [np.log([peak, life]) for life in np.geomspace(found.lag_s[0], found.span_s / 8, 4)]
-    bounds = (
-        np.log([1e-4 * found.variance, found.lag_s[0] / 20]),
-        np.log([4 * found.variance, found.span_s / 2]),
-    )
-    tries = [
-        least_squares(misfit, np.clip(start, bounds[0] + 1e-6, bounds[1] - 1e-6), bounds=bounds) for start in starts
-    ]
-    best = min(tries, key=lambda one: float(one.cost))
-    variance, life = np.exp(best.x)
-    if life < found.lag_s[0] / 3 or variance > 1.5 * found.variance:
-        return Lasting(variance=0.0, life_s=None)
-    return Lasting(variance=float(variance), life_s=float(life))
-
-
-def _taken(life_s: float, span_s: float) -> float:
-    """Return which share of a variance the mean over a span has that its exponential autocovariance lasts."""
-    ratio = life_s / span_s
-    return float(2 * ratio * (1 - ratio * (1 - np.exp(-1 / ratio))))
+    return where[some] / count[some], total[some] / count[some], count[some]
 
 
 def effective_size(value: Floats, group: Ints) -> float:
@@ -161,7 +115,7 @@ def effective_size(value: Floats, group: Ints) -> float:
     order = np.argsort(group, kind="stable")
     sorted_value, sorted_group = centred[order], group[order]
     total, before, longest = 1.0, 0.0, int(np.bincount(np.unique(group, return_inverse=True)[1]).max())
-    for step in range(1, min(longest, LONGEST_SUM)):
+    for step in range(1, min(longest, 3000)):
         same = sorted_group[step:] == sorted_group[:-step]
         if np.count_nonzero(same) < 2:
             break
@@ -196,46 +150,19 @@ def lag_one(value: Floats, group: Ints) -> float:
     return float(np.mean(sorted_value[1:][same] * sorted_value[:-1][same]) / variance)
 
 
-BLOCK: Final = 2000
-FEWEST: Final = 100
-"""Exchanges below which nothing of a distribution can be told."""
-
-
-class Flown(Protocol):
-    """What a flight must have: a `Contents`, a `Simulated` flight, or what is read of a recording."""
-
-    @property
-    def exchanges(self) -> Exchanges: ...  # noqa: D102 - the columns of a recording
-    @property
-    def tags(self) -> list[Tag]: ...  # noqa: D102
-    @property
-    def poses(self) -> Poses: ...  # noqa: D102
-    @property
-    def faults(self) -> list[Fault]: ...  # noqa: D102
-
-
-RecordingSource = str | os.PathLike[str] | Flown
+RecordingSource = str | os.PathLike[str] | Contents | Simulated
 """A recording: its file (.uwb), or what one holds, in memory."""
 
 
-@dataclass(frozen=True, slots=True)
-class Flew:
-    """What a twin needs of a recording."""
-
-    exchanges: Exchanges
-    tags: list[Tag]
-    poses: Poses
-    faults: list[Fault]
-
-
-def read_flight(source: RecordingSource) -> tuple[Flown, str]:
+def read_flight(source: RecordingSource) -> tuple[Contents | Simulated, str]:
     """Return what a recording holds and what messages call it; raises what `Recording.open` raises."""
     if not isinstance(source, str | os.PathLike):
         if not all(hasattr(source, name) for name in ("exchanges", "tags", "poses", "faults")):
             raise ScenarioError(f"recording: found {source!r:.60}, expected a file (.uwb) or what one holds")
         return source, "recording"
-    with Recording.open(Path(source)) as recording:
-        return Flew(recording.exchanges(), recording.tags(), recording.poses(), recording.faults()), str(source)
+    with Recording.open(Path(source)) as file:
+        held = Contents(exchanges=file.exchanges(), tags=file.tags(), poses=file.poses(), faults=file.faults())
+        return held, str(source)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -260,7 +187,6 @@ class Flight:
     towards: Floats
     residual_m: Floats
     ratio_ppm: Floats
-    left_out: int = 0
 
     def __len__(self) -> int:
         """Return the number of exchanges."""
@@ -291,36 +217,62 @@ class Flight:
         return np.unique(begins[:, None] + np.arange(BLOCK))
 
     @property
+    def interval_s(self) -> float:
+        """Return how soon a pair mostly ranges again, in seconds."""
+        order = np.lexsort((self.time_s, self.pair))
+        apart = np.diff(self.time_s[order])[np.diff(self.pair[order]) == 0]
+        return float(np.median(apart)) if len(apart) else float("inf")
+
+    @property
     def power_dbm(self) -> Floats:
         """First-path powers read at target and initiator, (2, n)."""
         return np.array([self.exchanges.fpp1_dbm, self.exchanges.fpp2_dbm])
 
     @classmethod
-    def of(cls, flown: Flown, known: KnownDevices, where: str = "recording", *, fewest: int = FEWEST) -> Self:
+    def of(
+        cls, flown: Contents | Simulated, known: KnownDevices, where: str = "recording", *, fewest: int = MIN_EXCHANGES
+    ) -> Self:
         """Take the columns; raises `ScenarioError` where a recording cannot have a twin."""
-        exchanges, row = _of_one_protocol(flown.exchanges, where)
-        _check(flown, exchanges, where, fewest)
-        tags = _those_that_range(flown.tags, exchanges, where)
+        names, counts = np.unique(flown.exchanges.protocol, return_counts=True)
+        if not len(names):
+            raise UnanswerableError(f"{where}: holds no exchanges; record or import some first")
+        row = PROTOCOLS[str(names[np.argmax(counts)])]
+        exchanges = flown.exchanges[np.flatnonzero(flown.exchanges.protocol == row.name)]
+        if len(exchanges) < fewest:
+            raise UnanswerableError(
+                f"{where}: holds {len(exchanges)} exchanges, a twin needs {fewest} or more; record longer"
+            )
+        if not len(flown.poses):
+            raise UnanswerableError(f"{where}: holds no poses; add motion capture with `uwblink poses`")
+        if not np.any(_powered(exchanges)):
+            raise UnanswerableError(f"{where}: no exchange has both first-path powers, and a twin is made from powers")
+        ids = set(np.unique([exchanges.initiator, exchanges.target]).tolist())
+        lacking = sorted(ids - {tag.tag for tag in flown.tags})
+        if lacking:
+            raise UnanswerableError(
+                f"{where}: does not say on which body tag {', '.join(map(str, lacking))} sits; give tags with "
+                "'uwblink poses --tags'"
+            )
+        tags = tuple(tag for tag in flown.tags if tag.tag in ids)
         known.require([tag.tag for tag in tags])
-        order = np.argsort(exchanges.time_ns, kind="stable")
-        exchanges = exchanges[order]
-        spots = [antennas_m(flown.poses, list(tags), ids, exchanges.time_ns) for ids in _ids(exchanges)]
-        good = np.isfinite(spots[0] + spots[1]).all(axis=1) & _powered(exchanges) & ~without_stamps(exchanges)
-        good &= exchanges.initiator != exchanges.target
+        exchanges = exchanges[np.argsort(exchanges.time_ns, kind="stable")]
+        ends = np.array([exchanges.initiator, exchanges.target], dtype=np.int64)
+        spots = np.array([antennas_m(flown.poses, list(tags), end, exchanges.time_ns) for end in ends])
+        good = np.isfinite(spots).all(axis=(0, 2)) & _powered(exchanges) & ~without_stamps(exchanges)
+        good &= ends[0] != ends[1]
         if np.count_nonzero(good) < fewest:
             raise UnanswerableError(
                 f"{where}: {np.count_nonzero(good)} of {len(good)} exchanges have stamps, both powers and poses around "
                 f"them, a twin needs {fewest} or more; record longer, and with motion capture all the time"
             )
-        exchanges, spots = exchanges[good], [spot[good] for spot in spots]
-        apart = spots[1] - spots[0]
-        distance = np.linalg.norm(apart, axis=1)
-        unit = apart / np.maximum(distance, 1e-9)[:, None]
-        place = {tag.tag: k for k, tag in enumerate(tags)}
-        ends = np.array([[place[int(tag)] for tag in ids.tolist()] for ids in _ids(exchanges)])
-        names, pair = np.unique(np.sort(np.array(_ids(exchanges)), axis=0), axis=1, return_inverse=True)
-        origin = int(exchanges.time_ns[0])
-        turned = [
+        exchanges, spots, ends = exchanges[good], spots[:, good], ends[:, good]
+        distance = np.linalg.norm(spots[1] - spots[0], axis=1)
+        unit = (spots[1] - spots[0]) / np.maximum(distance, 1e-9)[:, None]
+        names, pair = np.unique(np.sort(ends, axis=0), axis=1, return_inverse=True)
+        places = np.array([tag.tag for tag in tags])
+        order = np.argsort(places)
+        ends = order[np.searchsorted(places[order], ends)]
+        towards = [
             _into_body(flown.poses, tags, end, exchanges.time_ns, way)
             for end, way in zip(ends, (unit, -unit), strict=True)
         ]
@@ -328,56 +280,21 @@ class Flight:
             tags=tags,
             row=row,
             exchanges=exchanges,
-            origin_ns=origin,
-            time_s=np.asarray((exchanges.time_ns - origin) * NS, dtype=np.float64),
+            origin_ns=int(exchanges.time_ns[0]),
+            time_s=np.asarray((exchanges.time_ns - exchanges.time_ns[0]) * NS, dtype=np.float64),
             ends=ends,
             pair=pair.ravel(),
             pairs=tuple((int(a), int(b)) for a, b in names.T),
             distance_m=distance,
-            towards=np.array(turned),
+            towards=np.array(towards),
             residual_m=known.corrected_m(exchanges) - distance,
             ratio_ppm=_ratio_ppm(exchanges, row),
-            left_out=len(flown.exchanges) - len(exchanges),
         )
 
 
-def _ids(exchanges: Exchanges) -> tuple[Ints, Ints]:
-    return exchanges.initiator.astype(np.int64), exchanges.target.astype(np.int64)
-
-
-def _of_one_protocol(exchanges: Exchanges, where: str) -> tuple[Exchanges, RangingProtocol]:
-    names, counts = np.unique(exchanges.protocol, return_counts=True)
-    if not len(names):
-        raise UnanswerableError(f"{where}: holds no exchanges; record or import some first")
-    name = str(names[np.argmax(counts)])
-    return exchanges[np.flatnonzero(exchanges.protocol == name)], PROTOCOLS[name]
-
-
-def _check(flown: Flown, exchanges: Exchanges, where: str, fewest: int) -> None:
-    if len(exchanges) < fewest:
-        raise UnanswerableError(
-            f"{where}: holds {len(exchanges)} exchanges, a twin needs {fewest} or more; record longer"
-        )
-    if not len(flown.poses):
-        raise UnanswerableError(f"{where}: holds no poses; add motion capture with `uwblink poses`")
-    if not np.any(_powered(exchanges)):
-        raise UnanswerableError(f"{where}: no exchange has both first-path powers, and a twin is made from powers")
-
-
-def _powered(exchanges: Exchanges) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _powered(exchanges: Exchanges) -> Bools:
     powers = np.array([exchanges.fpp1_dbm, exchanges.fpp2_dbm])
     return np.asarray(np.all(np.isfinite(powers) & (powers < 0), axis=0))
-
-
-def _those_that_range(tags: Sequence[Tag], exchanges: Exchanges, where: str) -> tuple[Tag, ...]:
-    ids = set(np.unique([exchanges.initiator, exchanges.target]).tolist())
-    known = {tag.tag for tag in tags}
-    if ids - known:
-        lacking = ", ".join(map(str, sorted(ids - known)))
-        raise UnanswerableError(
-            f"{where}: does not say on which body tag {lacking} sits; give tags with 'uwblink poses --tags'"
-        )
-    return tuple(tag for tag in tags if tag.tag in ids)
 
 
 def _into_body(poses: Poses, tags: Sequence[Tag], end: Ints, time_ns: Ints, way: Floats) -> Floats:

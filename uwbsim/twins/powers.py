@@ -9,31 +9,17 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwbsim.twins.flight import Flight, Lasting, autocovariance, bulk_spread, effective_size, lasting
+from uwbsim.twins.flight import Flight, bulk_spread, effective_size, lasting
 from uwbsim.world.radio import ANTENNAS, harmonics
 
-LEAST_SPREAD: Final = 0.05
-"""Of the decimal logarithm of distance, below which nothing is told of path loss."""
+MIN_LOG_SPREAD: Final = 0.05
+"""Standard deviation of log10(distance) below which nothing is told of path loss: distances within some 12 %."""
 
-DEFAULT_EXPONENT: Final = 2.0
-DEGREES: Final = ((800, 3), (250, 2), (80, 1))
-"""Of antenna patterns, by how many readings a tag has at least."""
+MIN_REFLECTED: Final = 5.0
+"""Reflected exchanges, by their probabilities, below which nothing is told of their losses."""
 
-OFFSET_STD_DB: Final = 4.0
-"""How different offsets of tags are thought to be before anything is seen."""
-
-PATTERN_STD_DB: Final = 2.0
-"""The same for a harmonic of degree 1 of an antenna; higher ones are as much smaller as their degree."""
-
-BETTER: Final = 0.97
-"""Of the variance that is left, below which an antenna with a shape is taken instead of none."""
-
-HUBER: Final = 1.5
-"""Times their spread, beyond which readings count less: fades are deep more often than normal."""
-
-REWEIGHTED: Final = 5
 LEVELS: Final = 41
-LEAST_WEIGHT: Final = 5.0
+"""Quantiles of fading that a scenario gets, and so the fewest readings that they are taken of."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +30,7 @@ class PowerFit:
     (tags, harmonics) are of tags, by place. `reflection_loss_db` with `reflection_loss_std_db` about it is what a
     reflection takes off, None where there are too few. `fading_db` is how much fading both ends share,
     `fading_levels_db` its quantiles; it lasts `fading_life_s`, None where the recording does not tell;
-    `noise_db` is of a reading. `left_db` (2, n) is what all but fading and noise leave.
+    `noise_db` is of a reading.
     """
 
     at_1m_dbm: float
@@ -59,7 +45,6 @@ class PowerFit:
     fading_levels_db: Floats
     fading_life_s: float | None
     noise_db: float
-    left_db: Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,44 +58,31 @@ class _Solved:
     left_db: Floats
 
 
-@dataclass(frozen=True, slots=True)
-class _Doubt:
-    """How often readings are weighed anew, and the variance in dB^2 with which one tells something of an antenna."""
-
-    rounds: int
-    scale_db2: float = 100.0
-
-
 def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     """Fit powers of a flight whose ranges are reflected with known probabilities (n,)."""
-    share = float(reflected.sum())
-    tries = [_solve(flight, reflected, antenna, _Doubt(rounds=1)) for antenna in ANTENNAS]
-    enough = share >= LEAST_WEIGHT
-    plain = tries[0]
-    best = min(tries[1:], key=lambda one: float(np.var(one.left_db)))
-    antenna = (best if np.var(best.left_db) < BETTER * np.var(plain.left_db) else plain).antenna
-    doubt = _Doubt(rounds=REWEIGHTED, scale_db2=_worth_db2(flight, best if antenna == best.antenna else plain))
-    solved = _solve(flight, reflected, antenna, doubt)
+    enough = float(reflected.sum()) >= MIN_REFLECTED
+    plain, *shaped = [_solve(flight, reflected, antenna, rounds=1) for antenna in ANTENNAS]
+    best = min(shaped, key=lambda one: float(np.var(one.left_db)))
+    # An antenna with a shape is taken where it leaves 3 % less than none.
+    if np.var(best.left_db) >= 0.97 * np.var(plain.left_db):
+        best = plain
+    # A reading has the variance that is left, as much larger as values that last are worth less than their number.
+    both = best.left_db.mean(axis=0)
+    scale_db2 = float(np.var(best.left_db) * 2 * len(both) / effective_size(both, flight.pair))
+    solved = _solve(flight, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
     if solved.loss_db < 0:
         # Reflections are not stronger than what they replace; what looks like that is something else.
         reflected = np.zeros(len(flight))
-        solved = _solve(flight, reflected, antenna, doubt)
-    told = np.std(np.log10(flight.distance_m)) >= LEAST_SPREAD
+        solved = _solve(flight, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
     # Where a tag was seen from one side only, its antenna can take its offsets over; towards there they count together.
     seen = _mean_gains(flight, solved.pattern_db)
     level, own, tx, offset = _split(*(solved.tags_db + seen))
     fading, loss_std = _common(solved, reflected)
     both = solved.left_db.mean(axis=0)
-    noise = _spread(solved.left_db[0] - solved.left_db[1]) / np.sqrt(2)
-    span = float(flight.time_s[-1])
-    found = (
-        lasting(autocovariance(flight.time_s, flight.pair, both, span))
-        if fading > 0
-        else Lasting(variance=0, life_s=None)
-    )
+    _, life = lasting(flight.time_s, flight.pair, both, float(flight.time_s[-1])) if fading > 0 else (0.0, None)
     return PowerFit(
         at_1m_dbm=solved.at_1m_dbm + level,
-        exponent=solved.exponent if told else None,
+        exponent=solved.exponent if np.std(np.log10(flight.distance_m)) >= MIN_LOG_SPREAD else None,
         antenna=solved.antenna,
         tx_db=tx,
         offset_db=offset,
@@ -119,39 +91,50 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
         reflection_loss_std_db=min(loss_std, max(solved.loss_db, 0.0) / 2),
         fading_db=fading,
         fading_levels_db=_levels(both, reflected, fading),
-        fading_life_s=found.life_s,
-        noise_db=noise,
-        left_db=solved.left_db,
+        fading_life_s=life,
+        noise_db=max(bulk_spread(solved.left_db[0] - solved.left_db[1]), 1e-6) / np.sqrt(2),
     )
 
 
-def _solve(flight: Flight, reflected: Floats, antenna: str, doubt: _Doubt) -> _Solved:
-    """Solve one penalized least-squares problem: two readings an exchange."""
-    tags, degree = len(flight.tags), _degree(flight)
+def _solve(flight: Flight, reflected: Floats, antenna: str, *, rounds: int, scale_db2: float = 100.0) -> _Solved:
+    """Solve one penalized least-squares problem: two readings an exchange, weighed anew in each of the rounds.
+
+    `scale_db2` is the variance in dB^2 with which a reading tells something of an antenna. Offsets of tags are thought
+    to differ by 4 dB before anything is seen, harmonics of degree 1 of an antenna by 2 dB, and higher ones as much less
+    as their degree. Degrees are those that a tag's readings can tell.
+    """
+    tags, each = len(flight.tags), 4 * len(flight) / len(flight.tags)
+    degree = next((degree for least, degree in ((800, 3), (250, 2), (80, 1)) if each >= least), 0)
     size = (degree + 1) ** 2 - 1  # all of a tag's readings know of its mean, which the offsets have
     apart = -10 * np.log10(flight.distance_m)
     gain = sum(ANTENNAS[antenna](np.hypot(way[:, 0], way[:, 1])) for way in flight.towards)
     blocks, readings = [], []
     waves = [harmonics(way, degree)[:, 1:] for way in flight.towards]
     for receiver in (1, 0):
-        sender = 1 - receiver
         columns = np.zeros((len(flight), 3 + 2 * tags + tags * size))
         columns[:, 0], columns[:, 1], columns[:, 2] = 1, apart, -reflected
         rows = np.arange(len(flight))
-        columns[rows, 3 + flight.ends[sender]] = 1
+        columns[rows, 3 + flight.ends[1 - receiver]] = 1
         columns[rows, 3 + tags + flight.ends[receiver]] = 1
         for end, wave in zip(flight.ends, waves, strict=True):
             first = 3 + 2 * tags + end * size
             for k in range(size):
                 columns[rows, first + k] += wave[:, k]
         blocks.append(columns)
-        readings.append(flight.power_dbm[0 if receiver == 1 else 1] - gain)
+        readings.append(flight.power_dbm[1 - receiver] - gain)
     design, value = np.vstack(blocks), np.concatenate(readings)
-    penalty, weight = _penalty(tags, degree, flight, doubt.scale_db2), np.ones(len(value))
-    for _ in range(doubt.rounds):
-        found = _ridge(design, value, penalty, weight)
+    exponent = 1e9 if np.std(np.log10(flight.distance_m)) < MIN_LOG_SPREAD else 0.0
+    fine = [scale_db2 * (k / 2.0) ** 2 for k in range(1, degree + 1) for _ in range(2 * k + 1)]
+    penalty = np.array([0.0, exponent, 1e-6] + [scale_db2 / 4.0**2] * (2 * tags) + fine * tags)
+    prior, weight = np.zeros(design.shape[1]), np.ones(len(value))
+    prior[1] = 2.0  # the exponent in free space
+    for _ in range(rounds):
+        weighted = (design * weight[:, None]).T
+        normal = weighted @ design + np.diag(penalty) + 1e-9 * np.eye(len(penalty))
+        found = prior + np.linalg.solve(normal, weighted @ (value - design @ prior))
         left = value - design @ found
-        weight = 1 / np.maximum(np.abs(left) / (HUBER * _spread(left)), 1.0)
+        # Huber's weights: fades are deep more often than normal.
+        weight = 1 / np.maximum(np.abs(left) / (1.5 * max(bulk_spread(left), 1e-6)), 1.0)
     return _Solved(
         antenna=antenna,
         at_1m_dbm=float(found[0]),
@@ -161,38 +144,6 @@ def _solve(flight: Flight, reflected: Floats, antenna: str, doubt: _Doubt) -> _S
         pattern_db=found[3 + 2 * tags :].reshape(tags, size),
         left_db=left.reshape(2, -1),
     )
-
-
-def _degree(flight: Flight) -> int:
-    each = 4 * len(flight) / len(flight.tags)
-    return next((degree for least, degree in DEGREES if each >= least), 0)
-
-
-def _penalty(tags: int, degree: int, flight: Flight, scale_db2: float) -> Floats:
-    """Return prior precisions by unknown, in units of what a reading tells; fine patterns are less likely."""
-    free = [0.0, 0.0, 1e-6]
-    if np.std(np.log10(flight.distance_m)) < LEAST_SPREAD:
-        free[1] = 1e9
-    fine = [k**2 / PATTERN_STD_DB**2 for k in range(1, degree + 1) for _ in range(2 * k + 1)]
-    return np.array(free + [scale_db2 / OFFSET_STD_DB**2] * (2 * tags) + [scale_db2 * one for one in fine] * tags)
-
-
-def _worth_db2(flight: Flight, solved: _Solved) -> float:
-    """Return the variance of a reading, as much larger as values that last are worth less than their number."""
-    both = solved.left_db.mean(axis=0)
-    return float(np.var(solved.left_db) * 2 * len(both) / effective_size(both, flight.pair))
-
-
-def _ridge(design: Floats, value: Floats, penalty: Floats, weight: Floats) -> Floats:
-    prior = np.zeros(design.shape[1])
-    prior[1] = DEFAULT_EXPONENT
-    weighted = (design * weight[:, None]).T
-    normal = weighted @ design + np.diag(penalty) + 1e-9 * np.eye(len(penalty))
-    return np.asarray(prior + np.linalg.solve(normal, weighted @ (value - design @ prior)))
-
-
-def _spread(values: Floats) -> float:
-    return max(bulk_spread(values), 1e-6)
 
 
 def _mean_gains(flight: Flight, pattern_db: Floats) -> Floats:
@@ -236,7 +187,7 @@ def _common(solved: _Solved, reflected: Floats) -> tuple[float, float]:
     first, second = solved.left_db
     unsure = reflected * (1 - reflected) * solved.loss_db**2
     design = np.column_stack([np.ones(len(reflected)), reflected])
-    if reflected.sum() < LEAST_WEIGHT:
+    if reflected.sum() < MIN_REFLECTED:
         return float(np.sqrt(max(np.mean(first * second), 0.0))), 0.0
     found = np.linalg.lstsq(design, first * second - unsure, rcond=None)[0]
     return float(np.sqrt(max(found[0], 0.0))), float(np.sqrt(max(found[1], 0.0)))

@@ -18,39 +18,30 @@ from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import intervals
 from uwbsim.scenario.radio import TwoStateMultipath
-from uwbsim.twins.flight import Flight, Lasting, autocovariance, bulk_spread, effective_size, lasting, some_rows
+from uwbsim.twins.flight import Flight, bulk_spread, effective_size, lasting, some_rows
 
-LEAST_SHARE: Final = 1e-4
+MIN_SHARE: Final = 1e-4
+"""Shares of reflections are kept so far from 0 and 1, where their logarithms end."""
+
 SHORTEST_CORE_M: Final = 1e-3
-ROUNDS: Final = 50
-SAMPLED: Final = 30_000
-"""Ranges to which the core and the tail of all are fitted, at most."""
+"""A core is not narrower than this, far below a tick (4.7 mm)."""
 
-TRIM_M: Final = 0.6
-"""Nearer than this a residual may be of the core for certain; further below it is a mistake of some other kind."""
-
-LEAST_DETOUR: Final = 1.0
-"""Of a detour to the spread of the core: shorter ones cannot be told from it."""
-
-NEEDED: Final = 8.0
-DETOUR_M: Final = TwoStateMultipath(model="two-state").mean_excess_m
-ENOUGH_SPELLS: Final = 6.0
+UNKNOWN_VARIANCE: Final = 1e6
+"""Of what a pair does not tell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReflectionFit:
     """Core and tail: all lengths in metres.
 
-    `core_mean_m`: the mean of direct ranges; `direct_std_m` their spread beyond `white_m` (n,), the noise of receive
-    stamps; `share` of reflected ranges and `mean_excess_m` of their detours, over all pairs, with `share_std` and
-    `life_spread` between pairs; `pair_share`, `pair_excess_m`, `pair_life_s` are those of pairs (pairs,), drawn towards
-    all by how little each tells. `life_s` is None where the recording does not tell. `reflected` (n,) is the
-    probability that a range is.
+    `core_mean_m`: the mean of direct ranges; `direct_std_m` their spread beyond the noise of receive stamps; `share` of
+    reflected ranges and `mean_excess_m` of their detours, over all pairs, with `share_std` and `life_spread` between
+    pairs; `pair_share`, `pair_excess_m`, `pair_life_s` are those of pairs (pairs,), drawn towards all by how little
+    each tells. `life_s` is None where the recording does not tell. `reflected` (n,) is the probability that a range is.
     """
 
     core_mean_m: float
     direct_std_m: float
-    white_m: Floats
     share: float
     share_std: float
     mean_excess_m: float
@@ -66,20 +57,34 @@ def fit_reflections(flight: Flight, receive_noise_s: Floats) -> ReflectionFit:
     """Fit a flight, whose receive stamps have noises (n,) in seconds, zero where none is known."""
     white = range_noise_m(flight, receive_noise_s)
     error, pair, count = flight.residual_m, flight.pair, len(flight.pairs)
-    usable = error > np.median(error) - TRIM_M
+    # Further below the median than this a residual is a mistake of some other kind.
+    usable = error > np.median(error) - 0.6
     mean, direct, excess, share = _mixture(error[usable], white[usable])
-    core = np.hypot(white, direct)
     if not _is_a_tail(error[usable], white[usable], mean, direct, excess, share):
-        return _no_tail(flight, error, white)
-    reflected = _responsibility(error, mean, core, excess, np.full(len(error), share))
-    found = _lasting_of(flight, reflected)
+        direct = float(np.sqrt(max(bulk_spread(error) ** 2 - float(np.mean(white**2)), 0.0)))
+        excess = TwoStateMultipath(model="two-state").mean_excess_m
+        return ReflectionFit(
+            core_mean_m=float(np.median(error)),
+            direct_std_m=direct if direct > SHORTEST_CORE_M else 0.0,
+            share=0.0,
+            share_std=0.0,
+            mean_excess_m=excess,
+            life_s=None,
+            life_spread=0.0,
+            pair_share=np.zeros(count),
+            pair_excess_m=np.full(count, excess),
+            pair_life_s=np.full(count, np.nan),
+            reflected=np.zeros(len(flight)),
+        )
+    core = np.hypot(white, direct)
+    reflected = _responsibility(error, mean, core, excess, share)
+    _, life = lasting(flight.time_s, pair, reflected, float(flight.time_s[-1]))
     pair_share, spread = _shares(flight, mean, core, excess, share, reflected)
     reflected = _responsibility(error, mean, core, excess, pair_share[pair])
-    life, pair_life, life_spread = _lives(flight, reflected, found, pair_share)
+    pair_life, life_spread = _lives(flight, reflected, life, pair_share)
     return ReflectionFit(
         core_mean_m=mean,
         direct_std_m=direct,
-        white_m=white,
         share=share,
         share_std=spread,
         mean_excess_m=excess,
@@ -103,7 +108,7 @@ def range_noise_m(flight: Flight, receive_noise_s: Floats) -> Floats:
 
 def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
     """Return the core's mean, its spread beyond the white noise, the mean detour and the share of the tail."""
-    thin = some_rows(len(error), SAMPLED)
+    thin = some_rows(len(error), 30_000)
     error, white = error[thin], white[thin]
     scale = max(bulk_spread(error), SHORTEST_CORE_M)
 
@@ -112,7 +117,7 @@ def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
 
     def loss(at: Floats) -> float:
         mean, direct, excess, share = unpack(at)
-        return -float(np.mean(_log_density(error, mean, np.hypot(white, direct), excess, share)))
+        return -float(np.mean(np.logaddexp(*_log_densities(error, mean, np.hypot(white, direct), excess, share))))
 
     tries = []
     for guess in (0.05, 0.3):
@@ -127,62 +132,34 @@ def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
 def _is_a_tail(error: Floats, white: Floats, mean: float, direct: float, excess: float, share: float) -> bool:
     """Say whether the tail explains more than a core alone, beyond what a few of its exchanges could by chance."""
     core, alone = np.hypot(white, direct), max(float(np.std(error)), SHORTEST_CORE_M)
-    if excess < LEAST_DETOUR * float(np.median(core)):
+    # Detours shorter than the spread of the core cannot be told from it.
+    if excess < float(np.median(core)):
         return False
-    with_tail = _log_density(error, mean, core, excess, share)
+    with_tail = np.logaddexp(*_log_densities(error, mean, core, excess, share))
     without = -0.5 * ((error - error.mean()) / alone) ** 2 - np.log(alone * np.sqrt(2 * np.pi))
-    return float(np.sum(with_tail - without)) > NEEDED
+    return float(np.sum(with_tail - without)) > 8
 
 
-def _no_tail(flight: Flight, error: Floats, white: Floats) -> ReflectionFit:
-    """Return a core alone."""
-    mean = float(np.median(error))
-    direct = float(np.sqrt(max(bulk_spread(error) ** 2 - float(np.mean(white**2)), 0.0)))
-    pairs = len(flight.pairs)
-    return ReflectionFit(
-        core_mean_m=mean,
-        direct_std_m=direct if direct > SHORTEST_CORE_M else 0.0,
-        white_m=white,
-        share=0.0,
-        share_std=0.0,
-        mean_excess_m=DETOUR_M,
-        life_s=None,
-        life_spread=0.0,
-        pair_share=np.zeros(pairs),
-        pair_excess_m=np.full(pairs, DETOUR_M),
-        pair_life_s=np.full(pairs, np.nan),
-        reflected=np.zeros(len(flight)),
-    )
-
-
-def _log_density(error: Floats, mean: float, core: Floats, excess: float, share: float | Floats) -> Floats:
+def _log_densities(
+    error: Floats, mean: float, core: Floats, excess: float, share: Floats | float
+) -> tuple[Floats, Floats]:
+    """Return the logarithms of the densities of direct ranges (normal) and of reflected (normal plus exponential)."""
     core = np.maximum(core, SHORTEST_CORE_M)
-    share = np.clip(share, LEAST_SHARE, 1 - LEAST_SHARE)
-    direct = np.log1p(-share) - 0.5 * ((error - mean) / core) ** 2 - np.log(core * np.sqrt(2 * np.pi))
-    return np.asarray(np.logaddexp(direct, np.log(share) + _log_tail(error - mean, core, excess)))
-
-
-def _log_tail(error: Floats, core: Floats, excess: float) -> Floats:
-    """Return the logarithm of the density of a normal plus an exponential variable."""
-    z = error / core
-    ratio = core / excess
-    far = 0.5 * ratio**2 - ratio * z + log_ndtr(z - ratio)
+    share = np.clip(share, MIN_SHARE, 1 - MIN_SHARE)
+    z, ratio = (error - mean) / core, core / excess
+    direct = np.log1p(-share) - 0.5 * z**2 - np.log(core * np.sqrt(2 * np.pi))
+    # Far in the tail by the normal's distribution; elsewhere by erfcx, which does not cancel.
     at = (ratio - z) / np.sqrt(2)
     with np.errstate(over="ignore", divide="ignore"):
         near = -0.5 * z**2 + np.log(erfcx(np.maximum(at, -5.0)) / 2)
-    return np.asarray(np.where(at > -5.0, near, far) - np.log(excess))
+    tail = np.where(at > -5.0, near, 0.5 * ratio**2 - ratio * z + log_ndtr(z - ratio)) - np.log(excess)
+    return direct, np.asarray(np.log(share) + tail)
 
 
-def _responsibility(error: Floats, mean: float, core: Floats, excess: float, share: Floats) -> Floats:
+def _responsibility(error: Floats, mean: float, core: Floats, excess: float, share: Floats | float) -> Floats:
     """Return the probability that each range is reflected."""
-    core = np.maximum(core, SHORTEST_CORE_M)
-    share = np.clip(share, LEAST_SHARE, 1 - LEAST_SHARE)
-    tail = np.log(share) + _log_tail(error - mean, core, excess)
-    return np.asarray(np.exp(tail - _log_density(error, mean, core, excess, share)))
-
-
-def _lasting_of(flight: Flight, value: Floats) -> Lasting:
-    return lasting(autocovariance(flight.time_s, flight.pair, value, float(flight.time_s[-1])))
+    direct, reflected = _log_densities(error, mean, core, excess, share)
+    return np.asarray(np.exp(reflected - np.logaddexp(direct, reflected)))
 
 
 def _shares(
@@ -192,7 +169,7 @@ def _shares(
     pair, count = flight.pair, len(flight.pairs)
     number = np.maximum(np.bincount(pair, minlength=count), 1)
     own = np.full(count, share)
-    for _ in range(ROUNDS):
+    for _ in range(50):
         weight = _responsibility(flight.residual_m, mean, core, excess, own[pair])
         own = np.bincount(pair, weight, minlength=count) / number
     centred = reflected - (np.bincount(pair, reflected, minlength=count) / number)[pair]
@@ -230,21 +207,21 @@ def _excesses(error: Floats, reflected: Floats, pair: Ints, count: int, excess: 
     return np.maximum(_drawn_together(own * scale, noise, excess, _between(own * scale, noise)), 0.1 * excess)
 
 
-def _lives(flight: Flight, reflected: Floats, found: Lasting, share: Floats) -> tuple[float | None, Floats, float]:
-    """Return the life of all, of pairs, and its spread in logarithms."""
+def _lives(flight: Flight, reflected: Floats, life_s: float | None, share: Floats) -> tuple[Floats, float]:
+    """Return the lives of pairs, drawn towards that of all, and their spread in logarithms."""
     count = len(flight.pairs)
-    if found.life_s is None:
-        return None, np.full(count, np.nan), 0.0
+    if life_s is None:
+        return np.full(count, np.nan), 0.0
     span = float(flight.time_s[-1])
-    own, noise = np.full(count, np.log(found.life_s)), np.full(count, 1e6)
+    own, noise = np.full(count, np.log(life_s)), np.full(count, UNKNOWN_VARIANCE)
     for k in range(count):
         rows = np.flatnonzero(flight.pair == k)
-        spells = 2 * share[k] * (1 - share[k]) * span / found.life_s
-        if len(rows) < 30 or spells < ENOUGH_SPELLS:
+        spells = 2 * share[k] * (1 - share[k]) * span / life_s
+        if len(rows) < 30 or spells < 6:
             continue
-        mine = lasting(autocovariance(flight.time_s[rows], np.zeros(len(rows), np.int64), reflected[rows], span))
-        if mine.life_s is not None:
-            own[k], noise[k] = np.log(mine.life_s), 2 / spells + 0.01
-    between = _between(own[noise < 1e6], noise[noise < 1e6]) if np.any(noise < 1e6) else 0.0
-    middle = np.log(found.life_s)
-    return found.life_s, np.exp(_drawn_together(own, noise, middle, between)), float(np.sqrt(between))
+        _, mine = lasting(flight.time_s[rows], np.zeros(len(rows), np.int64), reflected[rows], span)
+        if mine is not None:
+            own[k], noise[k] = np.log(mine), 2 / spells + 0.01
+    told = noise < UNKNOWN_VARIANCE
+    between = _between(own[told], noise[told]) if np.any(told) else 0.0
+    return np.exp(_drawn_together(own, noise, np.log(life_s), between)), float(np.sqrt(between))

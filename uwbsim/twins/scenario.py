@@ -21,88 +21,56 @@ from uwbsim.twins.clocks import ClockFit
 from uwbsim.twins.flight import Flight, attitude, bulk_spread
 from uwbsim.twins.powers import PowerFit
 from uwbsim.twins.reflections import ReflectionFit
-from uwbsim.twins.schedules import SHORTEST_LIFE_S, ScheduleFit, plan_rows
-from uwbsim.units import NS, NS_PER_S
+from uwbsim.twins.schedules import SHORTEST_LIFE_S, ScheduleFit
+from uwbsim.units import NS, NS_PER_S, PS_PER_S
 from uwbsim.world.radio import lifted
 
 WIDTH: Final = 120
-DIGITS: Final = 8
+"""Columns of a line of a scenario file."""
+
+MIN_FADING_DB: Final = 0.1
+"""Less fading than this counts as none: chosen, as it moves no first path and hardly a bias."""
+
+AFTER_S: Final = 0.2
+"""How long a scenario goes on after its last exchange, which may take so long."""
 
 
 def scenario_text(table: Mapping[str, Any], head: str) -> str:
-    """Return a scenario file: a comment, and a table each; what is one line is written as one."""
+    """Return a scenario file: a comment, and a table each; long values have a table of their own."""
     parts = ["\n".join(f"# {line}" for line in textwrap.wrap(head, WIDTH - 2))]
     for name, section in table.items():
         if isinstance(section, list):
             parts += [f"[[{name}]]\n{_lines(one)}" for one in section]
-        else:
-            short = {key: value for key, value in section.items() if not _is_long(value)}
-            parts.append(f"[{name}]\n{_lines(short)}{_tables(name, section)}")
+            continue
+        long = {k: v for k, v in section.items() if isinstance(v, Mapping) and len(_toml(v)) > WIDTH // 2}
+        parts.append(f"[{name}]\n{_lines({k: v for k, v in section.items() if k not in long})}")
+        parts += [f"[{name}.{key}]\n{_lines(value)}" for key, value in long.items()]
     return "\n\n".join(parts) + "\n"
 
 
 def _lines(section: Mapping[str, Any]) -> str:
-    return "\n".join(f"{key} = {_value(value)}" for key, value in section.items())
+    return "\n".join(f"{key} = {_toml(value)}" for key, value in section.items())
 
 
-def _tables(name: str, section: Mapping[str, Any]) -> str:
-    return "".join(f"\n\n[{name}.{key}]\n{_lines(value)}" for key, value in section.items() if _is_long(value))
-
-
-def _is_long(value: Any) -> bool:
-    return isinstance(value, Mapping) and len(_value(value)) > WIDTH // 2
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value)
+def _toml(value: Any) -> str:
+    """Return a value as TOML: numbers with eight digits, lists wrapped; what is long in a list has its own line."""
     if isinstance(value, float):
-        return _number(value)
+        text = f"{value:.8g}"
+        return text if "." in text or "e" in text else f"{text}.0"
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_value(one)}" for key, one in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return _listed([_value(one) for one in value])
-    return str(value)
-
-
-def _number(value: float) -> str:
-    """Return a number with as many digits as there can be meaning in, and a point."""
-    text = f"{value:.{DIGITS}g}"
-    return text if "." in text or "e" in text else f"{text}.0"
-
-
-def _listed(values: list[str]) -> str:
-    line = f"[{', '.join(values)}]"
+        return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
+    if not isinstance(value, list | tuple):
+        return json.dumps(value)
+    items = [_toml(one) for one in value]
+    line = f"[{', '.join(items)}]"
     if len(line) <= WIDTH:
         return line
-    return "[\n" + textwrap.indent("\n".join(_wrapped(values)), "  ") + "\n]"
-
-
-def _wrapped(values: list[str]) -> list[str]:
-    """Return lines of values; a value that is long itself has one of its own."""
-    lines, line = [], ""
-    for value in values:
-        if len(line) + len(value) + 2 > WIDTH - 2 and line:
-            lines.append(line.rstrip())
-            line = ""
-        line += f"{value}, "
-    return [*lines, line.rstrip()]
-
-
-STILL_M: Final = 0.01
-LEVEL_RAD: Final = 0.01
-AFTER_S: Final = 0.2
-NOISE_BINS: Final = 6
-FEWEST_IN_A_BIN: Final = 200
-OUTLIER: Final = 5.0
-ALIKE: Final = 0.01
-LEAST_DB: Final = 0.1
-"""Of fading, below which there is none."""
-
-LEAST_SHARE: Final = 0.002
-OWN_LIFE: Final = 0.1
+    lines = [""]
+    for item in items:
+        if len(lines[-1]) + len(item) + 2 > WIDTH - 2 and lines[-1]:
+            lines.append("")
+        lines[-1] += f"{item}, "
+    return "[\n" + textwrap.indent("\n".join(one.rstrip() for one in lines), "  ") + "\n]"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,17 +105,17 @@ def receive_noise(flight: Flight, clocks: ClockFit) -> ReceiveNoise:
     if not good.any():
         return ReceiveNoise(power_dbm=np.zeros(0), std_s=np.zeros(0))
     noise, power = noise[good], power[good]
-    limit = OUTLIER * bulk_spread(noise)
-    keep = np.abs(noise) < limit
+    keep = np.abs(noise) < 5 * bulk_spread(noise)
     noise, power = noise[keep], power[keep]
-    count = int(np.clip(len(noise) // FEWEST_IN_A_BIN, 1, NOISE_BINS))
+    # Six bins at most, of 200 values or more each: their spreads are known to 5 %.
+    count = int(np.clip(len(noise) // 200, 1, 6))
     parts = np.array_split(np.argsort(power, kind="stable"), count)
     std = np.array([np.sqrt(np.mean(noise[rows] ** 2)) for rows in parts])
     size = np.array([len(rows) for rows in parts])
     together = float(np.sqrt(np.mean(noise**2)))
     # The logarithm of a spread has the standard error 1/sqrt(2n).
     misfit = float(np.sum(2 * size * np.log(std / together) ** 2))
-    if count == 1 or chdtrc(count - 1, misfit) > ALIKE:
+    if count == 1 or chdtrc(count - 1, misfit) > 0.01:
         return ReceiveNoise(power_dbm=np.array([np.median(power)]), std_s=np.array([together]))
     middle = np.array([np.median(power[rows]) for rows in parts])
     distinct = np.append(True, np.diff(middle) > 1e-3)
@@ -162,11 +130,13 @@ def tables(
     if fitted.schedule.regular:
         duration = (len(fitted.schedule.time_s) + 0.3) / fitted.schedule.rate_hz
     bodies, paths = _bodies(flight, poses, duration)
+    steps = [np.diff(poses.time_ns[poses.body == tag.body]) for tag in flight.tags]
+    rates = [round(NS_PER_S / float(np.median(step)), 3) for step in steps if len(step) > 1]
     table = {
         "run": {"name": name, "seed": 1, "duration_s": duration},
         "ranging": _ranging(flight, fitted.schedule),
         "radio": _radio(flight, known, fitted),
-        "mocap": {"rate_hz": _pose_rate_hz(poses, flight)},
+        "mocap": {"rate_hz": rates[0] if rates else 100.0},
         "bodies": bodies,
         "tags": [_tag(flight, known, fitted, k) for k in range(len(flight.tags))],
     }
@@ -185,8 +155,8 @@ def _ranging(flight: Flight, schedule: ScheduleFit) -> dict[str, Any]:
     if schedule.replies_us is not None:
         found["reply"] = {"model": "quantiles", "delays_us": list(schedule.replies_us)}
     if not schedule.regular:
-        rows = plan_rows(schedule, flight)
-        found["plan"] = {"file": "", "slots": [(r["time_s"], r["initiator"], r["target"]) for r in rows]}
+        columns = zip(schedule.time_s.tolist(), schedule.initiator.tolist(), schedule.target.tolist(), strict=True)
+        found["plan"] = {"file": "", "slots": [(round(t, 6), ids[i], ids[j]) for t, i, j in columns]}
     return found
 
 
@@ -205,11 +175,18 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
     shift = fitted.reflections.core_mean_m
     curve = known.bias.model_dump(mode="json")
     found["bias"] = curve | {"coefficients": [value + shift for value in curve["coefficients"]]}
-    found |= _noise(fitted.noise)
+    found["rx_noise_ps"], noise = 0.0, fitted.noise
+    if len(noise.std_s) == 1:
+        found["rx_noise_ps"] = float(noise.std_s[0]) * PS_PER_S
+    elif len(noise.std_s):
+        at = lifted(noise.power_dbm)
+        # A range whose reply takes no time has c s / sqrt(2).
+        spread = SPEED_OF_LIGHT * noise.std_s / np.sqrt(2)
+        found["sigma"] = {"knots": [at[0], *at.tolist(), at[-1]], "coefficients": spread.tolist(), "degree": 1}
     multipath = _multipath(flight, fitted)
     if multipath:
         found["multipath"] = multipath
-    if powers.fading_db >= LEAST_DB:
+    if powers.fading_db >= MIN_FADING_DB:
         found["fading"] = {"levels_db": [float(level) for level in powers.fading_levels_db]}
         if powers.fading_life_s is not None:
             found["fading"]["life_s"] = max(powers.fading_life_s, SHORTEST_LIFE_S)
@@ -218,22 +195,9 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
     return found
 
 
-def _noise(noise: ReceiveNoise) -> dict[str, Any]:
-    if not len(noise.std_s):
-        return {"rx_noise_ps": 0.0}
-    if len(noise.std_s) == 1:
-        return {"rx_noise_ps": float(noise.std_s[0]) * 1e12}
-    at = lifted(noise.power_dbm)
-    knots = [at[0], *at, at[-1]]
-    # A range whose reply takes no time has c s / sqrt(2).
-    spread = SPEED_OF_LIGHT * noise.std_s / np.sqrt(2)
-    sigma = {"knots": [float(k) for k in knots], "coefficients": [float(s) for s in spread], "degree": 1}
-    return {"rx_noise_ps": 0.0, "sigma": sigma}
-
-
 def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any]:
     found, powers = fitted.reflections, fitted.powers
-    if found.share < LEAST_SHARE and found.direct_std_m == 0:
+    if found.share < 0.002 and found.direct_std_m == 0:
         return {}
     loss = powers.reflection_loss_db
     default = TwoStateMultipath(model="two-state")
@@ -246,7 +210,7 @@ def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any]:
         "life_s": default.life_s if found.life_s is None else max(found.life_s, SHORTEST_LIFE_S),
         "life_spread": min(found.life_spread, 2.0),
     }
-    shortest = shortest_interval_s(flight)
+    shortest = flight.interval_s
     if found.life_s is None and shortest < default.life_s:
         table["life_s"] = max(shortest / 3, SHORTEST_LIFE_S)
     if loss is not None:
@@ -258,21 +222,13 @@ def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any]:
         own: dict[str, Any] = {}
         if found.share_std > 0:
             own["share"] = float(np.clip(found.pair_share[k], 0, 1))
-        if found.life_s is not None and found.life_spread > OWN_LIFE:
+        if found.life_s is not None and found.life_spread > 0.1:
             own["life_s"] = max(float(found.pair_life_s[k]), SHORTEST_LIFE_S)
         if np.ptp(found.pair_excess_m) > 0:
             own["mean_excess_m"] = float(found.pair_excess_m[k])
         if own:
             pairs.append({"tags": list(pair)} | own)
     return table | ({"pairs": pairs} if pairs else {})
-
-
-def shortest_interval_s(flight: Flight) -> float:
-    """Return how soon a pair mostly ranges again, in seconds."""
-    order = np.lexsort((flight.time_s, flight.pair))
-    same = np.diff(flight.pair[order]) == 0
-    apart = np.diff(flight.time_s[order])[same]
-    return float(np.median(apart)) if len(apart) else float("inf")
 
 
 def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[str, Any]:
@@ -291,14 +247,6 @@ def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[st
         found |= {"warm_up_ppm": float(clocks.warm_up_ppm[k]), "warm_up_s": clocks.warm_up_s}
     pattern = powers.pattern_db[k]
     return found | ({"pattern_db": [float(value) for value in pattern]} if np.any(pattern) else {})
-
-
-def _pose_rate_hz(poses: Poses, flight: Flight) -> float:
-    for body in dict.fromkeys(tag.body for tag in flight.tags):
-        time = poses.time_ns[poses.body == body]
-        if len(time) > 2:
-            return round(NS_PER_S / float(np.median(np.diff(time))), 3)
-    return 100.0
 
 
 def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -327,13 +275,13 @@ def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[
 def _still(mine: Poses) -> dict[str, Any] | None:
     """Return place and heading of a body that stands level where it is, None for any other."""
     middle = np.median(mine.position_m, axis=0)
-    if np.max(np.linalg.norm(mine.position_m - middle, axis=1)) > STILL_M:
+    if np.max(np.linalg.norm(mine.position_m - middle, axis=1)) > 0.01:
         return None
     turns = attitude(mine, str(mine.body[0]), mine.time_ns)
     yaw, pitch, roll = turns.as_euler("ZYX").T
     heading = float(np.arctan2(np.sin(yaw).mean(), np.cos(yaw).mean()))
     turning = np.abs(np.angle(np.exp(1j * (yaw - heading))))
-    if max(np.abs(pitch).max(), np.abs(roll).max(), turning.max()) > LEVEL_RAD:
+    if max(np.abs(pitch).max(), np.abs(roll).max(), turning.max()) > 0.01:
         return None
     return {"position_m": [float(v) for v in middle], "yaw_deg": float(np.degrees(heading))}
 
@@ -371,16 +319,14 @@ ALWAYS: Final = (
     "when bodies take other ways.",
 )
 
-RATIO_BIAS_PPM: Final = 0.02
-Untold = Callable[[Flight, Fitted], bool]
-SOMETIMES: Final[tuple[tuple[Untold, str], ...]] = (
+SOMETIMES: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...]] = (
     (
         lambda flight, fitted: not len(fitted.noise.std_s),
         "Noise of stamps apart from that of ranges: only a third message from the target shows it. All noise of ranges "
         "is taken to last as long as a path (direct_std_m).",
     ),
     (
-        lambda flight, fitted: abs(fitted.clocks.ratio_bias_ppm) > RATIO_BIAS_PPM,
+        lambda flight, fitted: abs(fitted.clocks.ratio_bias_ppm) > 0.02,
         "Why dt64/dt53 is off by {ratio_bias:+.2g} ppm against the carrier readings: nothing in a scenario makes that.",
     ),
     (
@@ -397,7 +343,7 @@ SOMETIMES: Final[tuple[tuple[Untold, str], ...]] = (
         "The path-loss exponent: all distances are much the same.",
     ),
     (
-        lambda flight, fitted: fitted.powers.fading_db >= LEAST_DB and fitted.powers.fading_life_s is None,
+        lambda flight, fitted: fitted.powers.fading_db >= MIN_FADING_DB and fitted.powers.fading_life_s is None,
         "How long fading lasts (radio.fading.life_s): a pair ranges again after {interval:.2g} s.",
     ),
     (
@@ -417,7 +363,7 @@ SOMETIMES: Final[tuple[tuple[Untold, str], ...]] = (
 
 def unknowns(flight: Flight, fitted: Fitted) -> Iterator[str]:
     """Yield a sentence for everything that keeps its default, or was decided without the recording."""
-    interval = shortest_interval_s(flight)
+    interval = flight.interval_s
     for untold, text in SOMETIMES:
         if untold(flight, fitted):
             yield text.format(interval=interval, ratio_bias=fitted.clocks.ratio_bias_ppm)

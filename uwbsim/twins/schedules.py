@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -16,14 +16,8 @@ from uwblink.twr import intervals
 from uwbsim.twins.flight import Flight, lag_one
 from uwbsim.units import NS
 
-REGULAR: Final = 0.9
-"""Share of exchanges that follow the same one before, from which a plan is a round robin."""
-
-OFF_BEAT: Final = 0.25
-QUANTILES: Final = 201
-SHORTEST_REPLY_US, LONGEST_REPLY_US = 180.0, 6000.0
-SHORTEST_DELAY_UUS, LONGEST_DELAY_UUS = 280, 6500
 SHORTEST_LIFE_S: Final = 0.01
+"""The shortest life that a scenario can give to paths, fading and outages."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,8 +63,11 @@ def fit_schedule(flight: Flight, faults: list[Fault]) -> ScheduleFit:
     if turns:
         regular, beat = _beat(time, first, second, turns)
         if regular:
-            rate = 1 / beat
-            time, first, second, lost = _with_missing(time, first, second, lost, turns, beat)
+            # Slots of a round robin that left nothing at all are lost, too.
+            rate, slot = 1 / beat, np.rint(time / beat).astype(np.int64)
+            every = np.arange(slot[-1] + 1)
+            time, lost = every * beat, ~np.isin(every, slot[~lost])
+            first, second = np.array(turns)[every % len(turns)].T
     return ScheduleFit(
         time_s=time,
         initiator=first,
@@ -105,59 +102,43 @@ def _turns(first: Ints, second: Ints) -> list[tuple[int, int]]:
     followers: dict[tuple[int, int], Counter[tuple[int, int]]] = {}
     for one, other in pairwise(names):
         followers.setdefault(one, Counter())[other] += 1
-    begin = names[0]
-    turns, seen = [begin], {begin}
+    turns = [names[0]]
     while len(turns) < len(set(names)):
-        following = followers.get(turns[-1])
-        if not following:
+        after = followers.get(turns[-1], Counter()).most_common(1)
+        if not after or after[0][0] in turns:
             return []
-        after = following.most_common(1)[0][0]
-        if after in seen:
-            return []
-        turns.append(after)
-        seen.add(after)
+        turns.append(after[0][0])
     return turns
 
 
 def _beat(time: Floats, first: Ints, second: Ints, turns: list[tuple[int, int]]) -> tuple[bool, float]:
-    """Say whether slots keep to their turns and to a beat, and its length in seconds."""
+    """Return whether slots keep to their turns and to a beat, nine of ten, and its length in seconds."""
+    regular_share = 0.9
     number = {pair: k for k, pair in enumerate(turns)}
     turn = np.array([number[pair] for pair in zip(first.tolist(), second.tolist(), strict=True)])
     step, apart = np.diff(turn) % len(turns), np.diff(time)
     in_turn = step == 1 % len(turns)
-    if np.mean(in_turn) < REGULAR / 2 or not len(apart):
+    if np.mean(in_turn) < regular_share / 2 or not len(apart):
         return False, 0.0
     beat = float(np.median(apart[in_turn]))
     if beat <= 0:
         return False, 0.0
     slots = np.rint(apart / beat)
     beat = float(np.sum(apart) / max(np.sum(slots), 1))
-    near = np.abs(apart / beat - np.rint(apart / beat)) < OFF_BEAT
+    near = np.abs(apart / beat - np.rint(apart / beat)) < 0.25
     fits = near & (np.rint(apart / beat) % len(turns) == step)
-    return bool(np.mean(fits) >= REGULAR), beat
-
-
-def _with_missing(
-    time: Floats, first: Ints, second: Ints, lost: Bools, turns: list[tuple[int, int]], beat: float
-) -> tuple[Floats, Ints, Ints, Bools]:
-    """Fill in the slots of a round robin that left nothing at all: lost, too."""
-    slot = np.rint(time / beat).astype(np.int64)
-    begin = turns.index((int(first[0]), int(second[0])))
-    every = np.arange(slot[-1] + 1)
-    there = np.ones(len(every), dtype=bool)
-    there[slot[~lost]] = False
-    pairs = np.array(turns)[(every + begin) % len(turns)]
-    return every * beat, pairs[:, 0], pairs[:, 1], there
+    return bool(np.mean(fits) >= regular_share), beat
 
 
 def _scheduled_uus(flight: Flight) -> int | None:
     spans = intervals(flight.exchanges)
+    shortest, longest = 280, 6500  # what a scenario takes
     for k, message in enumerate(flight.row.messages[1:], start=1):
         if message.timing == "scheduled":
             ticks = float(np.median(spans.dt32 if k == 1 else spans.dt53))
             # A delay is cut to the grid of transmissions, after which the antenna's comes on top.
             nearest = round((ticks - ANTENNA_DELAY_TICKS) / UUS_TICKS)
-            return int(np.clip(nearest, SHORTEST_DELAY_UUS, LONGEST_DELAY_UUS))
+            return int(np.clip(nearest, shortest, longest))
     return None
 
 
@@ -165,13 +146,6 @@ def _replies_us(flight: Flight) -> tuple[float, ...] | None:
     if flight.row.messages[1].timing != "at once":
         return None
     delays = intervals(flight.exchanges).dt32 * TICK_S * 1e6
-    levels = np.linspace(0, 1, min(QUANTILES, len(delays)))
-    found = np.clip(np.quantile(delays, levels), SHORTEST_REPLY_US, LONGEST_REPLY_US)
+    levels = np.linspace(0, 1, min(201, len(delays)))
+    found = np.clip(np.quantile(delays, levels), 180.0, 6000.0)  # what a scenario takes
     return tuple(round(float(value), 4) for value in np.maximum.accumulate(found))
-
-
-def plan_rows(fit: ScheduleFit, flight: Flight) -> list[dict[str, Any]]:
-    """Return the slots as rows of a plan file: time_s, initiator, target."""
-    ids = [tag.tag for tag in flight.tags]
-    columns = zip(fit.time_s.tolist(), fit.initiator.tolist(), fit.target.tolist(), strict=True)
-    return [{"time_s": round(t, 6), "initiator": ids[i], "target": ids[j]} for t, i, j in columns]
