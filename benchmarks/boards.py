@@ -126,7 +126,7 @@ def driver_share() -> None:
     """A round trip to an answerer in another process that does nothing else: driver, kernel, and its wake-up."""
     from benchmarks.sources import report
     from uwblink.boards.board import Board
-    from uwblink.boards.pseudo_terminals import Terminal
+    from uwblink.boards.ports import Terminal
 
     terminal = Terminal()
     pid = os.fork()

@@ -24,10 +24,9 @@ import numpy as np
 
 from benchmarks.flights import Plan, fly
 from benchmarks.large import peak_mb
-from uwblink.boards import writer
-from uwblink.boards.listeners import Heard
+from uwblink.boards import record as writer
+from uwblink.boards.listeners import Heard, Progress
 from uwblink.boards.ports import Transport
-from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import FILE_MB, record
 from uwblink.recording.contents import Contents

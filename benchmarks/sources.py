@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 
-from uwblink.boards.pseudo_terminals import Terminal
+from uwblink.boards.ports import Terminal
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import IdReport, RangeReport
 

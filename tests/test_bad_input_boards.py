@@ -63,7 +63,7 @@ def test_what_a_board_cannot_do(ports, tmp_path):
 
 
 def test_a_port_that_is_not_a_board(ports, tmp_path):
-    from uwblink.boards.pseudo_terminals import Terminal
+    from uwblink.boards.ports import Terminal
 
     silent = Terminal()
     refused(run("uwblink", "info", silent.name), "b'C07\\r'", "heard nothing", "is this a ranging board")
@@ -127,7 +127,7 @@ def test_a_server_says_how_to_record_what_it_serves(tmp_path):
 
 
 def test_a_second_server_does_not_take_the_links_of_the_first(tmp_path):
-    from uwblink.boards.pseudo_terminals import Terminal
+    from uwblink.boards.ports import Terminal
     from uwblink.errors import PortError
 
     first = Terminal(tmp_path / "tag1")

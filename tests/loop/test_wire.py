@@ -7,7 +7,7 @@ import pytest
 
 from tests import processes
 from tests.boards import served
-from uwblink.boards.progress import Progress
+from uwblink.boards.listeners import Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
 from uwblink.importers.motion_capture import add_poses

@@ -5,13 +5,8 @@ from __future__ import annotations
 from io import BytesIO
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 from uwblink.output import write_bytes
 from uwblink.wire.messages import Cir
-
-TAP_NS = 1.0016
-AROUND = (20, 80)
 
 
 def plot_cir(cir: Cir, path: Path, *, force: bool = False) -> None:
@@ -19,11 +14,14 @@ def plot_cir(cir: Cir, path: Path, *, force: bool = False) -> None:
 
     Raises what `uwblink.output.whole` raises.
     """
+    from matplotlib.figure import Figure
+
     first = cir.first_path_milli / 1000
-    low, high = max(int(first) - AROUND[0], 0), min(int(first) + AROUND[1], cir.TAPS)
+    low, high = max(int(first) - 20, 0), min(int(first) + 80, cir.TAPS)
+    tap_ns = 1e3 / (2 * 499.2)  # half a chip of 499.2 MHz (firmware wire format, 4)
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.plot([(k - first) * TAP_NS for k in range(low, high)], cir.magnitudes[low:high], color="#0072B2", lw=1.6)
+    axes.plot([(k - first) * tap_ns for k in range(low, high)], cir.magnitudes[low:high], color="#0072B2", lw=1.6)
     axes.axvline(0, color="#D55E00", lw=1.2, label=f"first path, index {first:.3f}")
     axes.set_xlabel("time after the first path (ns)")
     axes.set_ylabel("magnitude")

@@ -1,4 +1,4 @@
-"""Listeners: the one way out of a recorder. The file writer, the live table and the user's callback are all listeners.
+"""Listeners: the one way out of a recorder, and those that count, check and correct what it tells.
 
 ```python
 import uwblink
@@ -9,20 +9,33 @@ def print_range(heard: uwblink.Heard) -> None:
 uwblink.record(["/dev/ttyACM0", "/dev/ttyACM1"], "flight.uwb", uwblink.RangingPlan(), listeners=[print_range])
 ```
 
-A listener is a function of one `Heard`, or an object of a class derived from `Listener`. They are called in the
-recorder's own loop, in their order, so they must be quick: 0.1 ms a message is plenty, and what takes longer belongs
-into a thread of the listener's own, as the file writer's does. What one raises ends the recording, with everything
-that came before in the file.
+A listener is a function of one `Heard`, or an object of a class derived from `Listener`: the writer of the file, the
+live table and the user's callback are all listeners. They are called in the recorder's own loop, in their order, so
+they must be quick: 0.1 ms a message is plenty, and what takes longer belongs into a thread of the listener's own, as
+the file writer's does. An exception that one raises ends the recording, with everything that came before in the file.
+
+Ranges are corrected by whatever distribution knows how to: uwblink stands below what calibrates, so it does not import
+it. An entry point of the group `uwbcal.corrections` names a function that takes the path of a calibration and returns
+the function which corrects exchanges.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
 
+from uwblink.arrays import Bools, Floats
+from uwblink.errors import PlanError
+from uwblink.recording.antenna_delays import AntennaDelays, delays_differ
 from uwblink.recording.schema import Fault
+from uwblink.ticks import DELAYED_TX_GRID
+from uwblink.twr import STAMPS, Exchanges
 from uwblink.wire.codec import Event
-from uwblink.wire.messages import RangeReport
+from uwblink.wire.messages import Cir, Overheard, RangeReport, TargetRangeReport
 
 Pair = tuple[int, int]
 """Initiator and target."""
@@ -147,3 +160,185 @@ def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> l
         else:
             raise TypeError(f"listeners: found {listener!r}, expected a Listener or a function of one Heard")
     return found
+
+
+@dataclass(slots=True)
+class PairState:
+    """How a pair has done so far; `recent_s` are the times of its last successes, since the start."""
+
+    tried: int = 0
+    good: int = 0
+    range_m: float = float("nan")
+    fpp_dbm: float = float("nan")
+    recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
+
+    def rate_hz(self, time_s: float) -> float:
+        """Return the successes a second over the last two seconds before `time_s`."""
+        # Of a copy, made at once: a page asks in a thread of its own, while the recorder goes on.
+        recent = sum(t > time_s - 2.0 for t in [*self.recent_s])
+        return recent / min(2.0, max(time_s, 0.1))
+
+
+@dataclass(slots=True, kw_only=True)
+class Progress(Listener):
+    """Counts for whoever watches. Times in seconds since `start_ns` (host time).
+
+    `waiting` pieces of bytes are not in the file yet, whose last commit ended `behind_s` seconds ago.
+    """
+
+    start_ns: int = 0
+    time_s: float = 0.0
+    pairs: dict[Pair, PairState] = field(default_factory=dict)
+    faults: dict[str, int] = field(default_factory=dict)
+    last_fault: str = ""
+    overheard: int = 0
+    cirs: int = 0
+    waiting: int = 0
+    behind_s: float = 0.0
+
+    @property
+    def exchanges(self) -> int:
+        """Exchanges that succeeded."""
+        return sum(p.good for p in self.pairs.values())
+
+    @property
+    def tried(self) -> int:
+        """Exchanges that were begun and ended."""
+        return sum(p.tried for p in self.pairs.values())
+
+    def on_message(self, heard: Heard) -> None:
+        """Count what has no turn of its own."""
+        self.overheard += isinstance(heard.message, Overheard)
+        self.cirs += isinstance(heard.message, Cir)
+
+    def on_turn(self, turn: Turn) -> None:
+        """Count a turn of a pair."""
+        state = self.pairs.setdefault(turn.pair, PairState())
+        state.tried += 1
+        if turn.report is not None:
+            state.good += 1
+            state.range_m, state.fpp_dbm = turn.report.range_m, turn.report.fpp1_dbm
+            state.recent_s.append((turn.time_ns - self.start_ns) * 1e-9)
+
+    def on_fault(self, fault: Fault) -> None:
+        """Count a fault."""
+        self.faults[fault.kind] = self.faults.get(fault.kind, 0) + 1
+        self.last_fault = f"{fault.kind}: {fault.detail}"
+
+
+class WrongDelayError(PlanError):
+    """Boards have other antenna delays than were said to be programmed into them."""
+
+
+class DelayCheck(Listener):
+    """Raises `WrongDelayError` where a board's first stamps are of another antenna delay than it is said to have.
+
+    A frame leaves on a grid of 512 ticks, and its stamp is that time and the antenna delay: the stamp's rest is the
+    delay's. What is in the register of the receiver shows in no stamp.
+    """
+
+    def __init__(self, delays: AntennaDelays) -> None:
+        """Take what is programmed into each board."""
+        self._expected = {
+            (board, name): getattr(delay, name) for board, delay in delays.items() for name in ("tx", "reply")
+        }
+        self._rests: dict[tuple[int | None, str], deque[int]] = {}
+
+    def on_turn(self, turn: Turn) -> None:
+        """Look at the stamps of a report; a delay that was found to be right is not looked at again."""
+        report = turn.report
+        if report is None or not self._expected:
+            return
+        initiator, target = turn.pair
+        double_sided = bool(report.tx3 or report.rx3)
+        sent = {(initiator, "tx"): report.tx1, (target, "tx" if double_sided else "reply"): report.tx2}
+        if double_sided:
+            sent[target, "reply"] = report.tx3
+        for which, stamp in sent.items():
+            if which not in self._expected:
+                continue
+            delay, half = self._expected[which], DELAYED_TX_GRID // 2
+            rest = (stamp - delay + half) % DELAYED_TX_GRID - half
+            rests = self._rests.setdefault(which, deque(maxlen=3))
+            rests.append(rest)
+            if not rest:
+                del self._expected[which]
+            # Three reports must contradict a delay alike: the wire has no checksum, and one stamp may be damaged.
+            elif len(rests) == 3 and len(set(rests)) == 1:
+                board, name = which
+                raise WrongDelayError(
+                    f"board {board}: {name} = {delay} is taken to be programmed, but by its stamps it is "
+                    f"{delay + rest}; say what is programmed into the boards",
+                    parameter="antenna_delays",
+                )
+
+
+class ReportCheck:
+    """Compares each report with the last one of its pair from the other end."""
+
+    def __init__(self) -> None:
+        """Compare nothing yet."""
+        self._last: dict[Pair, tuple[int, RangeReport]] = {}
+
+    def add(self, board: int, report: RangeReport) -> str | None:
+        """Take in a board's report; returns what it says otherwise than the other end's, None where nothing."""
+        mine = isinstance(report, TargetRangeReport)
+        pair = (report.neighbour, board) if mine else (board, report.neighbour)
+        before = self._last.pop(pair, None)
+        # Two reports of different exchanges have no stamp in common, but by chance.
+        same = before and any(getattr(before[1], name) == getattr(report, name) != 0 for name in STAMPS)
+        if before is None or before[0] == board or not same:
+            self._last[pair] = board, report
+            return None
+        names = [n for n in RangeReport.FIELDS if n != "neighbour" and getattr(before[1], n) != getattr(report, n)]
+        if not names:
+            return None
+        told = ", ".join(f"{n} {getattr(before[1], n)} and {getattr(report, n)}" for n in names)
+        return f"boards {before[0]} and {board} report one exchange of {pair[0]} with {pair[1]} differently: {told}"
+
+
+Correction = Callable[[Exchanges], Mapping[str, Floats | Bools]]
+"""Returns what is known of exchanges (n,), by name: columns (n,).
+
+`corrected_m` and `sigma_m` in metres, and whatever else whoever corrects can say; NaN where a value is not known.
+Raises a `ValueError` for exchanges that it cannot correct, as of a tag that is not calibrated.
+"""
+
+
+def load_correction(path: Path) -> Correction:
+    """Return the correction of a calibration's file; raises `PlanError` for what is none, or where nothing corrects.
+
+    What the correction cannot correct is a `PlanError`, too.
+    """
+    found = sorted(entry_points(group="uwbcal.corrections"), key=lambda entry: entry.name)
+    if not found:
+        raise PlanError(f"{path}: no installed distribution corrects ranges (entry points of uwbcal.corrections)")
+    with _as_plan_errors():
+        make: Callable[[Path], Correction] = found[0].load()
+        made = make(path)
+    return _as_plan_errors()(made)
+
+
+@contextmanager
+def _as_plan_errors() -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        raise PlanError(str(error)) from error
+
+
+def delays_warning(correct: Correction | None, delays: AntennaDelays, tags: Iterable[int] | None = None) -> str:
+    """Say where a correction is of other antenna delays than are programmed now; "" where it is not, or not known.
+
+    A correction says what it is of by an attribute `antenna_delays`. `tags` are those that range, by default all that
+    it knows.
+    """
+    then: AntennaDelays = getattr(correct, "antenna_delays", {})
+    return delays_differ(then, delays, (tag for tag in then if tag is not None) if tags is None else tags)
+
+
+def check_pairs(correct: Correction | None, pairs: Sequence[tuple[int, int]]) -> None:
+    """Correct a range of each pair of initiator and target, for what the correction raises where it cannot."""
+    if correct and pairs:
+        initiator, target = zip(*pairs, strict=True)
+        correct(Exchanges.from_arrays(initiator, target, tx1=[0] * len(pairs), rx1=0, tx2=0, rx2=0, range_m=1.0))

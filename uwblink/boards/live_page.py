@@ -1,7 +1,8 @@
 """A page that shows a recording while it is made: a listener of the recorder, and a server for this computer alone.
 
-Plain HTML with pictures in SVG, drawn here and fetched once a second; nothing comes from a network, and without
-scripts the page reloads itself. The server listens on the loopback interface only and answers no other host's name.
+Plain HTML with pictures in SVG, drawn here and fetched once a second: counts, a row a pair with the last minute of its
+ranges, faults, the disk. Nothing comes from a network, and without scripts the page reloads itself. The server listens
+on the loopback interface only and answers no other host's name.
 """
 
 from __future__ import annotations
@@ -13,26 +14,41 @@ import shutil
 import sys
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
-from uwblink.boards.corrections import Correction, check_pairs
-from uwblink.boards.listeners import Listener, Pair, Turn
-from uwblink.boards.live_view import SCRIPT, Point, counts, disk, faults_list, table, whole
-from uwblink.boards.progress import Progress
+from uwblink.boards.listeners import Correction, Listener, Pair, PairState, Progress, Turn, check_pairs
 from uwblink.errors import PortError
+from uwblink.pages.stylesheet import CSS
 from uwblink.recording.schema import Fault
 from uwblink.wire.bulk import exchanges_of
 
-LOOPBACK: Final = "127.0.0.1"
-MOST_POINTS: Final = 600
-LAST_FAULTS: Final = 8
 IDLE_S: Final = 10.0
 """A connection that sends no request for so long is closed: each has a thread."""
+
+WIDTH, HEIGHT, MARGIN = 260, 44, 3
+"""Size of a pair's picture, and of the margin around its lines, in pixels."""
+
+SCRIPT: Final = """
+setInterval(async()=>{const m=document.querySelector('main');try{const r=await fetch('/body');
+if(r.ok){m.innerHTML=await r.text();document.title=m.querySelector('h1').textContent;}
+}catch(e){document.title='recording ended';
+m.querySelector('p').textContent='This recording has ended; below is the last that came.';
+}},1000);
+"""
+
+
+class Point(NamedTuple):
+    """A range of a pair: host time (ns), range and corrected range (m), the latter NaN without a calibration."""
+
+    time_ns: int
+    range_m: float
+    corrected_m: float
 
 
 class LivePage(Listener):
@@ -46,14 +62,13 @@ class LivePage(Listener):
         self._path, self._correct = path, correct
         self._lock = threading.Lock()
         self._series: dict[Pair, deque[Point]] = {}
-        self._faults: deque[Fault] = deque(maxlen=LAST_FAULTS)
+        self._faults: deque[Fault] = deque(maxlen=8)
         self._progress = Progress()
         try:
-            self._server = _Server((LOOPBACK, port), self._handler())
+            self._server = _Server(("127.0.0.1", port), self._handler())
         except OSError as error:
             raise PortError(f"port {port}: the page cannot be served there ({error.strerror})") from error
-        self._thread = threading.Thread(target=self._server.serve_forever, name="uwblink page", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._server.serve_forever, name="uwblink page", daemon=True).start()
 
     def __enter__(self) -> Self:
         """Return the page."""
@@ -68,7 +83,7 @@ class LivePage(Listener):
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{LOOPBACK}:{self._server.server_address[1]}/"
+        return f"http://127.0.0.1:{self._server.server_address[1]}/"
 
     def on_start(self, pairs: Sequence[Pair]) -> None:
         """Raise what the correction raises where it cannot correct ranges of a pair."""
@@ -84,7 +99,7 @@ class LivePage(Listener):
             corrected_m = float(known["corrected_m"][0])
         point = Point(turn.time_ns, turn.report.range_m, corrected_m)
         with self._lock:
-            self._series.setdefault(turn.pair, deque(maxlen=MOST_POINTS)).append(point)
+            self._series.setdefault(turn.pair, deque(maxlen=600)).append(point)
 
     def on_fault(self, fault: Fault) -> None:
         """Keep a fault."""
@@ -102,28 +117,47 @@ class LivePage(Listener):
 
     def html(self) -> str:
         """Return the whole page."""
-        return whole(self.body())
+        body = self.body()
+        title = body.removeprefix("<h1>").partition("</h1>")[0]
+        style = CSS + (files("uwblink.boards") / "live.css").read_text(encoding="utf-8")
+        return (
+            f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+            f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style>'
+            '<noscript><meta http-equiv="refresh" content="2"></noscript></head>'
+            f"<body><main>{body}</main><script>{SCRIPT}</script></body></html>"
+        )
 
     def body(self) -> str:
         """Return what changes: counts, pairs, faults, disk; and the name, as the next recorder may have this port."""
         with self._lock:
             series = {pair: list(points) for pair, points in self._series.items()}
             faults = list(reversed(self._faults))
+        progress = self._progress
+        counts = [f"{progress.time_s:.0f} s, {progress.exchanges} of {progress.tried} exchanges"]
+        others = ((progress.overheard, "overheard"), (progress.cirs, "impulse responses"))
+        counts += [f"{count} {name}" for count, name in others if count]
         parts = (
             f"<h1>recording {escape(self._path.name)}</h1>",
-            counts(self._progress),
-            table(self._progress, series, corrected=self._correct is not None),
-            faults_list(self._progress, faults),
+            f"<p>{', '.join(counts)}</p>",
+            _table(progress, series, corrected=self._correct is not None),
+            _faults(progress, faults),
             self._disk(),
         )
         return "".join(parts)
 
     def _disk(self) -> str:
+        """Return how large the file is and how much room is left, and what waits to be written."""
         try:
             size = sum(p.stat().st_size for p in (self._path, Path(f"{self._path}.wal")) if p.exists())
-            return disk(self._progress, size, shutil.disk_usage(self._path.parent).free)
+            free = shutil.disk_usage(self._path.parent).free
         except OSError:
             return ""
+        progress = self._progress
+        behind = ' class="bad"' if progress.behind_s > 1 else ""
+        return (
+            f"<p{behind}>file {size / 2**20:.1f} MB, disk {free / 2**30:.1f} GB free; "
+            f"queue: {progress.waiting} pieces, last commit {progress.behind_s:.1f} s ago</p>"
+        )
 
     def _handler(self) -> type[BaseHTTPRequestHandler]:
         page = self
@@ -136,7 +170,7 @@ class LivePage(Listener):
             def do_GET(self) -> None:
                 host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
                 found = {"/": page.html, "/body": page.body}.get(self.path)
-                if host not in (LOOPBACK, "localhost"):
+                if host not in ("127.0.0.1", "localhost"):
                     self.send_error(403)
                 elif found is None:
                     self.send_error(404)
@@ -173,3 +207,68 @@ def _send(handler: BaseHTTPRequestHandler, text: str) -> None:
     )
     handler.end_headers()
     handler.wfile.write(data)
+
+
+def _table(progress: Progress, series: Mapping[Pair, Sequence[Point]], *, corrected: bool) -> str:
+    """Return a row a pair; one that has not ranged for two seconds stands out."""
+    names = ["pair", "rate (Hz)", "success", "range (m)", *(["corrected (m)"] if corrected else []), "FPP (dBm)"]
+    head = "".join(f"<th>{name}</th>" for name in names)
+    drawn = "<b class='range'>range</b>" + (", <b class='corrected'>corrected</b>" if corrected else "")
+    rows = (
+        _row(pair, state, series.get(pair, ()), progress.time_s, corrected=corrected)
+        for pair, state in list(progress.pairs.items())
+    )
+    return (
+        f"<div class='wide live'><table><thead><tr>{head}<th>last minute: {drawn}</th></tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _row(pair: Pair, state: PairState, points: Sequence[Point], time_s: float, *, corrected: bool) -> str:
+    rate_hz = state.rate_hz(time_s)
+    cells = [
+        f"{pair[0]}&nbsp;&rarr;&nbsp;{pair[1]}",
+        f"{rate_hz:.1f}",
+        f"{100 * state.good / state.tried:.0f} %" if state.tried else "",
+        _metres(state.range_m),
+        *([_metres(points[-1].corrected_m if points else math.nan)] if corrected else []),
+        f"{state.fpp_dbm:.1f}" if state.good else "",
+        picture(points),
+    ]
+    silent = " class='silent'" if state.tried and rate_hz == 0 else ""
+    return f"<tr{silent}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+
+def _metres(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else ""
+
+
+def picture(points: Sequence[Point]) -> str:
+    """Draw range and corrected range over the last minute as SVG; the scale is that of the ranges shown."""
+    if len(points) < 2:
+        return ""
+    shown = [p for p in points if points[-1].time_ns - p.time_ns <= 60e9]
+    values = [v for p in shown for v in (p.range_m, p.corrected_m) if math.isfinite(v)]
+    low, high, began = min(values), max(values), shown[0].time_ns
+    lasted_ns, spread_m = max(shown[-1].time_ns - began, 1), max(high - low, 1e-3)
+    lines = ""
+    for kind in ("range", "corrected"):
+        places = [
+            f"{MARGIN + (WIDTH - 2 * MARGIN) * (p.time_ns - began) / lasted_ns:.1f},"
+            f"{HEIGHT - MARGIN - (HEIGHT - 2 * MARGIN) * (value - low) / spread_m:.1f}"
+            for p in shown
+            if math.isfinite(value := p.range_m if kind == "range" else p.corrected_m)
+        ]
+        lines += f'<polyline class="{kind}" points="{" ".join(places)}"/>' if places else ""
+    label = f"range from {low:.3f} to {high:.3f} m"
+    return (
+        f'<svg role="img" aria-label="{label}" viewBox="0 0 {WIDTH} {HEIGHT}" preserveAspectRatio="none">'
+        f"<title>{label}</title>{lines}</svg>"
+    )
+
+
+def _faults(progress: Progress, last: Iterable[Fault]) -> str:
+    """Return the count of each kind of fault, and the last ones, the newest first."""
+    kinds = ", ".join(f"{escape(kind)} {n}" for kind, n in sorted(dict(progress.faults).items())) or "none"
+    items = "".join(f"<li>board {escape(f.board)}: {escape(f.kind)}: {escape(f.detail)}</li>" for f in last)
+    return f"<p>faults: {kinds}</p>" + (f"<ul>{items}</ul>" if items else "")

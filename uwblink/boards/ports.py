@@ -1,6 +1,7 @@
-"""Serial ports: which there are, opening one, and moving bytes. The only file that knows pyserial.
+"""Serial ports: which there are, opening one, and moving bytes; and pseudo-terminals that stand in for them.
 
-A port is a device (`/dev/ttyACM0`), a link to one, or any pyserial URL (`socket://`, `rfc2217://`).
+A port is a device (`/dev/ttyACM0`), a link to one, or any pyserial URL (`socket://`, `rfc2217://`). This is the only
+file that uses pyserial.
 """
 
 from __future__ import annotations
@@ -11,25 +12,21 @@ import os
 import select
 import selectors
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import serial
 from serial.tools import list_ports
 
 from uwblink.errors import PortBusyError, PortError, PortLostError, PortMissingError, PortPermissionError
 
-VENDOR_ID: Final = 0x0483
-PRODUCT_ID: Final = 0x5740
-"""The boards' USB identity, "STM32 Virtual ComPort" (firmware wire format, 1.1)."""
-
-BAUD: Final = 19_200
-"""Ignored by the boards, but a serial port wants one."""
-
-READ_BYTES: Final = 65_536
-POLL_S: Final = 0.002
-"""How often ports without a descriptor are asked."""
+try:
+    import pty
+    import tty
+except ImportError:  # pragma: no cover - Windows has no pseudo-terminals
+    pty = None  # type: ignore[assignment]
 
 
 class Transport(Protocol):
@@ -96,7 +93,7 @@ def boards_ports() -> list[PortInfo]:
     return [
         PortInfo(p.device, p.description or "", p.serial_number)
         for p in sorted(list_ports.comports())
-        if (p.vid, p.pid) == (VENDOR_ID, PRODUCT_ID)
+        if (p.vid, p.pid) == (0x0483, 0x5740)  # "STM32 Virtual ComPort" (firmware wire format, 1.1)
     ]
 
 
@@ -132,7 +129,7 @@ class SerialPort:
         if self.fileno is None:
             return self._read_pyserial(0)
         try:
-            data = os.read(self.fileno, READ_BYTES)
+            data = os.read(self.fileno, 65_536)
         except BlockingIOError:
             return b""
         except OSError as error:
@@ -186,7 +183,7 @@ class SerialPorts:
     """The serial ports of this computer."""
 
     def __init__(self) -> None:
-        """Watch none yet."""
+        """Watch no port; the clock starts now."""
         self._selector = selectors.SelectSelector()
         self._pyserial: list[SerialPort] = []
         # No change of the wall clock moves the times of a recording.
@@ -211,7 +208,7 @@ class SerialPorts:
     def wait(self, timeout_s: float) -> Sequence[SerialPort]:
         """Return ports at which bytes may be waiting; those without a descriptor must be asked again and again."""
         if self._pyserial:
-            timeout_s = min(timeout_s, POLL_S)
+            timeout_s = min(timeout_s, 0.002)
         return [key.data for key, _ in self._selector.select(max(timeout_s, 0.0))] + self._pyserial
 
     def now_s(self) -> float:
@@ -231,7 +228,7 @@ class SerialPorts:
 
 def _opened(name: str) -> Any:
     try:
-        port = serial.serial_for_url(name, do_not_open=True, timeout=0, baudrate=BAUD)
+        port = serial.serial_for_url(name, do_not_open=True, timeout=0, baudrate=19_200)  # the boards ignore the rate
         if "://" not in name:
             port.exclusive = True
         port.open()
@@ -245,20 +242,24 @@ def _opened(name: str) -> Any:
 
 
 def _explained(name: str, error: Exception) -> PortError:
-    code = getattr(error, "errno", None)
-    text = str(error)
-    if code == errno.ENOENT or "No such file" in text:
+    """Return the error of a port that cannot be opened, by the system's number or, on other systems, its words."""
+    code, text = getattr(error, "errno", None), str(error)
+
+    def told(words: str, *codes: int) -> bool:
+        return code in codes or words in text
+
+    if told("No such file", errno.ENOENT):
         return PortMissingError(f"{name}: no such port; `uwblink ports` lists the boards that are plugged in")
-    if code in (errno.EACCES, errno.EPERM) or "Permission denied" in text:
+    if told("Permission denied", errno.EACCES, errno.EPERM):
+        group = _group(name)
         return PortPermissionError(
-            f"{name}: permission denied; join the group {_group(name)} (sudo usermod -aG {_group(name)} $USER) "
-            "and log in again"
+            f"{name}: permission denied; join the group {group} (sudo usermod -aG {group} $USER) and log in again"
         )
-    if code in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "exclusively lock" in text:
+    if told("exclusively lock", errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
         return PortBusyError(f"{name}: another process has this port open; close it first")
     if os.path.isdir(name):
         return PortError(f"{name.rstrip('/')}: is a folder; name the ports in it, as with {name.rstrip('/')}/*")
-    if code == errno.ENOTTY or "Inappropriate ioctl" in text or "configure port" in text:
+    if told("Inappropriate ioctl", errno.ENOTTY) or "configure port" in text:
         return PortError(f"{name}: not a serial port")
     return PortError(f"{name}: cannot be opened ({text})")
 
@@ -271,3 +272,96 @@ def _group(name: str) -> str:
         return grp.getgrgid(os.stat(name).st_gid).gr_name
     except (OSError, KeyError, ImportError):
         return "dialout"
+
+
+def wait_until(due_s: float, stop: Callable[[], bool]) -> bool:
+    """Wait for a time of the monotonic clock; returns whether nobody said to stop meanwhile."""
+    while (wait_s := due_s - time.monotonic()) > 0:
+        if stop():
+            return False
+        time.sleep(min(wait_s, 0.1))
+    return not stop()
+
+
+class Terminal:
+    """A pseudo-terminal that stands in for a serial port: opened raw, linked under a stable name, and unplugged.
+
+    The far end behaves like the boards' USB: what does not fit because nobody reads is lost, and while the port is
+    unplugged its name is gone. `name` is what a client opens: the link if there is one, else the device's path.
+    """
+
+    def __init__(self, link: Path | None = None) -> None:
+        """Plug in; raises `PortError` where `link` cannot be made, or the system has no pseudo-terminals."""
+        if pty is None:  # pragma: no cover - Windows
+            raise PortError("this system has no pseudo-terminals; use Linux or macOS")
+        self._link = link
+        self._ends: tuple[int, int] | None = None
+        self.lost_bytes = 0
+        self.plug()
+
+    @property
+    def fileno(self) -> int | None:
+        """The descriptor to wait on for the client's bytes, None while unplugged."""
+        return self._ends[0] if self._ends else None
+
+    @property
+    def name(self) -> str:
+        """What a client opens."""
+        if self._link:
+            return str(self._link)
+        return os.ttyname(self._ends[1]) if self._ends else "(unplugged)"
+
+    def plug(self) -> None:
+        """Open the port, unless it is open."""
+        if self._ends:
+            return
+        # The client's end stays open here too: otherwise a read fails whenever no client has it open.
+        near, far = pty.openpty()
+        tty.setraw(far)
+        os.set_blocking(near, False)
+        self._ends = near, far
+        if self._link:
+            _point(self._link, os.ttyname(far))
+
+    def unplug(self) -> None:
+        """Close the port, as pulling the cable does: clients get an error, the link is gone."""
+        if not self._ends:
+            return
+        if self._link:
+            with contextlib.suppress(OSError):
+                self._link.unlink()
+        for end in self._ends:
+            os.close(end)
+        self._ends = None
+
+    def read(self) -> bytes:
+        """Return what the client has written since, without waiting."""
+        if not self._ends:
+            return b""
+        try:
+            return os.read(self._ends[0], 65_536)
+        except (BlockingIOError, OSError):
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes in one piece; what does not fit is lost, and counted."""
+        if not self._ends:
+            self.lost_bytes += len(data)
+            return
+        try:
+            sent = os.write(self._ends[0], data)
+        except (BlockingIOError, OSError):
+            sent = 0
+        self.lost_bytes += len(data) - sent
+
+
+def _point(link: Path, device: str) -> None:
+    if link.is_symlink() and link.exists():
+        raise PortError(f"{link}: is a port that somebody serves; choose another folder, or remove the link")
+    try:
+        link.parent.mkdir(parents=True, exist_ok=True)
+        if link.is_symlink():  # left behind by a server that was killed
+            link.unlink()
+        link.symlink_to(device)
+    except OSError as error:
+        raise PortError(f"{link}: cannot be made a link to {device} ({error.strerror})") from error

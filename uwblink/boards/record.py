@@ -1,29 +1,50 @@
-"""Recording from boards into a file: who is there, what the file says of it, and the recorder that plays the plan."""
+"""Recording from boards into a file: who is there, what the file says of it, and the thread that writes it.
+
+The recorder's loop collects what was heard, and a thread of the writer's own commits it every `FLUSH_S`: so a slow disk
+never makes the loop miss bytes, and what was handed over is in the file after that time and the commit itself.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
 
 from uwblink.boards.board import Board
-from uwblink.boards.delay_check import DelayCheck, WrongDelayError
-from uwblink.boards.listeners import Heard, Listener, Pair, as_listeners
+from uwblink.boards.listeners import DelayCheck, Heard, Listener, Progress, WrongDelayError, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
-from uwblink.boards.progress import Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import Recorder
-from uwblink.boards.writer import RecordingWriter
-from uwblink.errors import PlanError
+from uwblink.database import log_of
+from uwblink.errors import PlanError, RecordingError
 from uwblink.output import check_output
 from uwblink.recording.antenna_delays import meta_of_delays
-from uwblink.recording.file import Recording
-from uwblink.recording.schema import SHAPES, Arrangement, Tag
+from uwblink.recording.file import Recording, SnapshotMaker
+from uwblink.recording.schema import SHAPES, Arrangement, CirRow, Fault, FrameRow, Tag
+from uwblink.twr import Exchanges
+from uwblink.wire.bulk import exchanges_of
+from uwblink.wire.messages import Cir, Overheard, RangeReport
 
 FILE_MB: Final = 64
-"""Of the file so much is kept in memory; without a limit all of it would be, and a recording of hours is long."""
+"""Memory for the file; without a limit all of it would be kept, and a recording of hours is long."""
+
+FLUSH_S: Final = 0.1
+"""How often rows are committed: what a power cut loses is no longer than this."""
+
+LONGEST_BACKLOG_S: Final = 20.0
+"""How far behind a disk may fall: much longer than the second or two for which a busy one does not answer."""
+
+LONG_LOG: Final = 8 * 2**20
+"""Half of the bytes at which DuckDB puts its log into the file within a commit, which takes a second on a busy machine.
+"""
 
 
 def record(  # noqa: PLR0913 - the settings of a recording, by keyword
@@ -83,68 +104,51 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     check_output(path, force=force, recording=True)
     found = identify(ports, using)
     turns = plan.turns(sorted(found))
+    there = ", ".join(map(str, sorted(found)))
     if order and sorted(order) != sorted(found):
-        there = ", ".join(map(str, sorted(found)))
         text = f"found {', '.join(map(str, order))}, expected each of the boards at the ports, {there}"
         raise PlanError(text, parameter="order")
-    if plan.tags and not any(tag.tag in found for tag in plan.tags):
-        seated, there = (", ".join(map(str, sorted(ids))) for ids in ({tag.tag for tag in plan.tags}, found))
+    seats = {tag.tag: tag for tag in plan.tags}
+    if seats and not seats.keys() & found.keys():
+        seated = ", ".join(map(str, sorted(seats)))
         raise PlanError(
             f"the plan says where {seated} sit, but the boards at the ports are {there}: is it that of others?"
         )
     for listener in others:
         listener.on_start(turns)
     delays = plan.programmed(found)
-    meta = _meta(found, plan, turns, passive) | (meta_of_delays(delays) if plan.antenna_delays else {})
-    with (
-        _without_wrong_delays(path),
-        Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording,
-    ):
-        seats = {tag.tag: tag for tag in plan.tags}
-        recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
-        with RecordingWriter(recording) as writer:
-            told = [writer, DelayCheck(delays), *others]
-            recorder = Recorder(found, plan, turns, told, passive=passive, ports=using)
-
-            def tell(progress: Progress) -> None:
-                progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
-                if watch:
-                    watch(progress)
-
-            try:
-                recorder.run(duration_s, stop, tell)
-            finally:
-                recorder.close()
-        if arrangement:
-            last_ns = max(using.host_ns(), recorder.progress.start_ns + 1)
-            mark = Arrangement(arrangement, recorder.progress.start_ns, last_ns, known, tuple(order))
-            recording.append_arrangements([mark])
-    return recorder.progress
-
-
-@contextmanager
-def _without_wrong_delays(path: Path) -> Iterator[None]:
-    """Remove a recording that was given up because its `meta` would say wrong antenna delays."""
-    try:
-        yield
-    except WrongDelayError:
-        path.unlink(missing_ok=True)
-        raise
-
-
-def _meta(found: dict[int, str], plan: RangingPlan, turns: Iterable[Pair], passive: bool) -> dict[str, Any]:
-    return {
+    played = {name: getattr(plan, name) for name in ("rate_hz", "protocol", "target_reports", "get_cir")}
+    meta = {
         "source": "boards",
         "ports": {str(board): name for board, name in sorted(found.items())},
-        "plan": {
-            "pairs": [list(pair) for pair in turns],
-            "rate_hz": plan.rate_hz,
-            "protocol": plan.protocol,
-            "target_reports": plan.target_reports,
-            "get_cir": plan.get_cir,
-            "passive": passive,
-        },
+        "plan": {"pairs": [list(pair) for pair in turns], **played, "passive": passive},
+        **(meta_of_delays(delays) if plan.antenna_delays else {}),
     }
+    try:
+        with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
+            recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
+            with RecordingWriter(recording) as writer:
+                recorder = Recorder(
+                    found, plan, turns, [writer, DelayCheck(delays), *others], passive=passive, ports=using
+                )
+
+                def tell(progress: Progress) -> None:
+                    progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
+                    if watch:
+                        watch(progress)
+
+                try:
+                    recorder.run(duration_s, stop, tell)
+                finally:
+                    recorder.close()
+            if arrangement:
+                first_ns = recorder.progress.start_ns
+                last_ns = max(using.host_ns(), first_ns + 1)
+                recording.append_arrangements([Arrangement(arrangement, first_ns, last_ns, known, tuple(order))])
+    except WrongDelayError:
+        path.unlink(missing_ok=True)  # its `meta` would say wrong antenna delays
+        raise
+    return recorder.progress
 
 
 def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]:
@@ -161,3 +165,224 @@ def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]
             raise PlanError(f"{found[number]} and {name} both say they are board {number}; ids must differ")
         found[number] = name
     return found
+
+
+@dataclass(slots=True)
+class Batch:
+    """Rows that wait to be written, in the order in which they came."""
+
+    frames: list[FrameRow] = field(default_factory=list)
+    exchanges: list[tuple[int, int, RangeReport]] = field(default_factory=list)
+    overheard: list[tuple[int, int, Overheard]] = field(default_factory=list)
+    cirs: list[tuple[int, int, Cir]] = field(default_factory=list)
+    faults: list[Fault] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to write."""
+        return bool(self.frames or self.exchanges or self.overheard or self.cirs or self.faults)
+
+    def add(self, heard: Heard) -> None:
+        """Put a message into the list of its table; what belongs to none is in the bytes."""
+        row = heard.time_ns, heard.board
+        if isinstance(heard.message, RangeReport):
+            self.exchanges.append((*row, heard.message))
+        elif isinstance(heard.message, Overheard):
+            self.overheard.append((*row, heard.message))
+        elif isinstance(heard.message, Cir):
+            self.cirs.append((*row, heard.message))
+
+    def write(self, recording: Recording) -> None:
+        """Append everything in one transaction; raises `RecordingError`."""
+        with recording.transaction():
+            self.append_to(recording)
+
+    def append_to(self, recording: Recording) -> None:
+        """Append everything; raises `RecordingError`."""
+        recording.append_frames(self.frames)
+        if self.exchanges:
+            recording.append_exchanges(exchanges_of(self.exchanges))
+        recording.append_overheard(overheard_row(*row) for row in self.overheard)
+        recording.append_cirs(
+            CirRow(t, board, c.initiator, c.target, c.first_path_milli / 1000, c.magnitudes)
+            for t, board, c in self.cirs
+        )
+        recording.append_faults(self.faults)
+
+
+class RecordingWriter(Listener):
+    """A listener that writes a live recording. A context manager: leaving it writes what is left."""
+
+    def __init__(self, recording: Recording) -> None:
+        """Begin writing; raises `RecordingError` where what would be written cannot be read back."""
+        check_writing(recording)
+        self._recording = recording
+        self._batch = Batch()
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._written_s = self._checked_s = time.monotonic()
+        self._stopped_s = 0.0
+        self._file = _identity(recording.path)
+        self._error: RecordingError | None = None
+        self._snapshots = SnapshotMaker(recording.path, recording.snapshot)
+        self._shortening: threading.Thread | None = None
+        self._thread = threading.Thread(target=self._work, name="uwblink writer", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what is left; raises what `check` raises, unless something else is already on its way up."""
+        try:
+            self.close()
+        except RecordingError:
+            if kind is None:
+                raise
+
+    def on_bytes(self, time_ns: int, port: str, direction: str, data: bytes) -> None:
+        """Keep bytes."""
+        with self._lock:
+            self._batch.frames.append(FrameRow(time_ns, port, direction, data))
+
+    def on_message(self, heard: Heard) -> None:
+        """Keep a message in the table of its kind."""
+        with self._lock:
+            self._batch.add(heard)
+
+    def on_fault(self, fault: Fault) -> None:
+        """Keep a fault."""
+        with self._lock:
+            self._batch.faults.append(fault)
+
+    @property
+    def waiting(self) -> int:
+        """How many pieces of bytes wait to be written."""
+        return len(self._batch.frames)
+
+    @property
+    def behind_s(self) -> float:
+        """How long ago the last commit ended, in seconds, less what this process was stopped since."""
+        return time.monotonic() - self._written_s - self._stopped_s
+
+    def check(self) -> None:
+        """Raise `RecordingError` when nothing can be written any more, or the disk cannot keep up."""
+        if self._error:
+            raise self._error
+        now_s = time.monotonic()
+        # A loop that did not check for two seconds was stopped with its process (Ctrl-Z, a suspended computer), and no
+        # disk is to blame.
+        if now_s - self._checked_s > 2.0:
+            self._stopped_s += now_s - self._checked_s
+        self._checked_s = now_s
+        if self.behind_s > LONGEST_BACKLOG_S:
+            raise RecordingError(
+                f"{self._recording.path}: the disk is {self.behind_s:.0f} s behind; record to a faster one. "
+                "What was written before is kept"
+            )
+
+    def close(self) -> None:
+        """Write what is left; raises what `check` raises."""
+        self._ended.set()
+        self._thread.join(LONGEST_BACKLOG_S)
+        self.check()
+
+    def _work(self) -> None:
+        last = False
+        while not last and not self._error:
+            last = self._ended.wait(FLUSH_S)
+            with self._lock:
+                batch, self._batch = self._batch, Batch()
+            try:
+                if batch:
+                    batch.write(self._recording)
+                self._check_file()
+            except RecordingError as error:
+                self._error = error
+            except Exception as error:  # whatever it is: nobody else sees what ends this thread
+                self._error = RecordingError(
+                    f"{self._recording.path}: cannot be written any more ({type(error).__name__}: {error}). "
+                    "What was written before is kept"
+                )
+            self._written_s, self._stopped_s = time.monotonic(), 0.0
+            if not self._error:
+                self._snapshots.look()
+                self._shorten_log()
+        self._snapshots.close()
+        if self._shortening:
+            self._shortening.join()
+
+    def _shorten_log(self) -> None:
+        """Have a long log put into the file by another thread, while this one goes on committing."""
+        if self._shortening and self._shortening.is_alive():
+            return
+        try:
+            long = log_of(self._recording.path).stat().st_size > LONG_LOG
+        except OSError:
+            return
+
+        def put_away() -> None:
+            with suppress(RecordingError):  # what is wrong with the disk, the next commit reports
+                self._recording.shorten_log()
+
+        if long:
+            self._shortening = threading.Thread(target=put_away, name="uwblink log", daemon=True)
+            self._shortening.start()
+
+    def _check_file(self) -> None:
+        """Raise `RecordingError` where the file has no name any more: what is written to it then is lost."""
+        path = self._recording.path
+        if _identity(path) != self._file:
+            raise RecordingError(f"{path}: was removed or replaced while it was being recorded; what it held is lost")
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from another of the same name, None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+class _Withdrawn(RecordingError):  # noqa: N818 - nothing is wrong
+    """Ends a transaction without a trace."""
+
+
+def check_writing(recording: Recording) -> None:
+    """Raise `RecordingError` unless a row of each kind comes back as it was written; leaves nothing behind.
+
+    `recording` is a new one, with nothing in it. Another version of a library may write otherwise, and an hour later
+    is too late to know.
+    """
+    probe = Batch(
+        frames=[FrameRow(1, "probe", "in", bytes(range(256)))],
+        exchanges=[(2, 1, RangeReport(2, 1.25, 3, 4, 5, 6, 7, 8, -80.5, -81.5, 0.25, -0.25))],
+        cirs=[(3, 1, Cir(1, 2, 3500, (0, 65535, 7)))],
+        faults=[Fault(4, "probe", "kind", "a 'detail'", 1, 2)],
+    )
+
+    def values(exchanges: Exchanges) -> dict[str, Any]:
+        return {name: str(column.tolist()) for name, column in exchanges.to_dict().items()}
+
+    with suppress(_Withdrawn), recording.transaction():
+        probe.append_to(recording)
+        same = {
+            "frames": recording.frames() == probe.frames,
+            "exchanges": values(recording.exchanges()) == values(exchanges_of(probe.exchanges)),
+            "cirs": recording.cirs() == [CirRow(3, 1, 1, 2, 3.5, (0, 65535, 7))],
+            "faults": recording.faults() == probe.faults,
+        }
+        if not all(same.values()):
+            wrong = ", ".join(table for table, good in same.items() if not good)
+            raise RecordingError(f"{recording.path}: what is written comes back otherwise (tables: {wrong})")
+        raise _Withdrawn("tried")
+
+
+def overheard_row(time_ns: int, listener: int, heard: Overheard) -> dict[str, float]:
+    """Return a passive listener's report as a row of the table `overheard`."""
+    values = {name: getattr(heard, name) for name in Overheard.FIELDS}
+    nothing = {name: np.nan for name, value in values.items() if value is None}
+    return {"time_ns": time_ns, "listener": listener} | values | nothing

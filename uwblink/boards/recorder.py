@@ -6,29 +6,99 @@ would collide on the air. A board that is unplugged leaves the others running an
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Final
 
 from uwblink.boards.board import PROTOCOL_FLAGS, Board
-from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, CommandOutcome
-from uwblink.boards.listeners import Heard, Listener, Pair, Turn
-from uwblink.boards.ports import Ports, SerialPorts
-from uwblink.boards.progress import PairState, Progress
+from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, CommandOutcome, Connection
+from uwblink.boards.listeners import Heard, Listener, Pair, PairState, Progress, ReportCheck, Turn
+from uwblink.boards.ports import Ports, SerialPorts, Transport, serial_number
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.report_check import ReportCheck
-from uwblink.boards.station import Station
 from uwblink.errors import BoardError, PortError, PortLostError
 from uwblink.recording.schema import Fault
-from uwblink.wire.codec import Event
-from uwblink.wire.messages import IdReport, Message, RangeCommand, RangeReport, Skipped, TextLine
+from uwblink.wire.codec import LONGEST_LINE, Event
+from uwblink.wire.messages import GetId, IdReport, Message, RangeCommand, RangeReport, SetPassive, Skipped, TextLine
 
 LONGEST_WAIT_S: Final = 0.05
-NOBODY_READY_S: Final = 0.005
-WATCH_EVERY_S: Final = 0.25
-MOST_FAULT_TEXT: Final = 200
-EXPECTED_TEXTS: Final = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
-"""Lines that every ranging brings; any other one is noted as a fault."""
+"""How often the loop looks whether it is to stop, if nothing comes in."""
+
+
+class Station:
+    """A board's port as the recorder sees it; `port` is None while it is unplugged."""
+
+    def __init__(self, board: int, name: str, ports: Ports, *, passive: bool) -> None:
+        """Open the port; raises `PortError`. A `passive` board is told to listen, again whenever it comes back."""
+        self.board, self.name = board, name
+        self.serial_number = serial_number(name)
+        self._ports, self._passive = ports, passive
+        self.port: Transport | None = None
+        self._todo: deque[Message] = deque()
+        self._retry_s = self._pause_until_s = 0.0
+        self._damage, self._damaged_s = b"", 0.0
+        self._plug(name)
+
+    def ready(self, now_s: float) -> bool:
+        """Whether the board may be asked to range now."""
+        waits = self._todo or self.connection.busy or self.connection.ready_s(now_s)
+        return self.port is not None and not waits and now_s >= self._pause_until_s
+
+    def next_command(self, now_s: float) -> Message | None:
+        """Return what the board is to be told besides the plan's turns, None if nothing is due."""
+        if self.port is None or self.connection.busy or not self._todo or self.connection.ready_s(now_s) > 0:
+            return None
+        return self._todo.popleft()
+
+    def rest_after(self, outcome: CommandOutcome, now_s: float) -> None:
+        """Leave a board alone for a second that did not even answer a fence."""
+        if isinstance(outcome.error, TimeoutError) and outcome.command is FENCE:
+            self._pause_until_s = now_s + 1.0
+
+    def damage(self, events: list[Event], now_s: float) -> str | None:
+        """Gather bytes that are no message; returns a description of them when a damaged line is over.
+
+        One damaged line is skipped in many pieces, because it comes in many, and because a message could start in it.
+        It is over with a message, a line end, too many bytes, or 50 ms of silence.
+        """
+        text = None
+        for event in [*events, None]:
+            if isinstance(event, Skipped):
+                self._damage, self._damaged_s = self._damage + event.data, now_s
+                continue
+            late = now_s - self._damaged_s > 0.05
+            over = event or late or self._damage.endswith(b"\r\n") or len(self._damage) > LONGEST_LINE
+            if self._damage and over:
+                text = f"{len(self._damage)} bytes: {self._damage[:60]!r}"
+                self._damage = b""
+        return text
+
+    def unplug(self, now_s: float) -> None:
+        """Close the port of a board that is gone."""
+        if self.port is not None:
+            self._ports.close(self.port)
+        self.port, self._retry_s = None, now_s + 0.2
+
+    def plug_again(self, now_s: float) -> bool:
+        """Try to take the board back, under another name if its device has one now; True when it is back."""
+        if self.port is not None or now_s < self._retry_s:
+            return False
+        self._retry_s = now_s + 0.2  # the system needs time to find a device that was plugged in
+        name = self._ports.moved(self.name, self.serial_number)
+        with suppress(PortError):
+            if name is not None:
+                self._plug(name)
+        return self.port is not None
+
+    def _plug(self, name: str) -> None:
+        """Open the port; the board's power may have been gone, so it must be told again what it was told before."""
+        self.port = self._ports.open(name)
+        self.name, self.connection = name, Connection(name)
+        self._todo.clear()
+        if self._retry_s:
+            self._todo.append(GetId())
+        if self._passive:
+            self._todo.append(SetPassive(True))
 
 
 class Recorder:
@@ -72,7 +142,7 @@ class Recorder:
         watched_s = self._start_s
         with suppress(KeyboardInterrupt):
             for now_s in self.steps(duration_s, stop):
-                if watch and now_s - watched_s > WATCH_EVERY_S:
+                if watch and now_s - watched_s > 0.25:
                     watched_s = now_s
                     self.progress.time_s = now_s - self._start_s
                     watch(self.progress)
@@ -112,8 +182,10 @@ class Recorder:
             self._hear(self._by_port[id(port)])
         now_s = self._ports.now_s()
         for station in self._stations.values():
+            if station.plug_again(now_s):
+                self._by_port[id(station.port)] = station
+                self._fault(station, "replugged", f"{station.name}: board {station.board} is back")
             if station.port is None:
-                self._take_back(station, now_s)
                 continue
             if outcome := station.connection.expire(now_s):
                 self._ended(station, outcome)
@@ -138,12 +210,17 @@ class Recorder:
             return
         found = self._next_turn(now_s)
         if found is None:
-            self._next_s = now_s + NOBODY_READY_S
+            self._next_s = now_s + 0.005
         elif found[0].connection.doubtful:
             self._turn -= 1
             self._say(found[0], FENCE)
         else:
-            self._play(*found, now_s)
+            # A turn that comes late does not make the next ones come in a burst.
+            self._next_s = max(self._next_s + (1 / self._plan.rate_hz if self._plan.rate_hz else 0.0), now_s)
+            self._active = station, pair = found
+            plan = self._plan
+            flag = PROTOCOL_FLAGS[plan.protocol]
+            self._say(station, RangeCommand(pair[1], plan.target_reports, flag, plan.get_cir))
 
     def _next_turn(self, now_s: float) -> tuple[Station, Pair] | None:
         """Return the next pair of the plan that can range, passing over those of which a board is busy or away."""
@@ -153,14 +230,6 @@ class Recorder:
             if self._stations[pair[0]].ready(now_s) and self._stations[pair[1]].port is not None:
                 return self._stations[pair[0]], pair
         return None
-
-    def _play(self, station: Station, pair: Pair, now_s: float) -> None:
-        plan = self._plan
-        period_s = 1 / plan.rate_hz if plan.rate_hz else 0.0
-        # A turn that comes late does not make the next ones come in a burst.
-        self._next_s = max(self._next_s + period_s, now_s)
-        self._active = station, pair
-        self._say(station, RangeCommand(pair[1], plan.target_reports, PROTOCOL_FLAGS[plan.protocol], plan.get_cir))
 
     def _say(self, station: Station, command: Message) -> None:
         data = station.connection.send(command, self._ports.now_s())
@@ -173,7 +242,7 @@ class Recorder:
 
     def _hear(self, station: Station) -> None:
         try:
-            data = station.read()
+            data = station.port.read(0.0) if station.port is not None else b""
         except PortLostError as error:
             self._lost(station, error)
             return
@@ -197,7 +266,9 @@ class Recorder:
     def _tell(self, station: Station, time_ns: int, event: Event) -> None:
         if isinstance(event, Skipped):
             return
-        if isinstance(event, TextLine) and not event.text.startswith(EXPECTED_TEXTS):
+        # The lines that every ranging brings are no faults; any other one is.
+        expected = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
+        if isinstance(event, TextLine) and not event.text.startswith(expected):
             self._fault(station, "text", event.text.strip())
         if isinstance(event, RangeReport) and (told := self._check.add(station.board, event)):
             self._fault(station, "reports differ", told)
@@ -216,13 +287,12 @@ class Recorder:
             self._fault(station, "wrong board", f"board {outcome.reply.board} where {station.board} was")
             self._drop(station)
         if self._active and self._active[0] is station and isinstance(outcome.command, RangeCommand):
-            self._leave_alone(self._active[1], now_s)
+            if self._plan.get_cir:
+                self._leave_alone(self._active[1], now_s)
             self._end_turn(outcome.reply if isinstance(outcome.reply, RangeReport) else None)
 
     def _leave_alone(self, pair: Pair, now_s: float) -> None:
         """Keep quiet while the two boards of an exchange, and passive ones, print their impulse responses."""
-        if not self._plan.get_cir:
-            return
         both = self._plan.target_reports or self._passive
         until_s = now_s + (QUIET_TARGET_S if both else QUIET_AFTER_CIR_S)
         self._next_s = max(self._next_s, until_s)
@@ -248,13 +318,8 @@ class Recorder:
         self._by_port.pop(id(station.port), None)
         station.unplug(self._ports.now_s())
 
-    def _take_back(self, station: Station, now_s: float) -> None:
-        if station.plug_again(now_s):
-            self._by_port[id(station.port)] = station
-            self._fault(station, "replugged", f"{station.name}: board {station.board} is back")
-
     def _fault(self, station: Station, kind: str, detail: str, failed: RangeCommand | None = None) -> None:
         ends = (station.board, failed.target) if failed else (None, None)
-        fault = Fault(self._ports.host_ns(), str(station.board), kind, detail[:MOST_FAULT_TEXT], *ends)
+        fault = Fault(self._ports.host_ns(), str(station.board), kind, detail[:200], *ends)
         for listener in self._listeners:
             listener.on_fault(fault)

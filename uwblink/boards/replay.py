@@ -1,4 +1,4 @@
-"""Old flights through today's decoder: the stored bytes decoded again, or played back on pseudo-terminals."""
+"""Replay: the stored bytes of a recording decoded again, or played back on pseudo-terminals."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from uwblink.boards.pseudo_terminals import Terminal
-from uwblink.boards.writer import overheard_row
+from uwblink.boards.ports import Terminal, wait_until
+from uwblink.boards.record import overheard_row
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import CirRow
+from uwblink.recording.schema import CirRow, FrameRow
 from uwblink.twr import COLUMNS, Exchanges
 from uwblink.wire.bulk import ColumnDecoder
 from uwblink.wire.messages import Cir, Overheard, TextLine
@@ -34,9 +34,7 @@ class Decoded:
 
 def decode_again(recording: Recording) -> Decoded:
     """Decode every byte that came from a board; raises `RecordingError` when the recording holds none."""
-    frames = [frame for frame in recording.frames() if frame.direction == "in"]
-    if not frames:
-        raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
+    frames = _heard(recording)
     ids = board_ids(recording)
     decoders: dict[str, ColumnDecoder] = {}
     for frame in frames:
@@ -96,9 +94,7 @@ def play(
     `ready` is told what each board's port is now called, before the first byte. Raises `RecordingError` when the
     recording holds no bytes.
     """
-    frames = [frame for frame in recording.frames() if frame.direction == "in"]
-    if not frames:
-        raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
+    frames = _heard(recording)
     ids = board_ids(recording)
     names = sorted({frame.board for frame in frames})
     terminals = {n: Terminal(link_dir / f"tag{ids.get(n, k)}" if link_dir else None) for k, n in enumerate(names)}
@@ -106,10 +102,8 @@ def play(
         ready({name: terminal.name for name, terminal in terminals.items()})
         start_s, first_ns = time.monotonic(), frames[0].time_ns
         for count, frame in enumerate(frames):
-            while (wait_s := start_s + (frame.time_ns - first_ns) * 1e-9 / speed - time.monotonic()) > 0:
-                if stop():
-                    return count
-                time.sleep(min(wait_s, 0.1))
+            if not wait_until(start_s + (frame.time_ns - first_ns) * 1e-9 / speed, stop):
+                return count
             terminals[frame.board].write(frame.data)
         return len(frames)
     finally:
@@ -119,14 +113,19 @@ def play(
 
 def summarize(recording: Recording, decoded: Decoded) -> dict[str, Any]:
     """Compare what was decoded now with what was stored then, JSON-ready."""
-    return {
-        "messages": decoded.messages,
-        "skipped_bytes": decoded.skipped_bytes,
-        "texts": decoded.texts,
-        "exchanges": {"stored": recording.count("exchanges"), "decoded": len(decoded.exchanges)},
-        "overheard": {"stored": recording.count("overheard"), "decoded": len(decoded.overheard)},
-        "cirs": {"stored": recording.count("cirs"), "decoded": len(decoded.cirs)},
+    totals = {name: getattr(decoded, name) for name in ("messages", "skipped_bytes", "texts")}
+    return totals | {
+        table: {"stored": recording.count(table), "decoded": len(getattr(decoded, table))}
+        for table in ("exchanges", "overheard", "cirs")
     }
+
+
+def _heard(recording: Recording) -> list[FrameRow]:
+    """Return the bytes from boards; raises `RecordingError` when there are none."""
+    frames = [frame for frame in recording.frames() if frame.direction == "in"]
+    if not frames:
+        raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
+    return frames
 
 
 def _in_order(parts: list[Exchanges]) -> Exchanges:

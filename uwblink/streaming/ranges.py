@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from uwblink.boards.corrections import Correction
+from uwblink.boards.listeners import Correction
 from uwblink.twr import Exchanges
 
 ENDS: Final = ("time_ns", "initiator", "target")

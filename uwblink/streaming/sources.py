@@ -12,10 +12,18 @@ from typing import Final
 
 import numpy as np
 
-from uwblink.boards.corrections import Correction, check_pairs, load_correction
-from uwblink.boards.delay_check import DelayCheck
-from uwblink.boards.listeners import Heard, Listener, Pair, Turn, as_listeners
-from uwblink.boards.ports import Ports, SerialPorts
+from uwblink.boards.listeners import (
+    Correction,
+    DelayCheck,
+    Heard,
+    Listener,
+    Pair,
+    Turn,
+    as_listeners,
+    check_pairs,
+    load_correction,
+)
+from uwblink.boards.ports import Ports, SerialPorts, wait_until
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import identify
 from uwblink.boards.recorder import Recorder
@@ -27,7 +35,6 @@ from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import RangeReport
 
 Stream = Generator[StreamedRange, None, None]
-LONGEST_SLEEP_S: Final = 0.1
 AT_A_TIME: Final = 10_000
 """Rows of a recording that are corrected and made into Python's numbers at once."""
 
@@ -179,15 +186,6 @@ def _play(
     for start in range(0, len(exchanges), AT_A_TIME):
         for found in streamed(exchanges[start : start + AT_A_TIME], correct):
             since_s = (found.time_ns - first_ns) * 1e-9
-            if since_s > duration_s or not _wait_until(start_s + since_s / speed, stop):
+            if since_s > duration_s or not wait_until(start_s + since_s / speed, stop):
                 return
             yield found
-
-
-def _wait_until(due_s: float, stop: Callable[[], bool]) -> bool:
-    """Wait for a time of the monotonic clock; returns whether nobody said to stop meanwhile."""
-    while (wait_s := due_s - time.monotonic()) > 0:
-        if stop():
-            return False
-        time.sleep(min(wait_s, LONGEST_SLEEP_S))
-    return not stop()

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwblink.arrays import Floats
-from uwblink.boards.pseudo_terminals import Terminal
+from uwblink.boards.ports import Terminal
 from uwblink.output import new_file
 from uwbsim.boards.frames import MS, NS_PER_S
 from uwbsim.boards.virtual_board import Bench, VirtualBoard

@@ -75,7 +75,7 @@ def test_a_patient_connection_stays_patient():
     connection.expire(2.0)
     connection.send(FENCE, 3.0)
     assert connection.deadline_s() == 5.0
-    connection.settled()
+    connection.receive(b"R00\r\n", 3.1)
     assert not connection.doubtful
 
 

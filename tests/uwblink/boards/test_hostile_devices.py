@@ -11,8 +11,8 @@ import pytest
 
 import uwblink
 from tests import processes
-from uwblink.boards.progress import Progress
-from uwblink.boards.pseudo_terminals import Terminal
+from uwblink.boards.listeners import Progress
+from uwblink.boards.ports import Terminal
 from uwblink.boards.recorder import Recorder
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode

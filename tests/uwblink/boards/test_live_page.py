@@ -19,10 +19,8 @@ import pytest
 import uwblink
 from tests.boards import bench_scenario, served
 from uwblink.boards import live_page
-from uwblink.boards.corrections import load_correction
-from uwblink.boards.listeners import Turn
+from uwblink.boards.listeners import PairState, Progress, Turn, load_correction
 from uwblink.boards.live_page import LivePage
-from uwblink.boards.progress import PairState, Progress
 from uwblink.errors import PlanError, PortError
 from uwblink.recording.schema import Fault
 from uwblink.wire.messages import RangeReport

@@ -10,9 +10,8 @@ import pytest
 from benchmarks.hours import RATE_HZ, AnsweringPorts
 from uwblink.boards.listeners import Listener
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.record import FILE_MB, identify, record
+from uwblink.boards.record import FILE_MB, FLUSH_S, Batch, identify, record
 from uwblink.boards.recorder import Recorder
-from uwblink.boards.writer import FLUSH_S, Batch
 from uwblink.recording.file import Recording
 
 WARM, LATER, LONG = 1_200, 3_600, 3_700

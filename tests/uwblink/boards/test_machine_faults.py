@@ -13,8 +13,7 @@ from tests.in_process import Ended, run
 from uwblink.boards.listeners import Listener
 from uwblink.boards.ports import SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
-from uwblink.boards.record import record
-from uwblink.boards.writer import LONGEST_BACKLOG_S, RecordingWriter
+from uwblink.boards.record import LONGEST_BACKLOG_S, RecordingWriter, record
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwbsim.boards.virtual_port import VirtualPorts

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from tests.boards import bench_scenario, served
-from uwblink.boards.listeners import Listener
-from uwblink.boards.progress import Progress
+from uwblink.boards.listeners import Listener, Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
 from uwblink.boards.replay import decode_again

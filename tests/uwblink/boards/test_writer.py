@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from uwblink.boards import writer as writing
-from uwblink.boards.writer import RecordingWriter
+from uwblink.boards import record as writing
+from uwblink.boards.record import RecordingWriter
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES

@@ -11,7 +11,7 @@ import calib
 import uwblink
 from calib.doctor.examine import examine
 from tests.boards import bench_scenario
-from uwblink.boards.report_check import ReportCheck
+from uwblink.boards.listeners import ReportCheck
 from uwblink.recording.file import Recording
 from uwblink.recording.summary import summarize
 from uwblink.recording.target_reports import differences, single_reports
