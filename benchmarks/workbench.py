@@ -168,24 +168,25 @@ def dask() -> str:
     from distributed import Client, LocalCluster
 
     from uwbsim.sweep.design import load_design
-    from uwbsim.sweep.executors import run_chunk
+    from uwbsim.sweep.executors import Work, run_chunk
     from uwbsim.sweep.runner import _task
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "plan.toml"
         path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=40))
         plan = load_design(path)
-        _, once = run_chunk([_task(plan, 0)])
-        _, once = run_chunk([_task(plan, 1)])
+        work = Work.of_here(plan.scenario.stem, plan.protocols, plan.ranges)
+        _, once = run_chunk([_task(plan, 0)], work)
+        _, once = run_chunk([_task(plan, 1)], work)
         size = max(int(1 / once), 1)
         chunk = [_task(plan, k % plan.total) for k in range(size)]
         with (
             LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
             Client(cluster) as client,
         ):
-            client.submit(run_chunk, chunk, pure=False).result()
+            client.submit(run_chunk, chunk, work, pure=False).result()
             start = time.perf_counter()
-            futures = [client.submit(run_chunk, chunk, pure=False) for _ in range(8)]
+            futures = [client.submit(run_chunk, chunk, work, pure=False) for _ in range(8)]
             inside = sum(future.result()[1] for future in futures)
             whole = time.perf_counter() - start
     return f"{100 * (whole / inside - 1):.1f} % (chunks of {inside / 8:.2f} s)"

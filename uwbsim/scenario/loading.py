@@ -176,7 +176,7 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
     if isinstance(source, Mapping):
         return deepcopy(dict(source)), NO_FILE
     if isinstance(source, str) and "\n" in source:
-        return _toml(source, NO_FILE), NO_FILE
+        return parse_toml(source, NO_FILE), NO_FILE
     if not isinstance(source, str | os.PathLike):
         seen = type(source).__name__
         raise ParameterError(
@@ -184,10 +184,11 @@ def _table(source: Source) -> tuple[dict[str, Any], Path]:
         )
     path = found(Path(source))
     what = f"scenario file (.toml) or name{nearest(path)} (see uwbsim scenarios)"
-    return _toml(read_text(path, ScenarioError, what), path), path
+    return parse_toml(read_text(path, ScenarioError, what), path), path
 
 
-def _toml(text: str, path: Path) -> dict[str, Any]:
+def parse_toml(text: str, path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML text; raises `ScenarioError` that names its file."""
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:

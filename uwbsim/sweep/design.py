@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,16 +15,16 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.text_files import read_text, require_regular
+from uwblink.text_files import read_text
 from uwblink.toml import FileKey
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.linked_files import Folders, check_linked
-from uwbsim.scenario.loading import SUFFIX, load, shipped_scenarios
+from uwbsim.scenario.loading import SUFFIX, load, parse_toml, shipped_scenarios
 
-KINDS: Final = ("compare", "calibrate")
-DESIGNS: Final = ("grid", "latin-hypercube", "list")
 MOST_RUNS: Final = 10_000_000
+"""Runs of a sweep, seeds and values of a Latin hypercube at most: their numbers fit into memory."""
+
 FILE_KEYS: Final = (
     FileKey("sweep.name", "text", "the name of the file", "What the sweep is called."),
     FileKey("sweep.scenario", "text", "needed", "The scenario that varies, from the folder of this file."),
@@ -56,6 +56,7 @@ FILE_KEYS: Final = (
     FileKey('list[]."KEY"', "a value", "that of the scenario", "Of a list: the value of a key at one point."),
 )
 KEYS: Final = tuple(key.name.removeprefix("sweep.") for key in FILE_KEYS if key.name.startswith("sweep."))
+"""Of the table [sweep]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,21 +134,27 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
     (6, {'radio.rx_noise_ps': 200.0}, 2)
     """
     path, folders = Path(path), tuple(allow_files)
-    table, text = _parse(path)
+    text = read_text(path, ScenarioError, "file of a sweep (.toml)")
+    table = parse_toml(text, path)
     unknown = sorted(set(table) - {"sweep", "vary", "list"})
     if unknown:
         raise ScenarioError(f"{path}: {unknown[0]}: unknown table; known are sweep, vary, list")
     head = table.get("sweep")
     if not isinstance(head, dict):
         raise ScenarioError(f"{path}: sweep: missing table [sweep]")
-    _known_keys(path, head)
+    for key in head:
+        if key not in KEYS:
+            near = difflib.get_close_matches(key, KEYS, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(KEYS)}"
+            raise ScenarioError(f"{path}: sweep.{key}: unknown key; {hint}")
     scenario = _scenario(path, head, folders)
-    design = _word(path, head, "design", DESIGNS, "grid")
-    kind = _word(path, head, "kind", KINDS, "compare")
+    design = _word(path, head, "design", ("grid", "latin-hypercube", "list"), "grid")
+    kind = _word(path, head, "kind", ("compare", "calibrate"), "compare")
     protocols = head.get("protocols", list(PROTOCOLS) if kind == "compare" else ["ds"])
     named = isinstance(protocols, list) and all(isinstance(p, str) and p in PROTOCOLS for p in protocols)
     if not named or not protocols:
         raise ScenarioError(f"{path}: sweep.protocols: found {protocols!r}, allowed: {', '.join(PROTOCOLS)}")
+    known = read_text(scenario, ScenarioError, "scenario file (.toml)")
     vary, listed = table.get("vary", {}), table.get("list", [])
     axes, rows = _points(path, head, design, vary, listed)
     plan = SweepDesign(
@@ -160,7 +167,8 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
         seeds=_seeds(path, head),
         axes=axes,
         rows=rows,
-        fingerprint=_fingerprint(text, scenario),
+        # What a result depends on besides its number: the plan's text and the scenario's.
+        fingerprint=hashlib.sha256(text.encode() + b"\0" + known.encode()).hexdigest(),
         allow_files=folders,
     )
     if plan.total > MOST_RUNS:
@@ -176,24 +184,6 @@ def toml_value(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(map(toml_value, value)) + "]"
     return repr(value) if isinstance(value, float) else json.dumps(value)
-
-
-def _parse(path: Path) -> tuple[dict[str, Any], str]:
-    text = read_text(path, ScenarioError, "file of a sweep (.toml)")
-    try:
-        return tomllib.loads(text), text
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}") from error
-
-
-def _known_keys(path: Path, head: Mapping[str, Any]) -> None:
-    import difflib
-
-    for key in head:
-        if key not in KEYS:
-            near = difflib.get_close_matches(key, KEYS, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(KEYS)}"
-            raise ScenarioError(f"{path}: sweep.{key}: unknown key; {hint}")
 
 
 def _scenario(path: Path, head: Mapping[str, Any], folders: Folders) -> Path:
@@ -270,16 +260,6 @@ def _hypercube(path: Path, head: Mapping[str, Any], vary: Mapping[str, Any]) -> 
         whole = span.get("whole", isinstance(low, int) and isinstance(high, int))
         columns[key] = [round(v) if whole else float(v) for v in values.tolist()]
     return [dict(zip(columns, point, strict=True)) for point in zip(*columns.values(), strict=True)] or [{}]
-
-
-def _fingerprint(text: str, scenario: Path) -> str:
-    """What a result depends on besides its number: the plan's text and the scenario's."""
-    require_regular(scenario, ScenarioError, "scenario file")
-    try:
-        known = scenario.read_bytes()
-    except OSError as error:
-        raise ScenarioError(f"{scenario}: no such scenario file") from error
-    return hashlib.sha256(text.encode() + b"\0" + known).hexdigest()
 
 
 def _check_keys(plan: SweepDesign) -> None:

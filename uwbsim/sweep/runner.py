@@ -7,8 +7,10 @@ chunks are out at a time and every result goes to the store at once, so memory d
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,16 +19,11 @@ from uwblink.output import check_folder
 from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.loading import load
 from uwbsim.sweep.design import SweepDesign
-from uwbsim.sweep.executors import Chunk, Evaluate, Extensions, Result, Task, Workers, evaluator, failure, workers_for
+from uwbsim.sweep.executors import Chunk, Evaluate, Result, Task, Work, Workers, evaluator, workers_for
 from uwbsim.sweep.results import Store, export
 
 STORE: Final = "results.duckdb"
-CHUNK_S: Final = 1.0
-"""How long a chunk should take: long beside the milliseconds of handing it out, short beside a patience."""
-
-LONGEST_CHUNK: Final = 512
-ATTEMPTS: Final = 3
-"""How often a run may take its worker down before it counts as failed."""
+"""Name of the file that keeps the results of a sweep, in its folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +84,14 @@ def run_sweep(
         )
     if workers is not None and workers < 1:
         raise ParameterError(f"found {workers}, expected 1 or more", parameter="workers")
-    team = workers_for(workers, scheduler, Extensions.of_here(evaluate, plan.protocols))
+    work = Work.of_here(plan.scenario.stem, plan.protocols, plan.ranges, evaluate)
+    team = workers_for(workers, scheduler, work)
     try:
         folder.mkdir(exist_ok=True)
         path = folder / STORE
         with Store.open(path) if Store.begun(path) else Store.create(path, _identity(plan)) as store:
             known = store.done()
-            done, failed = _work(plan, store, team, known, progress)
+            done, failed = _do(plan, store, team, work, known, progress)
             export(store, folder / "results.csv", folder / "results.parquet")
     finally:
         team.close()
@@ -131,48 +129,50 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
         )
 
 
-def _work(
-    plan: SweepDesign, store: Store, team: Workers, known: set[int], progress: Callable[[float], None] | None
+def _do(
+    plan: SweepDesign,
+    store: Store,
+    team: Workers,
+    work: Work,
+    known: set[int],
+    progress: Callable[[float], None] | None,
 ) -> tuple[int, int]:
+    """Do the runs whose numbers are not `known`; return how many were done, and how many of them failed."""
     numbers = (number for number in range(plan.total) if number not in known)
     # Work that was lost with its worker is done first, one run at a time, so that only a run that kills is to blame.
     again: list[Chunk] = []
-    attempts: dict[int, int] = {}
-    out, done, failed, size, rest = 0, 0, 0, 1, True
+    attempts: Counter[int] = Counter()
+    out, done, failed, size = 0, 0, 0, 1
     while True:
-        while out < 2 * team.size and (again or rest):
-            chunk = again.pop() if again else [_task(plan, n) for n in _take(numbers, size)]
-            rest = rest and bool(chunk)
-            if chunk:
-                team.submit(chunk)
-                out += 1
+        while out < 2 * team.size:
+            chunk = again.pop() if again else [_task(plan, number) for number in islice(numbers, size)]
+            if not chunk:
+                break
+            team.submit(chunk)
+            out += 1
         if not out:
             return done, failed
         for chunk, rows, seconds in team.finished():
             out -= 1
             if rows is None:
-                rows = _lost(chunk, attempts, again)
+                rows = _lost(chunk, work, attempts, again)
             else:
-                size = min(max(int(CHUNK_S * len(chunk) / max(seconds, 1e-6)), 1), LONGEST_CHUNK)
+                # A chunk should take a second: long beside handing it out, short beside a patience.
+                size = min(max(int(len(chunk) / max(seconds, 1e-6)), 1), 512)
             store.append(rows)
             done += len(rows)
-            failed += sum(row["status"] == "failed" for _, some in rows for row in some[:1])
+            failed += sum(some[0]["status"] == "failed" for _, some in rows)
             if progress:
                 progress((len(known) + done) / max(plan.total, 1))
 
 
-def _take(numbers: Iterator[int], count: int) -> list[int]:
-    return [number for _, number in zip(range(count), numbers, strict=False)]
-
-
-def _lost(chunk: Chunk, attempts: dict[int, int], again: list[Chunk]) -> list[Result]:
-    """Queue the runs of a lost chunk one by one; return the rows of those that were lost too often."""
+def _lost(chunk: Chunk, work: Work, attempts: Counter[int], again: list[Chunk]) -> list[Result]:
+    """Queue the runs of a lost chunk one by one; return the rows of those that took their worker down three times."""
     rows = []
     for task in chunk:
-        number = task.number
-        attempts[number] = attempts.get(number, 0) + 1
-        if attempts[number] >= ATTEMPTS:
-            rows.append((number, [failure(task, f"its worker died {ATTEMPTS} times")]))
+        attempts[task.number] += 1
+        if attempts[task.number] >= 3:
+            rows.append(work.failed(task, "its worker died 3 times"))
         else:
             again.append([task])
     return rows
@@ -181,15 +181,7 @@ def _lost(chunk: Chunk, attempts: dict[int, int], again: list[Chunk]) -> list[Re
 def _task(plan: SweepDesign, number: int) -> Task:
     """Return a run as plain data; a scenario that cannot be is an error that travels with it."""
     run = plan.run(number)
-    task = Task(
-        number=number,
-        seed=run.seed,
-        values=run.values,
-        kind=plan.kind,
-        protocols=plan.protocols,
-        ranges=plan.ranges,
-        name=plan.scenario.stem,
-    )
+    task = Task(number=number, seed=run.seed, values=run.values)
     try:
         scenario = load(plan.scenario, run.settings(), run.seed, allow_files=plan.allow_files)
         return replace(task, scenario=scenario.model_dump_json())
