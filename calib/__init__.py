@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from calib.planning.flights import plan_flight
     from calib.planning.result import Plan
     from calib.report.campaign import run_campaign
-    from calib.report.layout import register_report_section
-    from calib.report.report import write_report
+    from calib.report.sections import register_report_section, write_report
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
     from calib.surveys.samples import sample_arrangements
@@ -107,12 +106,12 @@ _HOMES: Final = {
     "plan": "calib.planning.arranging",
     "plan_flight": "calib.planning.flights",
     "register_loss": "calib.estimation.losses",
-    "register_report_section": "calib.report.layout",
+    "register_report_section": "calib.report.sections",
     "run_campaign": "calib.report.campaign",
     "sample_arrangements": "calib.surveys.samples",
     "sample_flight": "calib.data.samples",
     "survey": "calib.surveys.surveying",
-    "write_report": "calib.report.report",
+    "write_report": "calib.report.sections",
 }
 
 if not TYPE_CHECKING:

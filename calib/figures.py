@@ -1,62 +1,142 @@
-"""The figures of a calibration, drawn into axes: errors and their distribution, curves over power, delays.
+"""The figures of a calibration: errors and their distribution, curves over power, delays, and what is left of errors.
 
-Each takes matplotlib axes, or makes new ones where there are none, and returns them.
+Functions that take Matplotlib axes draw into them, or into new ones where there are none, and return them. Functions
+that take a width in inches return a figure at that width (`uwblink.pages.figures`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Any, Final, Literal
 
 import numpy as np
 from matplotlib.axes import Axes as Axes
 from matplotlib.figure import Figure
 
+from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
-from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, planted_curve
-from calib.over_power import Binned, OverPower, biases, sigmas
+from calib.error_mixture import fit_error_mixtures
+from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
 from calib.spread import TWO_SIDED_95
-from uwblink.arrays import Floats
-from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE
-from uwblink.pages.figures import label, legend, mark, sheet
+from uwblink.arrays import Floats, Ints
+from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE, look
+from uwblink.pages.figures import NARROW_IN, WIDTHS, label, legend, mark, sheet
 from uwblink.ticks import SPEED_OF_LIGHT
 
-COLOURS: Final = {"raw": VERMILION, "delays": WINE, "full": BLUE, "planted": GREEN}
-DASHES: Final = {"raw": (0, (1.5, 1.2)), "delays": (0, (5, 1.5)), "full": "-"}
-LABELS: Final = {"raw": "raw", "delays": "delays corrected", "full": "fully corrected"}
-HISTOGRAM_BINS: Final = 40
-WIDE: Final = (7.16, 3.2)
-STRAY: Final = 12.0
-"""Values further from the median than so many median deviations do not decide how far an axis runs."""
+STAGE_LINES: Final[dict[str, dict[str, Any]]] = {
+    "raw": {"color": VERMILION, "ls": (0, (1.5, 1.2)), "label": "raw"},
+    "delays": {"color": WINE, "ls": (0, (5, 1.5)), "label": "delays corrected"},
+    "full": {"color": BLUE, "ls": "-", "label": "fully corrected"},
+}
+"""How each stage of correction is drawn."""
+
+PLANTED: Final[dict[str, Any]] = {"color": GREEN, "ls": (0, (5, 1.5))}
+"""How the curve of a simulation is drawn."""
+
+FEWEST_IN_BIN: Final = 60
+"""Errors of which a core can be told from a tail; below, their median stands for both."""
+
+MOST_PAIRS: Final = 24
+"""Pairs whose errors are drawn over time, those with the largest spread; more would be too small to see."""
+
+
+@dataclass(frozen=True, slots=True)
+class Binned:
+    """Errors by lifted power: median power, centre, standard deviation and median in each bin (bins,), metres.
+
+    Centre and deviation are those of the errors' core, noise without reflections, where the curve was fitted to the
+    core; else those of all errors.
+    """
+
+    lifted: Floats
+    centre_m: Floats
+    std_m: Floats
+    median_m: Floats
+
+
+def binned(lifted: Floats, error_m: Floats, loss: str, bins: int) -> Binned:
+    """Return errors (n,) by lifted power (n,) in bins of equal counts, as a fit with this loss sees them.
+
+    The curve of a robust fit follows the errors' core: reflections only lengthen, so medians and means lie above it.
+    Least squares follow the mean.
+    """
+    return _all_binned({"": (lifted, error_m, bins)}, loss)[""]
+
+
+def over_power(
+    ranges: Ranges, applied: CorrectedRanges, calibration: Calibration, which: Literal["bias", "sigma"]
+) -> dict[str, Binned]:
+    """Return errors by lifted power, of each pair by name in 6 bins, and of "all" in 20.
+
+    They are the delay-corrected errors for the "bias" curve, and the fully corrected ones for "sigma".
+    """
+    lifted = applied.lifted
+    error_m = (applied.delay_corrected_m if which == "bias" else applied.corrected_m) - ranges.truth_m
+    sets = {name: (lifted[rows], error_m[rows], 6) for name, rows in pair_rows(ranges).items()}
+    return _all_binned({**sets, "all": (lifted, error_m, 20)}, calibration.loss)
+
+
+def _all_binned(sets: Mapping[str, tuple[Floats, Floats, int]], loss: str) -> dict[str, Binned]:
+    """Return binned errors of sets (lifted powers, errors, number of bins); all cores are fitted at once."""
+    groups = {
+        name: np.array_split(np.argsort(x), max(1, min(bins, len(x) // FEWEST_IN_BIN)))
+        for name, (x, _, bins) in sets.items()
+    }
+    errors = [sets[name][1][rows] for name, some in groups.items() for rows in some]
+    if loss == "l2":
+        centres = [(float(np.mean(error_m)), float(np.std(error_m))) for error_m in errors]
+    else:
+        centres = [(float(np.median(error_m)), float(np.std(error_m))) for error_m in errors]
+        told = [k for k, e in enumerate(errors) if len(e) >= FEWEST_IN_BIN and float(np.ptp(e)) >= 1e-9]
+        for k, core in zip(told, fit_error_mixtures([errors[k] for k in told]), strict=True):
+            centres[k] = (core.location_m, float(core.sigma_m[0]))
+    found, first = {}, 0
+    for name, some in groups.items():
+        x, error_m, _ = sets[name]
+        own = np.array(centres[first : first + len(some)])
+        first += len(some)
+        medians = [(np.median(x[rows]), np.median(error_m[rows])) for rows in some]
+        powers, middles = np.array(medians).T
+        found[name] = Binned(powers, own[:, 0], own[:, 1], middles)
+    return found
 
 
 def histogram(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None) -> Axes:
-    """Range errors in the three stages, in cm; the outermost bins hold everything beyond them."""
+    """Draw range errors in the three stages, in cm; the outermost bins hold everything beyond them."""
     axes = axes or new_axes()
     errors = _errors_cm(ranges, applied)
-    low, high = _reach(errors)
-    edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
+    # From where to where: 98 % of the corrected errors, and of the raw ones where they are near.
+    low, high = np.quantile(errors["full"], (0.01, 0.99))
+    raw = np.quantile(errors["raw"], (0.02, 0.98))
+    if raw[1] - raw[0] + abs(float(np.mean(raw)) - float(low + high) / 2) < 5 * (high - low):
+        low, high = min(low, raw[0]), max(high, raw[1])
+    margin = 0.05 * float(high - low) + 0.1
+    low, high = float(low) - margin, float(high) + margin
+    edges = np.linspace(low, high, 41)
     for stage, error in errors.items():
         inside = np.clip(error, low, np.nextafter(high, low))
         share = np.histogram(inside, edges)[0] * (100 / len(error))
-        mark(axes.stairs(share, edges, lw=1.3, color=COLOURS[stage], ls=DASHES[stage], label=LABELS[stage]), stage)
-    _outermost(axes, low, high)
+        mark(axes.stairs(share, edges, lw=1.3, **STAGE_LINES[stage]), stage)
+    inner = [t for t in axes.get_xticks() if low + 0.12 * (high - low) < t < high - 0.12 * (high - low)]
+    names = [f"≤ {low:.0f}", *(f"{t:.0f}" for t in inner), f"≥ {high:.0f}"]
+    axes.set_xticks([low, *inner, high], [name.replace("-", "−") for name in names])
+    axes.set_xlim(low, high)
     label(axes, "range error (cm)", "ranges (%)")
     return _explained(axes)
 
 
 def cumulative(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None) -> Axes:
-    """Share of ranges whose error is smaller than so much, in the three stages."""
+    """Draw the share of ranges whose error is smaller than a size, in the three stages."""
     axes = axes or new_axes()
     errors = {stage: np.sort(np.abs(error)) for stage, error in _errors_cm(ranges, applied).items()}
     shares = np.concatenate([np.linspace(0, 0.98, 150), np.linspace(0.981, 1, 20)])
     for stage, error in errors.items():
-        (line,) = axes.plot(
-            np.quantile(error, shares), 100 * shares, color=COLOURS[stage], ls=DASHES[stage], label=LABELS[stage]
-        )
-        mark(line, LABELS[stage])
+        (line,) = axes.plot(np.quantile(error, shares), 100 * shares, **STAGE_LINES[stage])
+        mark(line, STAGE_LINES[stage]["label"])
     for share in (50, 95):
         axes.axhline(share, color=PALE, lw=0.6, zorder=0)
     full, raw = (float(np.quantile(errors[stage], 0.99)) for stage in ("full", "raw"))
@@ -73,26 +153,19 @@ def bias_over_power(
     calibration: Calibration,
     axes: Axes | None = None,
     *,
-    found: OverPower | None = None,
+    found: Mapping[str, Binned] | None = None,
 ) -> Axes:
-    """Centre of the delay-corrected errors' core over lifted power: every pair, all, fitted, planted; and medians.
+    """Draw the centre of the delay-corrected errors over lifted power: by pair, all, fitted, planted; and medians.
 
-    What is `found` by `biases` already need not be found again.
+    `found` is what `over_power` returned, where it is known already.
     """
     axes = axes or new_axes()
-    everything = _over_power(axes, found or biases(ranges, applied, calibration), calibration.loss, "centre_m")
-    if calibration.loss != "l2":
-        axes.plot(
-            everything.lifted, 100 * everything.median_m, "_", color=MUTED, ms=6, label="medians, reflections included"
-        )
-    _curve(axes, calibration, "bias")
-    grid = np.linspace(*calibration.bias_curve.range, 300)
-    planted = planted_curve(ranges, "bias_curve", grid)
-    if planted is not None:
-        beside = beside_planted(ranges, applied, calibration)
-        shift = beside.shift_ns * 1e-9 * SPEED_OF_LIGHT if beside else 0.0
-        axes.plot(grid, 100 * (planted + shift), ls=DASHES["delays"], color=GREEN, label="planted, same gauge")
-    _power_axes(axes, calibration, "bias (cm)")
+    planted = planted_curve(ranges, "bias_curve", np.linspace(*calibration.bias_curve.range, 300))
+    beside = beside_planted(ranges, applied, calibration) if planted is not None else None
+    if planted is not None and beside is not None:
+        planted += beside.shift_ns * 1e-9 * SPEED_OF_LIGHT
+    found = found or over_power(ranges, applied, calibration, "bias")
+    _over_power(axes, found, calibration, "bias", planted)
     return _explained(axes)
 
 
@@ -102,35 +175,36 @@ def sigma_over_power(
     calibration: Calibration,
     axes: Axes | None = None,
     *,
-    found: OverPower | None = None,
+    found: Mapping[str, Binned] | None = None,
 ) -> Axes:
-    """Standard deviation of the calibrated errors' core over lifted power, likewise; `found` by `sigmas`."""
+    """Draw the standard deviation of the calibrated errors over lifted power, in the same way."""
     axes = axes or new_axes()
-    _over_power(axes, found or sigmas(ranges, applied, calibration), calibration.loss, "std_m")
-    _curve(axes, calibration, "sigma")
-    grid = np.linspace(*calibration.sigma_curve.range, 300)
-    planted = planted_curve(ranges, "sigma_curve", grid)
-    if planted is not None:
-        axes.plot(grid, 100 * planted, ls=DASHES["delays"], color=GREEN, label="planted")
-    axes.set_ylim(bottom=0)
-    _power_axes(axes, calibration, "standard deviation (cm)")
+    planted = planted_curve(ranges, "sigma_curve", np.linspace(*calibration.sigma_curve.range, 300))
+    found = found or over_power(ranges, applied, calibration, "sigma")
+    _over_power(axes, found, calibration, "sigma", planted)
     return _explained(axes)
 
 
-def _over_power(axes: Axes, found: OverPower, loss: str, what: str) -> Binned:
-    shown: list[Floats] = []
-    for name, own in found.pairs.items():
-        shown.append(100 * getattr(own, what))
-        (line,) = axes.plot(own.lifted, shown[-1], color=PALE, lw=0.8, label="" if len(shown) > 1 else "each pair")
-        mark(line, f"pair {name}")
-    everything = found.everything
-    name = "mean of all pairs" if loss == "l2" else "core of all pairs"
-    axes.plot(everything.lifted, 100 * getattr(everything, what), "o", color=INK, ms=3, label=name, zorder=4)
-    keep_strays_out(axes, np.concatenate([*shown, 100 * getattr(everything, what)]))
-    return everything
-
-
-def _curve(axes: Axes, calibration: Calibration, which: Literal["bias", "sigma"]) -> None:
+def _over_power(
+    axes: Axes,
+    found: Mapping[str, Binned],
+    calibration: Calibration,
+    which: Literal["bias", "sigma"],
+    planted: Floats | None,
+) -> None:
+    what = "centre_m" if which == "bias" else "std_m"
+    values = {name: 100 * getattr(own, what) for name, own in found.items()}
+    for k, (name, own) in enumerate(found.items()):
+        if name != "all":
+            text = "" if k else "each pair"
+            mark(axes.plot(own.lifted, values[name], color=PALE, lw=0.8, label=text)[0], f"pair {name}")
+    everything, squares = found["all"], calibration.loss == "l2"
+    name = "mean of all pairs" if squares else "core of all pairs"
+    axes.plot(everything.lifted, values["all"], "o", color=INK, ms=3, label=name, zorder=4)
+    keep_strays_out(axes, np.concatenate(list(values.values())))
+    if which == "bias" and not squares:
+        medians = 100 * everything.median_m
+        axes.plot(everything.lifted, medians, "_", color=MUTED, ms=6, label="medians, reflections included")
     curve = calibration.bias_curve if which == "bias" else calibration.sigma_curve
     grid = np.linspace(*curve.range, 300)
     middle, std_m = 100 * curve(grid), calibration.band(grid, which)
@@ -138,6 +212,11 @@ def _curve(axes: Axes, calibration: Calibration, which: Literal["bias", "sigma"]
         half = 100 * TWO_SIDED_95 * std_m
         axes.fill_between(grid, middle - half, middle + half, color=BLUE, alpha=0.3, lw=0, label="95 % band")
     axes.plot(grid, middle, color=BLUE, lw=1.6, label="fitted", zorder=3)
+    if planted is not None:
+        axes.plot(grid, 100 * planted, label="planted, same gauge" if which == "bias" else "planted", **PLANTED)
+    if which == "sigma":
+        axes.set_ylim(bottom=0)
+    _power_axes(axes, calibration, "bias (cm)" if which == "bias" else "standard deviation (cm)")
 
 
 def _power_axes(axes: Axes, calibration: Calibration, y: str) -> None:
@@ -164,9 +243,9 @@ def delays(
     shift_ns: float = 0.0,
     axes: Axes | None = None,
 ) -> Axes:
-    """Delays in ns with 95 % intervals; planted ones, if known, beside them, moved by the common shift.
+    """Draw delays in ns with 95 % intervals, and planted ones beside them, moved by the common shift.
 
-    What lies far from all the others is at the edge, with its value.
+    A delay far from all the others is at the edge, with its value.
     """
     axes = axes or new_axes()
     tags = sorted(calibration.delays_ns)
@@ -176,16 +255,8 @@ def delays(
     bars = np.where(np.isfinite(std), TWO_SIDED_95 * std, 0.0)
     inside = within_fence(values)
     beside = 0.12 if planted_ns else 0.0
-    axes.errorbar(
-        (place - beside)[inside],
-        values[inside],
-        bars[inside],
-        fmt="o",
-        ms=3.5,
-        capsize=2.5,
-        color=BLUE,
-        label="fitted, 95 % interval",
-    )
+    dots: dict[str, Any] = {"fmt": "o", "ms": 3.5, "capsize": 2.5, "color": BLUE, "label": "fitted, 95 % interval"}
+    axes.errorbar((place - beside)[inside], values[inside], bars[inside], **dots)
     low, high = float(values[inside].min()), float(values[inside].max())
     if planted_ns:
         known = np.array([planted_ns.get(tag, np.nan) + shift_ns for tag in tags])
@@ -196,14 +267,8 @@ def delays(
     margin = 0.08 * (high - low) + bar + 1e-6
     axes.set_ylim(low - margin, high + 2.2 * margin if not inside.all() else high + margin)
     for k in np.flatnonzero(~inside):
-        axes.annotate(
-            f"{values[k]:+.1f} ns",
-            (place[k], 0.97),
-            xycoords=("data", "axes fraction"),
-            ha="center",
-            va="top",
-            color=BLUE,
-        )
+        where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "top"}
+        axes.annotate(f"{values[k]:+.1f} ns", (place[k], 0.97), color=BLUE, **where)
     axes.axhline(0, color=PALE, lw=0.7, zorder=0)
     every = max(1, len(tags) // 24 + 1)
     axes.set_xticks(place[::every], [str(tag) for tag in tags[::every]])
@@ -213,10 +278,10 @@ def delays(
 
 
 def within_fence(values: Floats) -> Any:
-    """Return which values (n,) may decide how far an axis runs: all but those far from the others."""
+    """Return which values (n,) may decide how far an axis runs: those within 12 median deviations of the median."""
     away = np.abs(values - np.median(values))
     usual = float(np.median(away))
-    return away <= (STRAY * usual if usual > 0 else np.inf)
+    return away <= (12.0 * usual if usual > 0 else np.inf)
 
 
 def keep_strays_out(axes: Axes, values: Floats) -> None:
@@ -227,26 +292,22 @@ def keep_strays_out(axes: Axes, values: Floats) -> None:
     axes.set_ylim(low - margin, high + margin)
 
 
+def new_axes() -> Axes:
+    """Return the axes of a new figure, which pyplot shows and closes."""
+    from matplotlib import pyplot
+
+    return pyplot.subplots(figsize=(WIDTHS["page"], 3.2), layout="constrained")[1]
+
+
+def alone(draw: Callable[[Axes], Axes], width_in: float) -> Figure:
+    """Return a figure of a width in inches with what is drawn into its only axes."""
+    figure, (axes,) = sheet(width_in, height_in=3.1)
+    draw(axes)
+    return figure
+
+
 def _errors_cm(ranges: Ranges, applied: CorrectedRanges) -> dict[str, Floats]:
     return {stage: 100 * (getattr(applied, name) - ranges.truth_m) for stage, name in CORRECTION_STAGES.items()}
-
-
-def _reach(errors: Mapping[str, Floats]) -> tuple[float, float]:
-    """Return from where to where a histogram runs: over 98 % of the corrected, and the raw where they are near."""
-    low, high = np.quantile(errors["full"], (0.01, 0.99))
-    raw = np.quantile(errors["raw"], (0.02, 0.98))
-    if raw[1] - raw[0] + abs(float(np.mean(raw)) - float(low + high) / 2) < 5 * (high - low):
-        low, high = min(low, raw[0]), max(high, raw[1])
-    margin = 0.05 * float(high - low) + 0.1
-    return float(low) - margin, float(high) + margin
-
-
-def _outermost(axes: Axes, low: float, high: float) -> None:
-    """Say at its ends that the axis holds everything beyond."""
-    inner = [t for t in axes.get_xticks() if low + 0.12 * (high - low) < t < high - 0.12 * (high - low)]
-    names = [f"≤ {low:.0f}", *(f"{t:.0f}" for t in inner), f"≥ {high:.0f}"]
-    axes.set_xticks([low, *inner, high], [name.replace("-", "−") for name in names])
-    axes.set_xlim(low, high)
 
 
 def _explained(axes: Axes) -> Axes:
@@ -259,15 +320,156 @@ def _explained(axes: Axes) -> Axes:
     return axes
 
 
-def new_axes() -> Axes:
-    """Return the axes of a new figure, which pyplot shows and closes."""
-    from matplotlib import pyplot
+def distribution(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
+    """Draw errors in the three stages: shares by size and sign, and how many are smaller than a size."""
+    figure, (left, right) = sheet(width_in, 2)
+    for draw, axes in ((histogram, left), (cumulative, right)):
+        inside = draw(ranges, applied, axes).get_legend()
+        if inside:
+            inside.remove()
+    legend(figure)
+    return figure
 
-    return pyplot.subplots(figsize=WIDE, layout="constrained")[1]
+
+def z_scores(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
+    """Draw errors over their sigma: a histogram beside the normal density, and quantiles against normal quantiles."""
+    z = (applied.corrected_m - ranges.truth_m) / applied.sigma_m
+    figure, (left, right) = sheet(width_in, 2)
+    edges = np.linspace(-6, 6, 61)
+    inside = np.clip(z, edges[0], edges[-1] - 1e-9)
+    density = np.histogram(inside, edges)[0] / len(z) / (edges[1] - edges[0])
+    left.stairs(density, edges, fill=True, color=BLUE, alpha=0.55, label="ranges")
+    grid = np.linspace(-6, 6, 200)
+    left.plot(grid, np.exp(-0.5 * grid**2) / np.sqrt(2 * np.pi), color=INK, lw=1.2, label="standard normal")
+    label(left, "error over its σ; all beyond ±6 in the last bins", "density")
+    shares = (np.arange(300) + 0.5) / 300
+    normal = [NormalDist().inv_cdf(share) for share in shares.tolist()]
+    right.plot(normal, np.clip(np.quantile(z, shares), -6, 12), ".", ms=3, color=BLUE)
+    right.plot([-3, 3], [-3, 3], color=INK, lw=1.2)
+    right.set_ylim(-6, 12)
+    label(right, "quantile of the standard normal", "quantile of error over σ")
+    legend(figure, left)
+    return figure
 
 
-def alone(draw: Callable[[Axes], Axes], width_in: float) -> Figure:
-    """Return a figure of its own, of a width in inches, with what is drawn into its axes."""
-    figure, (axes,) = sheet(width_in, height_in=3.1)
-    draw(axes)
+def residuals(width_in: float, ranges: Ranges, applied: CorrectedRanges, alpha_dbm: float) -> Figure:
+    """Draw calibrated errors over distance and over first-path power, with medians and the middle 68 %."""
+    figure, panels = sheet(width_in, 2, sharey=True)
+    error = 100 * (applied.corrected_m - ranges.truth_m)
+    power = 10 * np.log10(np.maximum(applied.lifted, 1e-9)) + alpha_dbm
+    over = ((ranges.truth_m, "true distance (m)"), (power, "lifted power, in dBm"))
+    for panel, (x, name) in zip(panels, over, strict=True):
+        every = slice(None, None, max(len(x) // 3000, 1))  # more points show nothing more
+        panel.plot(x[every], error[every], ".", ms=1.2, color=PALE, rasterized=True, zorder=0)
+        groups = np.array_split(np.argsort(x), max(1, min(16, len(x) // 40)))
+        middle = [float(np.median(x[rows])) for rows in groups]
+        low, median, high = np.array([np.quantile(error[rows], (0.16, 0.5, 0.84)) for rows in groups]).T
+        panel.fill_between(middle, low, high, color=BLUE, alpha=0.25, lw=0, label="middle 68 %")
+        panel.plot(middle, median, "o-", ms=2.8, color=BLUE, label="median")
+        panel.axhline(0, color=MUTED, lw=0.7)
+        low_x, high_x = np.quantile(x, (0.001, 0.999))
+        margin = 0.03 * (high_x - low_x) + 1e-6
+        panel.set_xlim(low_x - margin, high_x + margin)
+        # Labels like -97.5 are wide: there is room for fewer than by default.
+        panel.locator_params(axis="x", nbins=7, steps=[1, 2, 5, 10])
+        label(panel, name, "calibrated error (cm)" if panel is panels[0] or width_in < NARROW_IN else "")
+    panels[0].set_ylim(*_reach_cm(error))
+    legend(figure, panels[0])
+    return figure
+
+
+def over_time(width_in: float, ranges: Ranges, applied: CorrectedRanges) -> Figure:
+    """Draw the calibrated error of each pair over time, with the band in which 95 % should lie."""
+    error = 100 * (applied.corrected_m - ranges.truth_m)
+    pairs = most_spread(ranges, error)
+    time = (ranges.time_ns - ranges.time_ns.min()) * 1e-9
+    across = 2 if width_in < NARROW_IN else 4
+    figure, panels = sheet(width_in, len(pairs), height_in=1.05, across=across, sharex=True, sharey=True)
+    figure.set_figheight(figure.get_figheight() + 0.6)
+    for panel, (name, own) in zip(panels, pairs.items(), strict=True):
+        order = own[np.argsort(time[own])]
+        shown, some = order[:: max(1, len(order) // 800)], order[:: max(1, len(order) // 120)]
+        panel.plot(time[shown], error[shown], ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
+        for side in (-196, 196):
+            panel.plot(time[some], side * applied.sigma_m[some], color=INK, lw=0.6)
+        panel.set_title(f"tags {name}", loc="left", pad=2)
+        label(panel, "", "")
+    panels[0].set_ylim(*_reach_cm(error))
+    figure.supxlabel("time (s)", fontsize="medium")
+    figure.supylabel("calibrated error (cm)", fontsize="medium")
+    return figure
+
+
+def most_spread(ranges: Ranges, error: Floats) -> dict[str, Ints]:
+    """Return the rows of the pairs that are drawn over time: all, or of many those whose errors spread most."""
+    pairs = {name: np.flatnonzero(rows) for name, rows in pair_rows(ranges).items()}
+    spread = {name: float(np.ptp(np.quantile(error[rows], (0.05, 0.95)))) for name, rows in pairs.items()}
+    kept = sorted(pairs, key=lambda name: -spread[name])[:MOST_PAIRS]
+    return {name: rows for name, rows in pairs.items() if name in kept}
+
+
+def _reach_cm(error: Floats) -> tuple[float, float]:
+    """Return from where to where errors in cm are drawn: all but the outermost hundredth."""
+    low, high = np.quantile(error, (0.003, 0.985))
+    margin = 0.1 * float(high - low) + 0.1
+    return float(low) - margin, float(high) + margin
+
+
+def scale_sensitivity(width_in: float, scales_ns: list[float], fits: list[Calibration], chosen_ns: float) -> Figure:
+    """Draw how far each delay moves, about the mean of all, as the scale of the loss changes."""
+    figure, (axes,) = sheet(width_in, height_in=2.8)
+    tags = sorted(fits[0].delays_ns)
+    table = np.array([[fit.delays_ns[tag] for tag in tags] for fit in fits])
+    table -= table.mean(axis=1, keepdims=True)
+    reference = table[int(np.argmin(np.abs(np.log(np.array(scales_ns) / chosen_ns))))]
+    moved = 1e3 * (table - reference)
+    for k, tag in enumerate(tags):
+        (line,) = axes.plot(scales_ns, moved[:, k], label=f"tag {tag}", **look(k).line())
+        mark(line, f"tag {tag}")
+    keep_strays_out(axes, moved.ravel())
+    axes.axvline(chosen_ns, color=MUTED, ls="--", lw=0.8)
+    axes.text(chosen_ns, 0.98, " chosen", transform=axes.get_xaxis_transform(), va="top", color=MUTED)
+    axes.set_xscale("log")
+    kept = scales_ns[::2] if width_in < NARROW_IN else scales_ns
+    axes.set_xticks(kept, [f"{scale:.3g}" for scale in kept])
+    axes.set_xticks([], minor=True)
+    label(axes, "scale of the loss (ns of flight)", "change of the delay (ps)")
+    legend(figure)
+    return figure
+
+
+def differences(width_in: float, found: Comparison) -> Figure:
+    """Draw how far each delay differs, second less first, with 95 % intervals, the common shift taken out."""
+    figure, (axes,) = sheet(width_in, height_in=2.6)
+    tags = sorted(found.difference_ns)
+    place, values = np.arange(len(tags)), 1e3 * np.array([found.difference_ns[tag] for tag in tags])
+    half = 1e3 * TWO_SIDED_95 * np.nan_to_num([found.std_ns[tag] for tag in tags])
+    axes.errorbar(place, values, half, fmt="o", ms=3.5, capsize=2.5, color=BLUE, label="difference, 95 % interval")
+    axes.axhline(0, color=MUTED, lw=0.7)
+    keep_strays_out(axes, np.concatenate([values - half, values + half, [0.0]]))
+    axes.set_xticks(place, [str(tag) for tag in tags])
+    label(axes, "tag", "difference of the delay (ps)")
+    legend(figure)
+    return figure
+
+
+def both_curves(width_in: float, known: Sequence[Calibration], names: Sequence[str]) -> Figure:
+    """Draw bias curves of two calibrations about their own means, and sigma curves, over lifted power."""
+    figure, panels = sheet(width_in, 2)
+    kinds: tuple[Literal["bias", "sigma"], ...] = ("bias", "sigma")
+    lines: tuple[dict[str, Any], ...] = ({"color": VERMILION, "ls": (0, (5, 1.5))}, {"color": BLUE})
+    for which, axes in zip(kinds, panels, strict=True):
+        for one, name, line in zip(known, names, lines, strict=True):
+            curve = one.bias_curve if which == "bias" else one.sigma_curve
+            grid = np.linspace(*curve.range, 200)
+            values, std_m = 100 * curve(grid), one.band(grid, which)
+            values -= values.mean() if which == "bias" else 0.0
+            if std_m is not None:
+                half = 100 * TWO_SIDED_95 * std_m
+                axes.fill_between(grid, values - half, values + half, color=line["color"], alpha=0.2, lw=0)
+            mark(axes.plot(grid, values, label=name, **line)[0], name)
+    label(panels[0], "lifted power", "bias, mean taken out (cm)")
+    label(panels[1], "lifted power", "standard deviation (cm)")
+    panels[1].set_ylim(bottom=0)
+    legend(figure, panels[0])
     return figure

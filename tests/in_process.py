@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-MODULES = ["uwblink.cli", "uwbsim.cli", "calib.cli", "calib.report.report", "calib.report.pdf", "uwbsim.twins"]
+MODULES = ["uwblink.cli", "uwbsim.cli", "calib.cli", "calib.report", "uwblink.pages.pdf", "uwbsim.twins"]
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload([__name__, *MODULES])
 

@@ -92,7 +92,7 @@ COMMANDS = (
 )
 
 SAME = {
-    # One function writes what is drawn (calib.report.writing), and drawing takes seconds.
+    # One function writes what is drawn (uwblink.pages.blocks), and drawing takes seconds.
     "calib localize --figures": "calib compare --figures",
     "calib evaluate --figures": "calib compare --figures",
     "calib evaluate --report": "calib report --output",

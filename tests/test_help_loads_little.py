@@ -13,7 +13,7 @@ import typer
 
 from docs.site.commands import leaves
 
-HEAVY = ["numpy", "scipy", "duckdb", "matplotlib", "simpy", "serial", "pandas", "fpdf", "rosbags"]
+HEAVY = ["numpy", "scipy", "duckdb", "matplotlib", "simpy", "serial", "pandas", "pypdf", "rosbags"]
 
 SCRIPT = """
 import contextlib, importlib, io, json, sys

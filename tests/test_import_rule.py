@@ -15,11 +15,8 @@ FORBIDDEN = {
 CONFINED = {
     "serial": lambda path: path == "uwblink/boards/ports.py",
     "simpy": lambda path: path.startswith("uwbsim/"),
-    "matplotlib": lambda path: (
-        "figures" in Path(path).name or path in {f"calib/report/{name}.py" for name in ("blocks", "pdf")}
-    ),
-    "fpdf": lambda path: path == "calib/report/pdf.py",
-    "pypdf": lambda path: path == "calib/report/pdf_figures.py",
+    "matplotlib": lambda path: "figures" in Path(path).name or path == "uwblink/pages/pdf.py",
+    "pypdf": lambda path: path == "uwblink/pages/pdf.py",
     "typer": lambda path: "/cli/" in path,
     "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},

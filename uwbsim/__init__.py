@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from uwbsim.boards.server import Server
     from uwbsim.boards.virtual_port import VirtualPorts
     from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
-    from uwbsim.pages.scenario_page import show
-    from uwbsim.pages.scenario_summary import preview
+    from uwbsim.pages.documents import show
+    from uwbsim.pages.preview import preview
     from uwbsim.protocols.comparison import Comparison, compare, optimum
     from uwbsim.protocols.prediction import Prediction, State, predict_state
     from uwbsim.scenario.faults import load_faults
@@ -73,11 +73,11 @@ _HOMES: Final = {
     "load_faults": "uwbsim.scenario.faults",
     "optimum": "uwbsim.protocols.comparison",
     "predict_state": "uwbsim.protocols.prediction",
-    "preview": "uwbsim.pages.scenario_summary",
+    "preview": "uwbsim.pages.preview",
     "register_channel_effect": "uwbsim.world.channel",
     "run_sweep": "uwbsim.sweep.runner",
     "shipped_scenarios": "uwbsim.scenario.loading",
-    "show": "uwbsim.pages.scenario_page",
+    "show": "uwbsim.pages.documents",
     "simulate": "uwbsim.simulation.run",
     "through_wire": "uwbsim.simulation.simulated",
     "twin": "uwbsim.twins.fitting",

@@ -6,13 +6,11 @@ import json
 import os
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Unpack
 
 from calib.calibration.model import Calibration
-from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, each, held_open, load_each, opened
 from calib.doctor.base import Finding
@@ -21,67 +19,31 @@ from calib.errors import UnanswerableError
 from calib.estimation.arguments import FitSettings
 from calib.estimation.fitting import fit
 from calib.estimation.losses import MIXTURE
-from calib.estimation.passive_listeners import OverheardDelay, heard_delays
+from calib.estimation.passive_listeners import heard_delays
 from calib.estimation.result import FitResult
 from calib.evaluation.consistency import summarize
 from calib.evaluation.localization import localize
-from calib.evaluation.statistics import Evaluation, evaluate
 from calib.evaluation.tracking import Localization
-from calib.report.origin import Origin, origin_of
+from calib.report.results import Results, check_places, origin_of
+from calib.report.sections import TITLE, document
+from uwblink.pages.blocks import write_document
 
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
-"""Scales of the loss, over the chosen one, for which a campaign is fitted again."""
+"""Scales of the loss, over the chosen one, for which a campaign is fitted again: a factor of 16 in all."""
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Campaign:
-    """Everything that a report tells of: what was fitted from which recordings, and how it does on which tests.
+class Campaign(Results):
+    """Everything that a report tells of: what was fitted from which recordings, and how it does on which tests."""
 
-    `refits` are calibrations for other scales of the loss, by scale in ns; `heard` delays as passive listeners see
-    them; `findings` the doctor's, by recording; `tracks` the bodies that were localized; `origin` says when
-    it was made, and from what files.
-    """
-
-    training: list[Ranges]
-    tests: list[Ranges]
     fit: FitResult
-    refits: dict[float, Calibration] = field(default_factory=dict)
-    heard: dict[int, OverheardDelay] = field(default_factory=dict)
-    findings: list[tuple[str, Finding]] = field(default_factory=list)
-    tracks: list[Localization] = field(default_factory=list)
-    origin: Origin = field(default_factory=Origin)
 
     def __repr__(self) -> str:
         """Return what it comes to: the fit, how many tests there are, and what the doctor found."""
         found = [f"{name}: {finding.fault}" for name, finding in self.findings]
         return "\n".join([repr(self.fit), f"judged on {self.judged.source}", *found])
-
-    @property
-    def calibration(self) -> Calibration:
-        """The calibration that was fitted."""
-        return self.fit.calibration
-
-    @cached_property
-    def trained(self) -> Ranges:
-        """The ranges of all training recordings."""
-        return concatenate(self.training)
-
-    @cached_property
-    def judged(self) -> Ranges:
-        """The ranges of the tests, or of the training where there are none."""
-        return concatenate(self.tests or self.training)
-
-    @cached_property
-    def corrected(self) -> CorrectedRanges:
-        """The judged ranges, corrected."""
-        return self.calibration.apply(self.judged)
-
-    @cached_property
-    def evaluation(self) -> Evaluation:
-        """How the calibration does on the judged ranges."""
-        return evaluate(self.judged, self.calibration)
 
     def write(
         self,
@@ -97,17 +59,9 @@ class Campaign:
         Figures come at two widths, a column's (3.5 inch) and a page's (7.16 inch). A `html` that ends in .pdf is a PDF.
         `progress` is told what is being done. Raises the errors of `check_output` before anything is drawn.
         """
-        from calib.report.layout import document
-        from calib.report.writing import write_document
-
-        write_document(
-            document(self),
-            Path(html),
-            None if pdf is None else Path(pdf),
-            None if figures is None else Path(figures),
-            force=force,
-            progress=progress,
-        )
+        output, *more = (None if place is None else Path(place) for place in (html, pdf, figures))
+        check_places(output, *more, force=force)
+        write_document(document(self, TITLE), output, *more, force=force, progress=progress)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib report --json` prints."""
@@ -162,33 +116,32 @@ def run_campaign(
         fitted = load_each(recordings, trim_static=trim_static, need_power=need_power)
         testing = load_each(judged, need_power=need_power) if judged else []
         progress("fitting")
-        found = fit(concatenate(fitted), **settings)
-        refits = _refits(concatenate(fitted), found.calibration, settings)
+        ranges = concatenate(fitted)
+        found = fit(ranges, **settings)
+        known = found.calibration
+        refits: dict[float, Calibration] = {}
+        # The mixture and least squares have no scale.
+        for factor in SCALES if known.loss not in (MIXTURE, "l2") else ():
+            changed = settings.copy()
+            changed["scale_ns"] = factor * known.scale_ns
+            refits[factor * known.scale_ns] = fit(ranges, **changed).calibration
         progress("examining")
         findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
         progress("localizing")
+        whole = [data for data in recordings if not isinstance(data, Ranges)]
         return Campaign(
+            calibration=known,
             training=fitted,
             tests=testing,
+            warnings=found.warnings,
             fit=found,
             refits=refits,
-            heard=_heard(recordings, found.calibration),
+            # From the first recording that has passive listeners.
+            heard=next(filter(None, (heard_delays(data, known) for data in whole)), {}),
             findings=findings,
-            tracks=_tracks(judged or recordings, found.calibration),
+            tracks=[track for data in judged or recordings for track in _tracks(data, known)],
             origin=origin_of([*given[0], *given[1]], command),
         )
-
-
-def _refits(ranges: Ranges, calibration: Calibration, settings: FitSettings) -> dict[float, Calibration]:
-    """Fit again with other scales of the loss; the mixture and least squares have none."""
-    if calibration.loss in (MIXTURE, "l2"):
-        return {}
-    found = {}
-    for factor in SCALES:
-        changed = settings.copy()
-        changed["scale_ns"] = factor * calibration.scale_ns
-        found[factor * calibration.scale_ns] = fit(ranges, **changed).calibration
-    return found
 
 
 def _findings(data: Data) -> list[tuple[str, Finding]]:
@@ -198,20 +151,9 @@ def _findings(data: Data) -> list[tuple[str, Finding]]:
         return [(name, finding) for finding in examine(data)]
 
 
-def _heard(recordings: list[Data], calibration: Calibration) -> dict[int, OverheardDelay]:
-    """Delays by passive listeners, from the first recording that has them."""
-    whole = [data for data in recordings if not isinstance(data, Ranges)]
-    return next(filter(None, (heard_delays(data, calibration) for data in whole)), {})
-
-
-def _tracks(recordings: list[Data], calibration: Calibration) -> list[Localization]:
-    """Localize in every recording that has a body to localize; a report does without those that have none."""
-    found: list[Localization] = []
-    for data in recordings:
-        if isinstance(data, Ranges):
-            continue
-        try:
-            found += localize(data, calibration)
-        except UnanswerableError:
-            continue
-    return found
+def _tracks(data: Data, calibration: Calibration) -> list[Localization]:
+    """Localize in a recording; a report does without those that have no body to localize."""
+    try:
+        return [] if isinstance(data, Ranges) else localize(data, calibration)
+    except UnanswerableError:
+        return []

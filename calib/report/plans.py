@@ -6,17 +6,13 @@ import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 from calib.planning.flight_result import FlightPlan
 from calib.planning.procedure import where
 from calib.planning.result import Plan
-from calib.report import figures_plan
-from calib.report.blocks import Block, Document, Heading, Listing, Picture, Table, Text
-from calib.report.writing import write_document
-
-MEAN_OF_ALL: Final = "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines."
-PLACES: Final = {"line": "on a line", "plane": "in a plane", "": "in space"}
+from calib.report.figures import arrangement, flight, more, planned_delays
+from calib.report.results import check_places
+from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, write_document
 
 
 def write_plan(
@@ -34,12 +30,11 @@ def write_plan(
     blocks = list(_of_flight(plan) if isinstance(plan, FlightPlan) else _of_boards(plan))
     if commands:
         blocks += [Heading("Commands"), Listing("\n".join(commands))]
-    count = len(plan.half_ns)
-    title = (
-        f"Plan of a flight: {count} tags"
-        if isinstance(plan, FlightPlan)
-        else f"Plan: {count} boards {PLACES[plan.on]}, {len(plan.arrangements)} arrangements"
-    )
+    title = f"Plan of a flight: {len(plan.half_ns)} tags"
+    if isinstance(plan, Plan):
+        places = {"line": "on a line", "plane": "in a plane", "": "in space"}[plan.on]
+        title = f"Plan: {len(plan.half_ns)} boards {places}, {len(plan.arrangements)} arrangements"
+    check_places(output, None, figures, force=force)
     write_document(Document(title, blocks), output, None, figures, force=force)
 
 
@@ -56,7 +51,7 @@ def _of_boards(plan: Plan) -> Iterator[Block]:
         yield Text(f"{places}.{tapes} Record all pairs for {plan.seconds_each:.0f} s.")
         yield Picture(
             f"arrangement-{one.name}",
-            partial(figures_plan.arrangement, plan=plan, number=k),
+            partial(arrangement, plan=plan, number=k),
             f"Arrangement {one.name}, and the intervals of the delays when it has been made.",
         )
     yield from _promise(plan)
@@ -72,27 +67,26 @@ def _of_flight(plan: FlightPlan) -> Iterator[Block]:
     yield Listing("\n".join(plan.steps))
     yield Picture(
         "flight",
-        partial(figures_plan.flight, plan=plan),
+        partial(flight, plan=plan),
         "The flight from above and its heights, as a guide; thick where positions are known.",
     )
     yield Heading("What it promises")
-    yield Picture("delays", partial(figures_plan.delays, plan=plan), "Half the interval (95 %) of each delay.")
+    yield Picture("delays", partial(planned_delays, plan=plan), "Half the interval (95 %) of each delay.")
     yield from _promise(plan)
 
 
 def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
     if isinstance(plan, Plan):
         yield Heading("What it promises")
-    yield Table(["tag", "delay"], [[str(tag), _half(half)] for tag, half in plan.half_ns.items()])
+    halves = plan.half_ns.items()
+    rows = [[str(tag), f"± {half:.3f} ns" if math.isfinite(half) else "undetermined"] for tag, half in halves]
+    yield Table(["tag", "delay"], rows)
     if plan.undetermined:
         yield Text(f"Not determined: {'; '.join(direction.words for direction in plan.verdict.free)}.", "warning")
     if plan.next_best:
         yield Heading("What one thing more would bring")
-        yield Picture("more", partial(figures_plan.more, next_best=plan.next_best), MEAN_OF_ALL)
-
-
-def _half(half: float) -> str:
-    return f"± {half:.3f} ns" if math.isfinite(half) else "undetermined"
+        caption = "The mean interval with each; 1.5 ns are taken for known of a delay that nothing determines."
+        yield Picture("more", partial(more, next_best=plan.next_best), caption)
 
 
 def _known(plan: Plan | FlightPlan) -> str:

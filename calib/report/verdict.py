@@ -2,215 +2,290 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.calibration.model import Calibration
-from calib.calibration.parts import CorrectedRanges
-from calib.data.ranges import Ranges
-from calib.evaluation.statistics import Evaluation
-from calib.report.blocks import Block
-from calib.report.grades import BAD, DOUBT, GOOD, Criterion, graded, judgement
-from calib.report.without_truth import criteria
+from calib.calibration.model import rests_on
+from calib.report.results import Results
 from calib.spread import TWO_SIDED_95
+from uwblink.pages.blocks import Block, Table, Text
 
-if TYPE_CHECKING:
-    from calib.evaluation.tracking import Localization
-
-MOST_BIAS: Final = 0.5
-"""Of the spread of one range: a bias half as large adds an eighth to the error of a single range."""
-
-WORST_BIAS: Final = 1.0
-INTERVAL: Final = (0.90, 0.985)
-"""Share of errors within their 95 % intervals that is right; less, and a filter trusts the ranges too much."""
-
-INTERVAL_LEAST: Final = 0.80
-MOST_DELAY_NS: Final = 0.1
-"""3 cm of range: as much as DW1000s of one kind differ by chance."""
-
-MOST_CLAMPED: Final = 0.05
-WORST_CLAMPED: Final = 0.25
-LEAST_GAIN: Final = 0.05
-"""Of the typical error: a calibration that takes off less is hardly worth its trouble."""
+GOOD: Final = "good"
+DOUBT: Final = "doubt"
+BAD: Final = "bad"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Judged:
-    """What a verdict is on: a calibration, ranges and how it does on them, whether those were held out, and doubts.
+class Criterion(NamedTuple):
+    """A question, what is asked for, what was found, how well that is (good, doubt, bad), and it in a few words."""
 
-    `warnings` are those of the fit, `faults` those that the doctor found, `tracks` bodies that were localized.
-    """
-
-    calibration: Calibration
-    ranges: Ranges
-    corrected: CorrectedRanges
-    evaluation: Evaluation
-    held_out: bool
-    warnings: Sequence[str] = ()
-    faults: Sequence[str] = ()
-    tracks: Sequence[Localization] = field(default_factory=list)
+    question: str
+    asked: str
+    found: str
+    grade: str
+    told: str
 
 
-def verdict(judged: Judged) -> list[Block]:
-    """Return the verdict: a sentence, and the table of criteria behind it."""
-    return judgement([one for ask in CRITERIA for one in ask(judged)])
+def verdict(results: Results) -> list[Block]:
+    """Return a sentence on all criteria, and the table behind it."""
+    found = criteria(results)
+    bad, doubt = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT))
+    if bad:
+        kind, also = BAD, f" Also: {doubt}." if doubt else ""
+        text = f"Not fit for use. {bad[0].upper()}{bad[1:]}.{also}"
+    elif doubt:
+        kind, text = DOUBT, f"Fit for use, with reservations. {doubt[0].upper()}{doubt[1:]}."
+    else:
+        listed = "; ".join(one.told for one in found)
+        kind, text = GOOD, f"Fit for use. All {len(found)} criteria are met: {listed}."
+    marks = {GOOD: "✓ yes", DOUBT: "! in part", BAD: "✗ no"}
+    rows = [[one.question, marks[one.grade], one.found, one.asked] for one in found]
+    return [Text(text, kind), Table(["criterion", "met", "found", "asked for"], rows, words=True)]
 
 
-def _held_out(judged: Judged) -> list[Criterion]:
-    held = judged.held_out
-    return [
-        Criterion(
-            "Was it judged on recordings that the fit has not seen?",
-            "yes",
-            f"{judged.ranges.source}: {len(judged.ranges)} ranges" if held else "no: on those it was fitted to",
-            GOOD if held else DOUBT,
-            "it was judged on recordings that the fit has not seen"
-            if held
-            else "it was not judged on recordings that the fit has not seen, so what follows is too good",
-        )
-    ]
+def criteria(results: Results) -> list[Criterion]:
+    """Return what is asked of a calibration: on recordings where there are some, and by how it was made."""
+    made = results.calibration.provenance
+    without_truth: Sequence[Ask] = [_distances_found] if rests_on(made) else []
+    if made.get("recipe") == "survey":
+        without_truth = [_contradicted, _redundant, _pair_error, _reflected, _only_one, _shared]
+    asked: Sequence[Ask] = [_converged, _settled, *without_truth]
+    if results.recordings:
+        asked = [_held_out, _gain, _bias, _interval, _settled, _powers, _positions, *without_truth, _warned]
+    return [found for ask in asked if (found := ask(results)) is not None]
 
 
-def _gain(judged: Judged) -> list[Criterion]:
-    raw, full = (
-        float(np.median(np.abs(getattr(judged.corrected, name) - judged.ranges.truth_m)))
-        for name in ("raw_m", "corrected_m")
+Ask = Callable[[Results], Criterion | None]
+"""Returns how a criterion is met, None where it does not apply."""
+
+
+def _graded(good: bool, tolerable: bool) -> str:
+    return GOOD if good else DOUBT if tolerable else BAD
+
+
+def _held_out(results: Results) -> Criterion:
+    held, judged = results.held_out, results.judged
+    return Criterion(
+        "Was it judged on recordings that the fit has not seen?",
+        "yes",
+        f"{judged.source}: {len(judged)} ranges" if held else "no: on those it was fitted to",
+        _graded(held, True),
+        "it was judged on recordings that the fit has not seen"
+        if held
+        else "it was not judged on recordings that the fit has not seen, so what follows is too good",
     )
+
+
+def _gain(results: Results) -> Criterion:
+    least = 0.05  # of the typical error: a calibration that takes off less is hardly worth its trouble
+    truth, corrected = results.judged.truth_m, results.corrected
+    raw, full = (float(np.median(np.abs(range_m - truth))) for range_m in (corrected.raw_m, corrected.corrected_m))
     less = 1 - full / raw if raw > 0 else 0.0
-    return [
-        Criterion(
-            "Does it make ranges better?",
-            f"typical error at least {100 * LEAST_GAIN:.0f} % smaller than raw",
-            f"from {100 * raw:.1f} to {100 * full:.1f} cm ({-100 * less:+.0f} %); half of the errors are smaller",
-            graded(less >= LEAST_GAIN, less >= 0),
-            f"the typical error goes from {100 * raw:.1f} to {100 * full:.1f} cm",
-        )
-    ]
-
-
-def _bias(judged: Judged) -> list[Criterion]:
-    worst = max(
-        judged.evaluation.pairs.items(),
-        key=lambda item: abs(item[1].full.median_m) / max(item[1].full.robust_std_m, 1e-9),
+    return Criterion(
+        "Does it make ranges better?",
+        f"typical error at least {100 * least:.0f} % smaller than raw",
+        f"from {100 * raw:.1f} to {100 * full:.1f} cm ({-100 * less:+.0f} %); half of the errors are smaller",
+        _graded(less >= least, less >= 0),
+        f"the typical error goes from {100 * raw:.1f} to {100 * full:.1f} cm",
     )
-    name, stats = worst[0], worst[1].full
-    ratio = abs(stats.median_m) / max(stats.robust_std_m, 1e-9)
-    return [
-        Criterion(
-            "Is no pair left with a bias?",
-            f"median of each pair within {MOST_BIAS:g} of its spread",
-            f"worst: {name} with {100 * stats.median_m:+.1f} cm, {ratio:.2f} of its spread of "
-            f"{100 * stats.robust_std_m:.1f} cm",
-            graded(ratio <= MOST_BIAS, ratio <= WORST_BIAS),
-            f"no pair keeps a bias beyond {100 * abs(stats.median_m):.1f} cm"
-            if ratio <= MOST_BIAS
-            else f"pair {name} keeps a bias of {100 * stats.median_m:+.1f} cm",
-        )
-    ]
 
 
-def _interval(judged: Judged) -> list[Criterion]:
-    overall = judged.evaluation.overall
+def _bias(results: Results) -> Criterion:
+    most = 0.5  # of the spread of one range: so large a bias adds an eighth to the error of a single range
+    pairs = {name: group.full for name, group in results.evaluation.pairs.items()}
+    ratios = {name: abs(full.median_m) / max(full.robust_std_m, 1e-9) for name, full in pairs.items()}
+    name = max(ratios, key=lambda pair: ratios[pair])
+    full, ratio = pairs[name], ratios[name]
+    return Criterion(
+        "Is no pair left with a bias?",
+        f"median of each pair within {most:g} of its spread",
+        f"worst: {name} with {100 * full.median_m:+.1f} cm, {ratio:.2f} of its spread of "
+        f"{100 * full.robust_std_m:.1f} cm",
+        _graded(ratio <= most, ratio <= 1.0),
+        f"no pair keeps a bias beyond {100 * abs(full.median_m):.1f} cm"
+        if ratio <= most
+        else f"pair {name} keeps a bias of {100 * full.median_m:+.1f} cm",
+    )
+
+
+def _interval(results: Results) -> Criterion:
+    overall = results.evaluation.overall
     known = bool(np.isfinite(overall.inside_95))
     share = overall.inside_95 if known else overall.coverage["95"]
     of_what = "reflections included" if known else "by sigma alone; the calibration does not describe reflections"
-    low, high = INTERVAL
-    return [
-        Criterion(
-            "Does it say rightly how far ranges can be off?",
-            f"{100 * low:.0f} to {100 * high:.1f} % of errors within their 95 % intervals",
-            f"{100 * share:.1f} % ({of_what})",
-            graded(low <= share <= high, share >= INTERVAL_LEAST),
-            f"{100 * share:.0f} % of the errors lie within their 95 % intervals",
-        )
-    ]
+    low, high = 0.90, 0.985  # with less, a filter trusts the ranges too much; with more, too little
+    return Criterion(
+        "Does it say rightly how far ranges can be off?",
+        f"{100 * low:.0f} to {100 * high:.1f} % of errors within their 95 % intervals",
+        f"{100 * share:.1f} % ({of_what})",
+        _graded(low <= share <= high, share >= 0.80),
+        f"{100 * share:.0f} % of the errors lie within their 95 % intervals",
+    )
 
 
-def settled(known: Calibration) -> list[Criterion]:
-    """Return whether the antenna delays of a calibration are known well enough; nothing where pairs have constants."""
+def _settled(results: Results) -> Criterion | None:
+    known, most_ns = results.calibration, 0.1  # 3 cm of range: as much as DW1000s of one kind differ by chance
     if known.pair_offsets:
-        return []
+        return None
     free = known.provenance.get("undetermined", [])
-    half = {t: TWO_SIDED_95 * known.delays_std_ns.get(t, float("nan")) for t in known.delays_ns}
+    half = {t: TWO_SIDED_95 * known.delays_std_ns.get(t, math.nan) for t in known.delays_ns}
     measured = {tag: h for tag, h in half.items() if np.isfinite(h)}
-    asked = f"95 % interval of each within ± {MOST_DELAY_NS:g} ns (3 cm)"
+    asked = f"95 % interval of each within ± {most_ns:g} ns (3 cm)"
     question = "Are the antenna delays known well enough?"
     if free:
-        groups = "; ".join(", ".join(map(str, group)) for group in free)
-        trace = f"the delays of tags {groups} can shift against each other without a trace in any range"
-        told = str(known.provenance.get("left_open", trace))
-        return [Criterion(question, asked, told, BAD, told)]
+        return Criterion(question, asked, left_open(results), BAD, left_open(results))
     if not measured:
-        return [Criterion(question, asked, "the calibration states no intervals", DOUBT, "delays have no intervals")]
+        return Criterion(question, asked, "the calibration states no intervals", DOUBT, "delays have no intervals")
     tag = max(measured, key=lambda t: measured[t])
-    fine = measured[tag] <= MOST_DELAY_NS
-    return [
-        Criterion(
-            question,
-            asked,
-            f"widest: tag {tag}, ± {measured[tag]:.3f} ns",
-            graded(fine, measured[tag] <= 3 * MOST_DELAY_NS),
-            f"delays are known to ± {measured[tag]:.3f} ns or better"
-            if fine
-            else f"the delay of tag {tag} is known to ± {measured[tag]:.2f} ns only",
-        )
-    ]
+    fine = measured[tag] <= most_ns
+    return Criterion(
+        question,
+        asked,
+        f"widest: tag {tag}, ± {measured[tag]:.3f} ns",
+        _graded(fine, measured[tag] <= 3 * most_ns),
+        f"delays are known to ± {measured[tag]:.3f} ns or better"
+        if fine
+        else f"the delay of tag {tag} is known to ± {measured[tag]:.2f} ns only",
+    )
 
 
-def _powers(judged: Judged) -> list[Criterion]:
-    share = judged.evaluation.overall.clamped
-    return [
-        Criterion(
-            "Was the curve fitted at such powers?",
-            f"at most {100 * MOST_CLAMPED:.0f} % of the ranges beyond them",
-            f"{100 * share:.1f} % beyond",
-            graded(share <= MOST_CLAMPED, share <= WORST_CLAMPED),
-            f"{100 * share:.1f} % of the ranges have powers that the fit has not seen",
-        )
-    ]
+def left_open(results: Results) -> str:
+    """Say which delays the pairs do not determine."""
+    made = results.calibration.provenance
+    groups = "; ".join(", ".join(map(str, group)) for group in made.get("undetermined", []))
+    trace = f"the delays of tags {groups} can shift against each other without a trace in any range"
+    return str(made.get("left_open", trace))
 
 
-def _positions(judged: Judged) -> list[Criterion]:
-    if not judged.tracks:
-        return []
-    raw, best = (float(np.mean([one.rmse_m[name].mean() for one in judged.tracks])) for name in ("raw", "variance"))
-    return [
-        Criterion(
-            "Do positions become better?",
-            "RMSE of the position not larger than with raw ranges",
-            f"from {raw:.3f} to {best:.3f} m over {len(judged.tracks)} tracks",
-            graded(best < raw, False),
-            f"positions go from {100 * raw:.0f} to {100 * best:.0f} cm RMSE",
-        )
-    ]
+def _powers(results: Results) -> Criterion:
+    most = 0.05
+    share = results.evaluation.overall.clamped
+    return Criterion(
+        "Was the curve fitted at such powers?",
+        f"at most {100 * most:.0f} % of the ranges beyond them",
+        f"{100 * share:.1f} % beyond",
+        _graded(share <= most, share <= 0.25),
+        f"{100 * share:.1f} % of the ranges have powers that the fit has not seen",
+    )
 
 
-def _doubts(judged: Judged) -> list[Criterion]:
-    count = len(judged.warnings) + len(judged.faults)
-    names = "; ".join([*judged.warnings, *judged.faults])
-    return [
-        Criterion(
-            "Is there nothing to warn of?",
-            "no warning of the fit, no fault in a recording",
-            names or "nothing",
-            GOOD if not count else DOUBT,
-            "nothing to warn of was found" if not count else f"{count} warning{'s' * (count > 1)}, below",
-        )
-    ]
+def _positions(results: Results) -> Criterion | None:
+    if not results.tracks:
+        return None
+    raw, best = (float(np.mean([one.rmse_m[name].mean() for one in results.tracks])) for name in ("raw", "variance"))
+    return Criterion(
+        "Do positions become better?",
+        "RMSE of the position not larger than with raw ranges",
+        f"from {raw:.3f} to {best:.3f} m over {len(results.tracks)} tracks",
+        _graded(best < raw, False),
+        f"positions go from {100 * raw:.0f} to {100 * best:.0f} cm RMSE",
+    )
 
 
-CRITERIA: Final[tuple[Callable[[Judged], list[Criterion]], ...]] = (
-    _held_out,
-    _gain,
-    _bias,
-    _interval,
-    lambda judged: settled(judged.calibration),
-    _powers,
-    _positions,
-    lambda judged: criteria(judged.calibration),
-    _doubts,
-)
-"""What makes a calibration fit for use, in the order in which it is told."""
+def _warned(results: Results) -> Criterion:
+    found = [*results.warnings, *(f"{name}: {finding.fault}" for name, finding in results.findings)]
+    return Criterion(
+        "Is there nothing to warn of?",
+        "no warning of the fit, no fault in a recording",
+        "; ".join(found) or "nothing",
+        _graded(not found, True),
+        f"{len(found)} warning{'s' * (len(found) > 1)}, below" if found else "nothing to warn of was found",
+    )
+
+
+def _converged(results: Results) -> Criterion | None:
+    if results.calibration.provenance.get("converged", True):
+        return None
+    return Criterion("Did the search settle?", "yes", "no", BAD, "the search stopped before it settled")
+
+
+def _contradicted(results: Results) -> Criterion:
+    found = list(map(str, results.calibration.provenance.get("findings", [])))
+    return Criterion(
+        "Do the ranges agree with what is said to be known?",
+        "no line that is none, no wrong tape, no exchanged labels, no board that was moved",
+        "; ".join(found) or "they do",
+        _graded(not found, False),
+        f"{len(found)} contradiction{'s' * (len(found) > 1)} to what is known" if found else "nothing contradicts",
+    )
+
+
+def _redundant(results: Results) -> Criterion:
+    least = 10.0  # with few, a wrong range is not seen, and the spread of errors is a guess
+    made = results.calibration.provenance
+    freedom, pairs = float(made["rests_on"]["freedom"]), int(made["pairs"])
+    return Criterion(
+        "Do the arrangements check each other?",
+        f"at least {least:g} ranges of pairs more than the unknowns take",
+        f"{freedom:.0f} more, of {pairs}",
+        _graded(freedom >= least, freedom >= 4.0),
+        f"{freedom:.0f} of {pairs} ranges of pairs are left to check the rest",
+    )
+
+
+def _pair_error(results: Results) -> Criterion:
+    most_m = 0.03
+    error = float(results.calibration.provenance["rests_on"]["pair_error_m"])
+    return Criterion(
+        "Are the constant errors of pairs those of such boards?",
+        f"at most {100 * most_m:g} cm, beside reflections",
+        f"{100 * error:.1f} cm",
+        _graded(error <= most_m, error <= 2 * most_m),
+        f"a pair has a constant error of {100 * error:.1f} cm in an arrangement",
+    )
+
+
+def _reflected(results: Results) -> Criterion:
+    most = 0.05  # of the pairs: where more are reflected, some of it hides in the places of boards
+    made = results.calibration.provenance
+    count, pairs = sum(float(row["chance"]) for row in made.get("reflected", [])), int(made["pairs"])
+    share = count / max(pairs, 1)
+    return Criterion(
+        "Are few pairs reflected?",
+        f"at most {100 * most:g} % of them",
+        f"{count:.1f} of {pairs} ({100 * share:.0f} %)",
+        _graded(share <= most, share <= 0.2),
+        f"{100 * share:.0f} % of the pairs are believed to be reflected",
+    )
+
+
+def _only_one(results: Results) -> Criterion:
+    clear = 9.0  # three standard deviations of a single unknown
+    worse = results.calibration.provenance.get("second_best")
+    alone = worse is None or float(worse) >= clear
+    return Criterion(
+        "Is there no other solution?",
+        f"the second-best worse by at least {clear:g} in -2 log likelihood: three standard deviations",
+        "none was found" if worse is None else f"{float(worse):.0f} worse",
+        _graded(alone, True),
+        "no other places of boards agree with the ranges" if alone else "other places of boards agree as well",
+    )
+
+
+def _shared(results: Results) -> Criterion | None:
+    known, most_ns = results.calibration.uncertainty, 0.1  # 3 cm of every range
+    if known is None or not known.tags:
+        return None
+    half = TWO_SIDED_95 * math.sqrt(max(float(np.mean(np.array(known.delays_ns2))), 0.0))
+    return Criterion(
+        "Is what all delays share known?",
+        f"95 % interval of their mean within ± {most_ns:g} ns; a taped distance or a known delay tells it",
+        f"± {half:.3f} ns",
+        _graded(half <= most_ns, half <= 3 * most_ns),
+        f"what all delays share is known to ± {half:.2f} ns",
+    )
+
+
+def _distances_found(results: Results) -> Criterion | None:
+    off, most_m = results.calibration.provenance.get("distance_std_m"), 0.02
+    if not isinstance(off, int | float):
+        return None
+    return Criterion(
+        "Are the distances that stand for the true ones known well enough?",
+        f"standard error at most {100 * most_m:g} cm",
+        f"{100 * off:.1f} cm",
+        _graded(off <= most_m, off <= 0.05),
+        f"distances were found to {100 * off:.1f} cm",
+    )

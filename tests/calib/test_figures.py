@@ -7,9 +7,16 @@ import pytest
 from matplotlib.figure import Figure
 
 from calib.estimation.fitting import fit
-from calib.figures import bias_over_power, cumulative, delays, histogram, sigma_over_power, within_fence
-from calib.over_power import binned
-from calib.report.figures_fit import scale_sensitivity
+from calib.figures import (
+    bias_over_power,
+    binned,
+    cumulative,
+    delays,
+    histogram,
+    scale_sensitivity,
+    sigma_over_power,
+    within_fence,
+)
 from tests.calib.synthetic import bias_m, ranges
 from uwblink.pages.figures import style
 

@@ -9,7 +9,7 @@ import pytest
 
 import calib
 from calib.estimation.losses import LOSSES
-from calib.report.layout import SECTIONS
+from calib.report.sections import SECTIONS
 
 SECONDS = 0.25
 

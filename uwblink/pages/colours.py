@@ -1,7 +1,8 @@
 """The colours of figures and pages, on white and on a dark page.
 
-Any two of the first six are at least 15 apart (CIEDE2000) for people who see all colours and for those without one
-kind of cones (Machado, Oliveira and Fernandes 2009), on either ground; more than six differ by marker and dashes, too.
+Any two of the first six differ by at least 15 (CIEDE2000), for normal vision and for each kind of colour blindness
+(simulated as in Machado, Oliveira and Fernandes 2009), on white and on dark ground. More than six series also differ
+by marker and dashes.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ GRID: Final = "#d8d8d8"
 PALE: Final = "#b4b4b4"
 
 SERIES: Final = (BLUE, VERMILION, GREEN, WINE, GREY, SAGE)
-"""Colours of what is of one kind: tags, bodies, protocols."""
+"""Colours of things of one kind: tags, bodies, protocols."""
 
 DARK: Final = {
     BLUE: "#4aa8e8",
@@ -35,16 +36,12 @@ DARK: Final = {
     GRID: "#3a3f45",
     PALE: "#6a7078",
 }
-"""What stands on a dark page for each colour."""
-
-GROUND: Final = {"light": "#ffffff", "dark": "#16181b"}
-MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
-DASHES: Final[tuple[Any, ...]] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
+"""The colour that replaces each one on a dark page."""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How one of several is drawn: its colour, marker and dashes."""
+    """How one series is drawn: its colour, marker and dashes."""
 
     colour: str
     marker: str
@@ -57,9 +54,7 @@ class Look:
 
 
 def look(number: int) -> Look:
-    """Return the look of one of many: no two of 84 are alike, and no two of 28 where colours are not seen."""
-    return Look(
-        SERIES[number % len(SERIES)],
-        MARKERS[number % len(MARKERS)],
-        DASHES[number % len(DASHES)],
-    )
+    """Return the look of a series by its number: 84 different ones, 28 of them different without colours."""
+    markers = ("o", "s", "^", "D", "v", "P", "X")
+    dashes: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
+    return Look(SERIES[number % len(SERIES)], markers[number % len(markers)], dashes[number % len(dashes)])

@@ -8,8 +8,8 @@ import pytest
 
 import calib
 from calib.data.samples import sample_flight
-from calib.report.blocks import Heading, Text
-from calib.report.layout import SECTIONS
+from calib.report import Heading, Text
+from calib.report.sections import SECTIONS
 from tests import processes
 from uwblink.recording.file import Recording
 

@@ -6,9 +6,9 @@ import pytest
 
 import calib
 from calib.data.samples import sample_flight
-from calib.report.blocks import Document, Picture
-from calib.report.writing import check_places, write_document
+from calib.report import Picture, check_places
 from tests import processes
+from uwblink.pages.blocks import Document, write_document
 from uwblink.pages.figures import sheet
 from uwblink.recording.file import Recording
 
@@ -73,8 +73,8 @@ def test_figures_of_one_name_do_not_take_each_others_files(tmp_path):
     def draw(width_in):
         return sheet(width_in)[0]
 
-    write_document(Document("", [Picture("same", draw, "one"), Picture("same", draw, "two")]), None, None,
-                   tmp_path / "f", force=False)  # fmt: skip
+    pictures = [Picture("same", draw, text) for text in ("one", "two")]
+    write_document(Document("", [*pictures]), None, figures=tmp_path / "f")
     assert {path.name.rpartition("-")[0] for path in (tmp_path / "f").iterdir()} == {"same", "same-2"}
 
 

@@ -5,8 +5,8 @@ import io
 import pytest
 from pypdf import PdfReader
 
-from calib.report.blocks import Document, Heading, Table, Text
-from calib.report.pdf import to_pdf
+from uwblink.pages.blocks import Document, Heading, Table, Text
+from uwblink.pages.pdf import to_pdf
 
 
 def pages(*blocks):

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 import calib
 from calib.cli.commands import app
-from calib.report import figures_plan
+from calib.report.figures import arrangement
 from uwblink.pages.figures import picture
 
 
@@ -39,7 +39,7 @@ def test_boards_have_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_
 
 def test_boards_in_space_are_seen_from_the_side_as_well():
     plan = calib.plan(5, on="space", arrangements=1)
-    words = words_of(picture(partial(figures_plan.arrangement, plan=plan, number=0), "svg").decode())
+    words = words_of(picture(partial(arrangement, plan=plan, number=0), "svg").decode())
     assert "height (m)" in words
     assert words.count("5") >= 3
 

@@ -14,7 +14,7 @@ from pypdf import PdfReader
 
 from calib.cli.reporting import spread
 from calib.estimation.fitting import fit
-from calib.report.report import render
+from calib.report.sections import render
 from tests import processes
 from tests.browser import lies_well
 from tests.calib.report import page_of_numpy

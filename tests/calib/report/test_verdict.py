@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from calib.calibration.model import Calibration
+from calib.doctor.base import Finding
 from calib.estimation.fitting import fit
-from calib.evaluation.statistics import evaluate
-from calib.report.blocks import Table, Text
-from calib.report.verdict import CRITERIA, Judged, verdict
+from calib.report import Table, Text
+from calib.report.results import Results
+from calib.report.verdict import verdict
 from tests.calib.synthetic import ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -25,14 +26,7 @@ def unseen():
 
 
 def told(known, unseen, **changes):
-    judged = Judged(
-        calibration=known,
-        ranges=unseen,
-        corrected=known.apply(unseen),
-        evaluation=evaluate(unseen, known),
-        **{"held_out": True} | changes,
-    )
-    text, table = verdict(judged)
+    text, table = verdict(Results(calibration=known, **{"tests": [unseen]} | changes))
     assert isinstance(text, Text)
     assert isinstance(table, Table)
     return text, {row[0]: row[1] for row in table.rows}
@@ -42,28 +36,26 @@ def test_what_fits_what_it_has_not_seen_is_fit_for_use(known, unseen):
     text, met = told(known, unseen)
     assert text.kind == "good"
     assert text.text.startswith("Fit for use. ")
-    assert len(met) == len(CRITERIA) - 2, "nothing was localized, and distances were known"
+    assert len(met) == 7, "nothing was localized, and distances were known"
     assert set(met.values()) == {"✓ yes"}
 
 
 def test_every_criterion_states_its_threshold(known, unseen):
-    _, table = verdict(
-        Judged(calibration=known, ranges=unseen, corrected=known.apply(unseen), evaluation=evaluate(unseen, known),
-               held_out=True)
-    )  # fmt: skip
+    _, table = verdict(Results(calibration=known, tests=[unseen]))
     assert table.header[-1] == "asked for"
     assert all(row[-1] for row in table.rows)
 
 
 def test_without_a_test_there_is_a_reservation(known, unseen):
-    text, met = told(known, unseen, held_out=False)
+    text, met = told(known, unseen, tests=[], training=[unseen])
     assert text.kind == "doubt"
     assert "not judged on recordings that the fit has not seen" in text.text
     assert met["Was it judged on recordings that the fit has not seen?"] == "! in part"
 
 
 def test_warnings_and_faults_are_reservations(known, unseen):
-    text, met = told(known, unseen, warnings=["only 3 s of data"], faults=["a.uwb: clock"])
+    clock = Finding(fault="clock", evidence="it jumps", remedy="leave it out", p_value=0.0)
+    text, met = told(known, unseen, warnings=["only 3 s of data"], findings=[("a.uwb", clock)])
     assert text.kind == "doubt"
     assert "2 warnings, below" in text.text
     assert [question for question, how in met.items() if how != "✓ yes"] == ["Is there nothing to warn of?"]

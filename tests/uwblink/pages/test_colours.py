@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from uwblink.pages.colours import DARK, GRID, GROUND, INK, MUTED, PALE, SERIES, look
-from uwblink.pages.stylesheet import CSS
+from uwblink.pages.colours import DARK, GRID, INK, MUTED, PALE, SERIES, look
+from uwblink.pages.html import CSS
 
 # Machado, Oliveira and Fernandes 2009, severity 1, on linear RGB.
 EYES = {
@@ -58,6 +58,9 @@ def ciede2000(one, two):
     sc, sh = 1 + 0.045 * c, 1 + 0.015 * c * t
     rt = -np.sin(np.radians(60 * np.exp(-(((h - 275) / 25) ** 2)))) * 2 * np.sqrt(c**7 / (c**7 + 25**7))
     return np.sqrt((dl / sl) ** 2 + (dc / sc) ** 2 + (dh / sh) ** 2 + rt * dc / sc * dh / sh)
+
+
+GROUND = {"light": "#ffffff", "dark": "#16181b"}
 
 
 def contrast(one, two):

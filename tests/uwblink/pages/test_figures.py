@@ -9,10 +9,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.browser import lies_well
+from uwblink.pages.blocks import Document, Listing, Picture, Table, Text, to_html
 from uwblink.pages.colours import BLUE, DARK, INK, look
-from uwblink.pages.drawings import VARIABLES, inline
-from uwblink.pages.figures import PAGE_IN, drawn, label, legend, mark, picture, sheet
-from uwblink.pages.html import both_widths, page_html, table_html
+from uwblink.pages.figures import WIDTHS, drawn, label, legend, mark, picture, sheet
+from uwblink.pages.html import VARIABLES, inline, table_html
 
 
 def two_panels(width_in):
@@ -67,7 +67,7 @@ def test_a_page_knows_what_each_panel_shows():
     left, right = json.loads(unescape(re.search("data-panels='([^']*)'", page)[1]))
     assert left["names"] == ["time (s)", "error (cm)"]
     assert (left["scale"], right["scale"]) == (["linear", "linear"], ["log", "linear"])
-    assert left["box"][0] < left["box"][2] <= right["box"][0] < right["box"][2] <= 72 * PAGE_IN
+    assert left["box"][0] < left["box"][2] <= right["box"][0] < right["box"][2] <= 72 * WIDTHS["page"]
     # The first tick of the left panel lies where the box and the axis say.
     x = float(re.search(r'<use xlink:href="#m[0-9a-f]+" x="([0-9.]+)"', page)[1])
     share = (x - left["box"][0]) / (left["box"][2] - left["box"][0])
@@ -78,13 +78,14 @@ def test_a_page_knows_what_each_panel_shows():
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_page_lies_well(width, tmp_path):
     header = ["pair", *(f"column {k}" for k in range(20))]
-    parts = [
-        both_widths(two_panels, "A caption. " * 12, "two"),
-        table_html(header, [["1-2", *("12345.6" for _ in range(20))]] * 3),
-        table_html(["what", "is"], [["a question " * 9, "an answer " * 9], ["file", "0a" * 32]], words=True),
-        f"<p class='bad'>{'word ' * 60}{'x' * 90}</p><pre>{'y' * 300}</pre>",
+    blocks = [
+        Picture("two", two_panels, "A caption. " * 12),
+        Table(header, [["1-2", *("12345.6" for _ in range(20))]] * 3),
+        Table(["what", "is"], [["a question " * 9, "an answer " * 9], ["file", "0a" * 32]], words=True),
+        Text(f"{'word ' * 60}. {'x' * 90}", "bad"),
+        Listing("y" * 300),
     ]
-    lies_well(page_html("A page", parts), width, tmp_path)
+    lies_well(to_html(Document("A page", [*blocks])), width, tmp_path)
 
 
 def test_a_picture_is_on_white():

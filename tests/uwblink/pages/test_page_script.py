@@ -7,9 +7,9 @@ from html import unescape
 import pytest
 
 from tests.browser import chromium
+from uwblink.pages.blocks import Document, Picture, to_html
 from uwblink.pages.colours import look
 from uwblink.pages.figures import label, legend, mark, sheet
-from uwblink.pages.html import both_widths, page_html
 
 POINTED_AT = """<script>
 const told = {}, wide = document.querySelector('figure .wide svg'), tip = document.getElementById('tip');
@@ -63,7 +63,7 @@ def told(tmp_path_factory):
         legend(figure)
         return figure
 
-    page = page_html("A page", [both_widths(two_lines, "Two lines.", "two")])
+    page = to_html(Document("A page", [Picture("two", two_lines, "Two lines.")]))
     folder = tmp_path_factory.mktemp("page")
     path = folder / "page.html"
     path.write_text(page.replace("</body>", POINTED_AT))

@@ -10,13 +10,11 @@ import pytest
 import uwbsim
 from tests.browser import lies_well
 from uwblink import PROTOCOLS
+from uwblink.pages.blocks import to_html
 from uwblink.pages.figures import picture, style
-from uwbsim.pages.comparison_page import page as comparison_page
-from uwbsim.pages.protocol_figures import error_over
-from uwbsim.pages.scenario_figures import room, timing
-from uwbsim.pages.scenario_page import page as scene_page
-from uwbsim.pages.sweep_figures import Swept, figure_over_keys
-from uwbsim.pages.sweep_page import write_sweep_page
+from uwbsim.pages import write_sweep_page
+from uwbsim.pages.documents import comparison, scene
+from uwbsim.pages.figures import Swept, error_over, figure_over_keys, room, timing
 from uwbsim.protocols.comparison import ErrorCurve
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -74,12 +72,12 @@ def test_a_timing_diagram_has_every_interval_with_its_length(name):
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_scene_lies_well(width, tmp_path):
-    lies_well(scene_page(uwbsim.load(OFFICE)), width, tmp_path)
+    lies_well(to_html(scene(uwbsim.load(OFFICE))), width, tmp_path)
 
 
 @pytest.fixture(scope="module")
 def compared():
-    return comparison_page(uwbsim.compare(uwbsim.load(BENCH), list(PROTOCOLS.values()), 3000))
+    return to_html(comparison(uwbsim.compare(uwbsim.load(BENCH), list(PROTOCOLS.values()), 3000)))
 
 
 @pytest.mark.parametrize("width", [1280, 390])
@@ -110,7 +108,7 @@ def test_a_sweep_draws_what_came_out(tmp_path, more):
     design = uwbsim.load_design(plan, allow_files=[BENCH.parent])
     uwbsim.run_sweep(design, tmp_path / "out", workers=1, evaluate=judged)
     page = write_sweep_page(design, tmp_path / "out").read_text()
-    assert re.findall("<figcaption>(.*?)</figcaption>", page) == ["spread (cm)."]
+    assert re.findall("<figcaption>(.*?)</figcaption>", page) == ["Figure 1. spread (cm)."]
 
     assert "rx_noise_ps" in page
     assert f"{len(design.seeds)} seeds each" in page
@@ -124,7 +122,7 @@ def test_a_sweep_says_what_its_figures_are(tmp_path):
     uwbsim.run_sweep(design, tmp_path / "out", workers=1)
     page = write_sweep_page(design, tmp_path / "out").read_text()
     captions = re.findall("<figcaption>(.*?)</figcaption>", page)
-    assert "low (cm): what 2.5 % of the errors of raw ranges lie below." in captions
+    assert "Figure 4. low (cm): what 2.5 % of the errors of raw ranges lie below." in captions
 
 
 def test_bands_over_seeds_reach_from_the_least_to_the_largest():

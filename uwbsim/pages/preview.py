@@ -1,11 +1,13 @@
-"""What a scenario will do, before it is run."""
+"""What a scenario will do, worked out without running it."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -15,8 +17,6 @@ from uwbsim.scenario.ranging import UUS_S
 from uwbsim.simulation.air import schedule
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.world import World
-
-SAMPLES: Final = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,15 +48,12 @@ class Preview:
 
     def __repr__(self) -> str:
         """Return it in words, a line a thing to know; warnings begin with "warning:"."""
-        return "\n".join(sentences(self))
+        return "\n".join(_sentences(self))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `uwbsim validate --json` prints: the figures, without the scenario."""
-        pairs = [asdict(pair) for pair in self.pairs]
-        return {"pairs": pairs} | {name: getattr(self, name) for name in FIGURES}
-
-
-FIGURES: Final = ("exchanges", "rate_hz", "fastest_hz", "air_share", "duration_s")
+        figures = ("exchanges", "rate_hz", "fastest_hz", "air_share", "duration_s")
+        return {"pairs": [asdict(pair) for pair in self.pairs]} | {name: getattr(self, name) for name in figures}
 
 
 def preview(scenario: Scenario | Source) -> Preview:
@@ -81,14 +78,14 @@ def preview(scenario: Scenario | Source) -> Preview:
     """
     scenario = as_scenario(scenario)
     plan, world = schedule(scenario), World.of(scenario)
-    duration, radio = scenario.run.duration_s, scenario.radio
-    time = (np.linspace(0, duration, SAMPLES) * SUBTICKS_PER_SECOND).astype(np.int64)
+    duration, radio, samples = scenario.run.duration_s, scenario.radio, 200
+    time = (np.linspace(0, duration, samples) * SUBTICKS_PER_SECOND).astype(np.int64)
+    reply_s = scenario.ranging.response_delay_uus * UUS_S
     pairs = []
     for i, j in sorted(set(zip(plan.initiator.tolist(), plan.target.tolist(), strict=True))):
         count = int(np.count_nonzero((plan.initiator == i) & (plan.target == j)))
-        link = world.link(np.full(SAMPLES, i), np.full(SAMPLES, j), time)
+        link = world.link(np.full(samples, i), np.full(samples, j), time)
         one, two = scenario.tags[i], scenario.tags[j]
-        reply_s = scenario.ranging.response_delay_uus * UUS_S
         pairs.append(
             PairPreview(
                 initiator=one.id,
@@ -112,7 +109,7 @@ def preview(scenario: Scenario | Source) -> Preview:
     )
 
 
-def sentences(found: Preview) -> list[str]:
+def _sentences(found: Preview) -> list[str]:
     """Return the preview in words, a line each; warnings begin with "warning:"."""
     scenario = found.scenario
     protocol = PROTOCOLS[scenario.ranging.protocol]
@@ -122,21 +119,20 @@ def sentences(found: Preview) -> list[str]:
         f"{found.exchanges} exchanges planned among {len(found.pairs)} pairs, {found.rate_hz:.3g} a second "
         f"(one after the other at most {found.fastest_hz:.0f}); "
         f"frames on the air {100 * found.air_share:.1f} % of the time",
+        f"{'pair':>10s}{'exchanges':>11s}{'Hz':>7s}{'metres':>17s}{'dBm':>18s}  SS-TWR's bias (cm)",
     ]
-    lines.append(f"{'pair':>10s}{'exchanges':>11s}{'Hz':>7s}{'metres':>17s}{'dBm':>18s}  SS-TWR's bias (cm)")
-    for pair in found.pairs:
-        lines.append(
-            f"{pair.initiator:3d} -> {pair.target:3d}{pair.exchanges:11d}{pair.rate_hz:7.3g}"
-            f"{pair.distance_m[0]:8.2f} to {pair.distance_m[1]:5.2f}{pair.power_dbm[0]:8.1f} to "
-            f"{pair.power_dbm[1]:6.1f}{100 * pair.ss_bias_m:+20.1f}"
-        )
+    lines += [
+        f"{pair.initiator:3d} -> {pair.target:3d}{pair.exchanges:11d}{pair.rate_hz:7.3g}"
+        f"{pair.distance_m[0]:8.2f} to {pair.distance_m[1]:5.2f}{pair.power_dbm[0]:8.1f} to "
+        f"{pair.power_dbm[1]:6.1f}{100 * pair.ss_bias_m:+20.1f}"
+        for pair in found.pairs
+    ]
     lines += [
         f"warning: {pair.initiator} and {pair.target} hear each other {100 * pair.audible:.0f} % of the time "
         f"(sensitivity {scenario.radio.sensitivity_dbm:g} dBm)"
         for pair in found.pairs
         if pair.audible < 0.9
     ]
-    # Pairs that would not determine delays are known beforehand: a two-coloured graph leaves one direction free.
     if _is_bipartite([(p.initiator, p.target) for p in found.pairs]):
         lines.append(
             "warning: the pairs split the tags into two groups that range only with each other; their antenna delays "
@@ -146,23 +142,18 @@ def sentences(found: Preview) -> list[str]:
 
 
 def _is_bipartite(pairs: list[tuple[int, int]]) -> bool:
-    """Whether any connected part of the graph of pairs has no odd cycle."""
-    neighbours: dict[int, set[int]] = {}
-    for a, b in pairs:
-        neighbours.setdefault(a, set()).add(b)
-        neighbours.setdefault(b, set()).add(a)
-    colour: dict[int, int] = {}
-    for root in neighbours:
-        if root in colour:
-            continue
-        colour[root], waiting, odd = 0, [root], False
-        while waiting:
-            node = waiting.pop()
-            for other in neighbours[node]:
-                if other not in colour:
-                    colour[other] = 1 - colour[node]
-                    waiting.append(other)
-                odd |= colour[other] == colour[node]
-        if not odd:
-            return True
-    return False
+    """Return whether a connected part of the graph of pairs has no odd cycle: a direction of its delays stays free.
+
+    Such a part, and no other, falls into two in the double cover of the graph, whose edges lead from one copy of the
+    nodes to the other.
+    """
+    if not pairs:
+        return False
+    nodes, ends = np.unique(pairs, return_inverse=True)
+    first, second = ends.reshape(-1, 2).T
+    count, ones = len(nodes), np.ones(2 * len(pairs))
+    graph = coo_array((ones[::2], (first, second)), shape=(count, count))
+    cover_ends = (np.concatenate([first, second]), np.concatenate([second, first]) + count)
+    cover = coo_array((ones, cover_ends), shape=(2 * count, 2 * count))
+    parts, cover_parts = (connected_components(one, directed=False)[0] for one in (graph, cover))
+    return bool(cover_parts > parts)

@@ -1,0 +1,135 @@
+"""What a report tells of, where it comes from, and where it may be written."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib.calibration.model import Calibration
+from calib.calibration.parts import CorrectedRanges
+from calib.data.ranges import Ranges, concatenate
+from calib.data.sources import Data
+from calib.errors import BadInputError
+from calib.evaluation.statistics import Evaluation, evaluate
+from uwblink.output import check_output
+
+if TYPE_CHECKING:
+    from calib.doctor.base import Finding
+    from calib.estimation.passive_listeners import OverheardDelay
+    from calib.estimation.result import FitResult
+    from calib.evaluation.tracking import Localization
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """When (ISO 8601, UTC), how, with which version, and the SHA-256 of each file that was read, by its name."""
+
+    made: str = ""
+    command: str = ""
+    version: str = ""
+    files: dict[str, str] = field(default_factory=dict)
+
+    def sentence(self) -> str:
+        """Return it in a line, for the head of a report."""
+        parts = [f"Made {self.made}" if self.made else "", f"by uwbcal {self.version}" if self.version else ""]
+        how = f": {self.command}" if self.command else ""
+        return " ".join(filter(None, parts)) + how
+
+
+def origin_of(data: Iterable[Data], command: str = "") -> Origin:
+    """Return the origin of a report on some recordings; those in memory have no files.
+
+    The date is now, or what `SOURCE_DATE_EPOCH` says (seconds since 1970), for files that are the same each time.
+    """
+    from uwblink import __version__
+
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    seconds = int(epoch) if epoch.isdecimal() else datetime.datetime.now(datetime.UTC).timestamp()
+    made = datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+    files = {}
+    for path in (Path(one) for one in data if isinstance(one, str | os.PathLike)):
+        with path.open("rb") as file:
+            files[str(path)] = hashlib.file_digest(file, "sha256").hexdigest()
+    return Origin(made, command, __version__, files)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """What a report tells of: a calibration, and as much as there is of how it was fitted and how it does.
+
+    `training` are the ranges it was fitted to, `tests` others that judge it; an `evaluated` one of the judged ranges
+    is not made again. `warnings` are those of the fit. `refits` are calibrations for other scales of the loss, by
+    scale in ns; `heard` delays as passive listeners see them; `findings` the doctor's, by recording; `tracks` the
+    bodies that were localized; `origin` says when the report was made, and from what files.
+    """
+
+    calibration: Calibration
+    training: list[Ranges] = field(default_factory=list)
+    tests: list[Ranges] = field(default_factory=list)
+    evaluated: Evaluation | None = None
+    warnings: list[str] = field(default_factory=list)
+    fit: FitResult | None = None
+    refits: dict[float, Calibration] = field(default_factory=dict)
+    heard: dict[int, OverheardDelay] = field(default_factory=dict)
+    findings: list[tuple[str, Finding]] = field(default_factory=list)
+    tracks: list[Localization] = field(default_factory=list)
+    origin: Origin = field(default_factory=Origin)
+
+    @property
+    def recordings(self) -> list[Ranges]:
+        """What the calibration is judged on: the tests, or the training where there are none."""
+        return self.tests or self.training
+
+    @property
+    def held_out(self) -> bool:
+        """Whether it is judged on recordings that the fit has not seen."""
+        return bool(self.tests) and not self.evaluation.seen
+
+    @cached_property
+    def trained(self) -> Ranges:
+        """The ranges that curves are drawn over: those of the training, or of the tests where it is not known."""
+        return concatenate(self.training or self.tests)
+
+    @cached_property
+    def judged(self) -> Ranges:
+        """The ranges of the tests, or of the training where there are none."""
+        return concatenate(self.recordings)
+
+    @cached_property
+    def corrected(self) -> CorrectedRanges:
+        """The judged ranges, corrected."""
+        return self.calibration.apply(self.judged)
+
+    @cached_property
+    def evaluation(self) -> Evaluation:
+        """How the calibration does on the judged ranges."""
+        return self.evaluated or evaluate(self.judged, self.calibration)
+
+
+def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
+    """Raise, before anything is computed, what would keep the files of a report from being written.
+
+    Raises what `check_output` raises, and `BadInputError` for a `pdf` that is the `output`, and for a folder of
+    `figures` that is a file, that holds some already, or whose parent does not exist.
+    """
+    for path in filter(None, (output, pdf)):
+        check_output(path, force=force)
+    if pdf is not None and output is not None and output.resolve() == pdf.resolve():
+        raise BadInputError(f"{output} is the page already; give the PDF another name", parameter="pdf")
+    if figures is None:
+        return
+    wrong = ""
+    if figures.exists() and not figures.is_dir():
+        wrong = "is a file, expected a folder"
+    elif not force and any(path.suffix in (".pdf", ".svg") for path in figures.glob("*.*")):
+        wrong = "holds figures already; give another folder, or `force` to replace them"
+    elif not figures.parent.is_dir():
+        raise BadInputError(f"{figures.parent} does not exist", parameter="figures")
+    if wrong:
+        raise BadInputError(f"{figures} {wrong}", parameter="figures")

@@ -1,0 +1,376 @@
+"""Scenes, comparisons, sweeps and twins as pages: one HTML file each that needs no other."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from uwblink.output import check_folder, check_output, made_folder, write_bytes, write_files, write_text
+from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, to_html
+from uwblink.pages.figures import picture
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
+from uwbsim.errors import ScenarioError
+from uwbsim.pages import figures
+from uwbsim.pages.preview import preview
+from uwbsim.protocols.comparison import Comparison, Optimum, ProtocolErrors, over_reply, over_skew, over_state
+from uwbsim.protocols.conditions import conditions_of
+from uwbsim.scenario.loading import Source, as_scenario
+from uwbsim.scenario.model import Scenario
+from uwbsim.sweep.design import SweepDesign
+from uwbsim.sweep.results import Store
+from uwbsim.sweep.runner import STORE
+from uwbsim.tables import write_csv, write_parquet
+from uwbsim.twins import LEVEL, Compared, Twin
+
+
+def show(scenario: Scenario | Source, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write the scene: .html has the room, the timing of every protocol and the preview; a picture has the room.
+
+    `scenario` is whatever `load` takes, or a `Scenario`. Raises `ScenarioError` for a suffix other than .html, .png,
+    .svg and .pdf, and what `check_output` raises.
+
+    >>> from pathlib import Path
+    >>> import uwbsim
+    >>> mast, drone = ({"model": "static", "position_m": [x, 0.0, 2.0]} for x in (0.0, 5.0))
+    >>> uwbsim.show(
+    ...     {
+    ...         "run": {"duration_s": 2.0},
+    ...         "ranging": {"rate_hz": 50.0},
+    ...         "bodies": [{"name": "mast", "motion": mast}, {"name": "drone", "motion": drone}],
+    ...         "tags": [{"id": 1, "body": "mast"}, {"id": 2, "body": "drone"}],
+    ...     },
+    ...     "scene.png",
+    ... )
+    >>> Path("scene.png").read_bytes()[1:4]
+    b'PNG'
+    """
+    path, pictures = Path(path), (".png", ".svg", ".pdf")
+    check_output(path, force=force)
+    scenario = as_scenario(scenario)
+    suffix = path.suffix.lower()
+    if suffix in pictures:
+        write_bytes(path, picture(partial(figures.room, scenario=scenario), suffix[1:]), force=force)
+    elif suffix == ".html":
+        write_text(path, to_html(scene(scenario)), force=force)
+    else:
+        raise ScenarioError(f"{path}: found {suffix or 'no suffix'}, expected .html, {', '.join(pictures)}")
+
+
+def scene(scenario: Scenario) -> Document:
+    """Return the scene: its room, the preview, and an exchange of each protocol."""
+    # One protocol of each course of messages: formulas make no difference to a picture of them.
+    distinct: dict[Any, tuple[str, RangingProtocol]] = {}
+    for name, row in PROTOCOLS.items():
+        distinct.setdefault(row.messages, (name, row))
+    blocks: list[Block] = [
+        Picture(
+            "room",
+            partial(figures.room, scenario=scenario),
+            "Bodies' paths (two minutes at most), tags where they start, obstacles, the room's walls; to scale.",
+        ),
+        Heading("What will happen"),
+        Listing(str(preview(scenario)), table=True),
+        Heading("One exchange"),
+        Text(
+            "Every stamp, and what the paper calls it; pale: preamble and start of frame, full: header and data. dt41 "
+            "is the initiator's round trip, dt32 the target's reply, dt53 and dt64 the third leg as its sender and its "
+            "receiver have it."
+        ),
+    ]
+    for name, row in distinct.values():
+        draw = partial(figures.timing, scenario=scenario, name=name)
+        blocks.append(Picture(f"timing-{name}", draw, f"{row.title}."))
+    return Document(scenario.run.name, blocks)
+
+
+COLUMNS: Final[dict[str, Callable[[ProtocolErrors], str]]] = {
+    "protocol": lambda o: o.protocol,
+    "bias (cm)": lambda o: f"{100 * o.bias_m:+.2f}",
+    "predicted": lambda o: f"{100 * o.predicted_bias_m:+.2f}",
+    "std (cm)": lambda o: f"{100 * o.std_m:.2f}",
+    "predicted ": lambda o: f"{100 * o.predicted_std_m:.2f}",
+    "RMSE (cm)": lambda o: f"{100 * o.rmse_m:.2f}",
+    "95 % of errors (cm)": lambda o: f"{100 * o.low_m:+.1f} … {100 * o.high_m:+.1f}",
+    "messages": lambda o: str(o.messages),
+    "air (µs)": lambda o: f"{1e6 * o.air_s:.0f}",
+    "duration (µs)": lambda o: f"{1e6 * o.duration_s:.0f}",
+    "radio on (µs)": lambda o: f"{1e6 * o.radio_on_s:.0f}",
+    "rate (1/s)": lambda o: f"{o.rate_hz:.0f}",
+}
+"""What tables on the page and on the terminal show of a protocol."""
+
+FILES: Final = ("compare.html", "compare.csv", "compare.parquet")
+"""What `write_comparison` writes into its folder."""
+
+
+def write_comparison(found: Comparison, folder: Path, *, force: bool = False) -> None:
+    """Write a comparison as page and tables (`FILES`) into a folder, which is made where it is missing.
+
+    Raises what `check_folder` raises.
+    """
+    check_folder(folder, FILES, force=force)
+    text, rows = to_html(comparison(found)), [one.to_dict() for one in found.outcomes]
+    html, table, packed = (folder / name for name in FILES)
+    with made_folder(folder):
+        write_parquet(packed, rows, force=force)  # first, because it asks most of the folder's name
+        write_text(html, text, force=force)
+        write_csv(table, rows, force=force)
+
+
+def comparison(found: Comparison) -> Document:
+    """Return the comparison of protocols: what they know, what they cost, which wins where, and errors over what."""
+    scenario, outcomes, samples = found.scenario, found.outcomes, found.samples
+    protocols = {row.name: row for row in found.protocols}
+    states = conditions_of(scenario)
+    over = [
+        (
+            {name: over_skew(scenario, row) for name, row in protocols.items()},
+            "relative skew of the clocks (ppm)",
+            "Error over the relative skew of the clocks.",
+        ),
+        (
+            {name: over_reply(scenario, row) for name, row in protocols.items()},
+            "delay of the scheduled message (µs)",
+            "Error over the delay of the scheduled message: the response of single-sided ranging, the final of "
+            "double-sided.",
+        ),
+        (
+            {name: over_state(row, states, states.distance_m, samples[name]) for name, row in protocols.items()},
+            "distance (m)",
+            "Error over distance: bins of as many ranges each.",
+        ),
+        (
+            {name: over_state(row, states, states.power_dbm, samples[name]) for name, row in protocols.items()},
+            "first-path power (dBm)",
+            "Error over first-path power, likewise.",
+        ),
+    ]
+    # Two tables, what protocols know and what they cost, each whole on a screen.
+    cut = list(COLUMNS).index("messages")
+    halves = [list(COLUMNS)[:cut], ["protocol", *list(COLUMNS)[cut:]]]
+    winners = [
+        [
+            str(row["scheduled_us"]),
+            row["rmse"],
+            row["per_second"],
+            *(f"{100 * row[f'rmse_m {name}']:.2f}" for name in protocols),
+        ]
+        for row in found.winners
+    ]
+    blocks: list[Block] = [
+        Text(
+            f"{outcomes[0].ranges:,} raw ranges with each protocol in the same world, with the same noise. Errors are "
+            "those of raw ranges: antenna delays, power bias and reflections are in them."
+        ),
+        *(Table(names, [[COLUMNS[name](one) for name in names] for one in outcomes]) for names in halves),
+        Text(
+            "Predicted: by the protocol's formulas, without simulating. Air: sum of the frames' lengths; duration: "
+            "from the first to the last; radio on: sending and listening, of both radios together, a proxy of energy; "
+            "rate: exchanges one after the other.",
+            "note",
+        ),
+        Picture(
+            "errors",
+            partial(figures.histograms, samples=samples),
+            "Errors. The outermost bins hold everything beyond them.",
+        ),
+        Heading("Which wins where"),
+        Text(
+            "By prediction, once delays and power bias are calibrated, without reflections. One range: the least error "
+            "of a single range. Per second: the least error of the mean of what fits into a second."
+        ),
+        Table(["scheduled delay (µs)", "one range", "per second", *(f"{name} (cm)" for name in protocols)], winners),
+        Heading("Over what"),
+        Text(
+            "Points are simulated, lines predicted; the first two without delays, power bias and reflections. Axes "
+            "that cover decades are logarithmic, and say so; biases have a sign, so theirs is to scale up to ± "
+            f"{figures.LINEAR_CM:g} cm and logarithmic beyond."
+        ),
+    ]
+    for curves, x, caption in over:
+        draw = partial(figures.error_over, curves=curves, x=x, logarithmic=x.startswith("delay"))
+        blocks.append(Picture(f"over {x}", draw, caption))
+    return Document(f"Protocols in {scenario.run.name}", blocks)
+
+
+def optimum_file(protocol: str) -> str:
+    """Return what `write_optima` calls the picture of a protocol."""
+    return f"optimum-{protocol}.png"
+
+
+def write_optima(found: Iterable[Optimum], folder: Path, *, force: bool = False) -> None:
+    """Write the curve of each optimum as a picture (.png) into a folder, which is made where it is missing.
+
+    Raises what `check_folder` raises.
+    """
+    drawn = {optimum_file(one.protocol): picture(partial(figures.optimum_curve, found=one), "png") for one in found}
+    check_folder(folder, drawn, force=force)
+    write_files(folder, drawn, force=force)
+
+
+RESULTS: Final = {
+    "rmse_m": "root mean square of the errors of raw ranges",
+    "std_m": "standard deviation of the errors of raw ranges",
+    "bias_m": "mean error of raw ranges",
+    "full_std_m": "",
+    "full_robust_std_m": "",
+    "delays_rms_ns": "",
+    "curve_rms_m": "",
+    "correction_rms_m": "",
+    "median_m": "median error of raw ranges",
+    "low_m": "what 2.5 % of the errors of raw ranges lie below",
+    "high_m": "what 2.5 % of the errors of raw ranges lie above",
+    "predicted_bias_m": "mean error as it is predicted without simulating",
+    "predicted_std_m": "standard deviation as it is predicted without simulating",
+}
+"""What results of a sweep are, in words; the first eight are drawn before anything else."""
+
+
+def write_sweep_page(plan: SweepDesign, folder: Path) -> Path:
+    """Write the page of a sweep into the folder of its results, in the place of one that is there; return its path.
+
+    Raises `TableError` where the folder has no results.
+    """
+    most = 200_000  # rows of which a page is made; of more the tables are there for whoever looks
+    with Store.open(folder / STORE) as store:
+        rows = list(islice(store.rows(), most + 1))
+    path = folder / "results.html"
+    told = [Text(f"Of more than {most:,} rows the first are drawn.", "warning")] if len(rows) > most else []
+    write_text(path, to_html(_swept(plan, rows, told)), force=True)
+    return path
+
+
+def _swept(plan: SweepDesign, rows: Sequence[Mapping[str, Any]], told: list[Text]) -> Document:
+    good = [row for row in rows if row.get("status") == "ok"]
+    keys = list(plan.axes) if plan.rows is None else list(dict.fromkeys(key for row in plan.rows for key in row))
+    varied = [key for key in keys if len({str(row.get(key)) for row in good}) > 1]
+    failed = len({row["number"] for row in rows}) - len({row["number"] for row in good})
+    blocks: list[Block] = [
+        Text(
+            f"{plan.total:,} runs over {', '.join(keys) or 'nothing'}, {len(plan.seeds)} "
+            f"seed{'s' * (len(plan.seeds) > 1)} each, of which {failed:,} failed. Lines are medians, bands reach from "
+            "the least to the largest over seeds and over all other keys; maps are medians over seeds. The tables "
+            "beside this page have every run."
+        ),
+        *told,
+    ]
+    found, most = _results(good, keys) if varied else {}, 8
+    if not found:
+        blocks.append(Text("Nothing to draw: no run gave a number that changes with a key.", "warning"))
+    protocols = [str(row.get("protocol", "")) for row in good]
+    swept = figures.Swept({key: [row.get(key) for row in good] for key in varied}, protocols, np.zeros(0))
+    for name in list(found)[:most]:
+        stem, _, unit = name.rpartition("_")
+        shown, scale = name.replace("_", " "), 1.0
+        if unit == "m":
+            shown, scale = f"{stem.replace('_', ' ')} (cm)", 100.0
+        elif unit in ("ns", "s", "hz", "ps", "ppm", "dbm"):
+            shown = f"{stem.replace('_', ' ')} ({unit})"
+        told_of = f": {RESULTS[name]}" if RESULTS.get(name) else ""
+        own = replace(swept, figure=scale * found[name])
+        draw = partial(figures.figure_over_keys, swept=own, name=shown)
+        blocks.append(Picture(name, draw, f"{shown}{told_of}."))
+    if len(found) > most:
+        blocks.append(Text(f"Not drawn: {', '.join(list(found)[most:])}.", "note"))
+    return Document(f"Sweep: {plan.name}", blocks)
+
+
+def _results(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[str, Any]:
+    """Return the results that are numbers and change, as columns (rows,), the telling ones first."""
+    beside = {"scenario", "number", "seed", "uwbcal", "numpy", "python", "status", "error", "protocol", *keys}
+    found = {}
+    for name in dict.fromkeys(name for row in rows for name in row if name not in beside):
+        cells = (row.get(name) for row in rows)
+        numbers = [v if isinstance(v, int | float) and not isinstance(v, bool) else np.nan for v in cells]
+        values = np.array(numbers, dtype=np.float64)
+        known = values[np.isfinite(values)]
+        if len(known) and np.ptp(known) > 0:
+            found[name] = values
+    first = list(RESULTS)[:8]
+    return dict(sorted(found.items(), key=lambda item: first.index(item[0]) if item[0] in first else len(first)))
+
+
+TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {
+    "quantity": lambda c: f"{c.name} ({c.unit})",
+    "verdict": lambda c: "alike" if c.alike else "differ",
+    "median": lambda c: _both(c.median_measured, c.median_simulated),
+    "10 %": lambda c: _both(c.low_measured, c.low_simulated),
+    "90 %": lambda c: _both(c.high_measured, c.high_simulated),
+    "to a pair's next": lambda c: _both(c.lag1_measured, c.lag1_simulated, ".2f"),
+    "worth": lambda c: f"{c.worth_measured:.0f} of {c.count}",
+    "D": lambda c: f"{c.distance:.3f}",
+    "p": lambda c: f"{c.probability:.2g}",
+}
+"""What tables on the page and on the terminal show of a quantity: measured, then simulated."""
+
+
+def _both(measured: float, simulated: float, form: str = ".3g") -> str:
+    return " / ".join("–" if math.isnan(value) else format(value, form) for value in (measured, simulated))
+
+
+def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: bool = False) -> None:
+    """Write the page of a twin beside its recording; raises what `check_output` raises."""
+    check_output(path, force=force)
+    write_text(path, to_html(_twin(found, compared)), force=force)
+
+
+def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
+    alike = sum(one.alike for one in compared)
+    pairs = [one for one in compared if one.name in ("residual of calibrated ranges", "first-path power at initiator")]
+    numbers = {name: value for name, value in found.found.items() if value is None or isinstance(value, int | float)}
+    blocks: list[Block] = [
+        Text(
+            f"A scenario fitted to {len(found.measured):,} exchanges of {len(found.measured.pairs)} pairs, with the "
+            f"delays and the bias curve of {Path(found.calibration).name} as truth, and what it makes beside what "
+            f"was measured. {alike} of {len(compared)} quantities are alike."
+        ),
+        Heading("Measured and simulated"),
+        Text(
+            "Each cell has the measured value, then the simulated one. To a pair's next is the autocorrelation "
+            "to the pair's next exchange, worth how many independent values the measured ones are worth, D the "
+            "largest difference of the cumulative distributions, and p how likely chance makes it so large "
+            f"(Kolmogorov and Smirnov, with sizes as the values are worth); below {LEVEL:g} they differ. The scenario "
+            "was fitted to these same exchanges, so the test is of its form, not of what it predicts."
+        ),
+        Table(list(TWIN_COLUMNS), [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]),
+        Picture(
+            "marginals",
+            partial(figures.marginals, found=compared),
+            "Distributions. The outermost bins hold what lies beyond them.",
+        ),
+        Heading("Pair by pair"),
+    ]
+    if pairs:
+        caption = "A dot a pair of five exchanges or more; on the line both agree."
+        blocks.append(Picture("pairs", partial(figures.by_pair, found=pairs), caption))
+    blocks += [
+        Heading("What was found"),
+        Table(["what", "value"], [[name, _shown(value)] for name, value in numbers.items()]),
+    ]
+    for name in ("tags", "pairs"):
+        rows = found.found[name]
+        columns = list(next(iter(rows.values())))
+        cells = [[key, *(_shown(row[column]) for column in columns)] for key, row in rows.items()]
+        blocks.append(Table([name[:-1], *columns], cells))
+    blocks += [
+        Heading("What the recording cannot tell"),
+        Table(
+            ["kept at its default, or decided without the recording"], [[text] for text in found.unknown], words=True
+        ),
+    ]
+    return Document(f"The twin of {Path(found.recording).name}", blocks)
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "not told"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

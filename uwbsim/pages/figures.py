@@ -1,0 +1,432 @@
+"""Figures of scenarios, protocols, sweeps and twins, each drawn at a width in inches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from uwblink.arrays import Floats
+from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, look
+from uwblink.pages.figures import NARROW_IN, label, legend, mark, sheet
+from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.table import PROTOCOLS
+from uwblink.ticks import TICK_S
+from uwbsim.protocols.comparison import ErrorCurve, Optimum
+from uwbsim.random_streams import stream
+from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
+from uwbsim.simulation.timestamps import Begun, Draws, Stamped, draw_reply_s, stamp
+from uwbsim.twins import Compared
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.reception import Medium
+from uwbsim.world.world import World
+
+LETTER_IN: Final = 0.062
+"""Width of a letter of 8 pt, about."""
+
+LINEAR_CM: Final = 1.0
+"""Biases below are drawn to scale, larger ones by their logarithm."""
+
+
+def _plain_ticks(axis: Axis, values: Sequence[float]) -> None:
+    """Put plain numbers at these places of an axis, and nothing between them."""
+    axis.set_ticks(values, labels=[f"{value:g}".replace("-", "−") for value in values])
+    axis.set_ticks([], minor=True)
+
+
+def _logarithmic_delays(axes: Axes) -> None:
+    axes.set_xscale("log")
+    _plain_ticks(axes.xaxis, [300, 600, 1000, 2000, 4000])
+
+
+def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
+    """Draw errors of raw ranges, one outline a protocol; the outermost bins hold everything beyond them."""
+    figure, (axes,) = sheet(width_in, height_in=2.9)
+    best = min((np.quantile(e, (0.005, 0.995)) for e in samples.values()), key=np.ptp)
+    margin = 0.25 * np.ptp(best) + 1e-4
+    edges = 100 * np.linspace(best[0] - margin, best[1] + margin, 81)
+    for k, (name, errors) in enumerate(samples.items()):
+        inside = np.clip(100 * errors, edges[0] + 1e-9, edges[-1] - 1e-9)
+        share = 100 * np.histogram(inside, edges)[0] / len(inside)
+        mark(axes.stairs(share, edges, lw=1.2, color=look(k).colour, ls=look(k).dashes, label=name), name)
+    ticks = [t for t in axes.get_xticks() if edges[8] < t < edges[-9]]
+    names = [f"≤ {edges[0]:.0f}", *(f"{t:.0f}" for t in ticks), f"≥ {edges[-1]:.0f}"]
+    axes.set_xticks([edges[0], *ticks, edges[-1]], [text.replace("-", "−") for text in names])
+    axes.set_xlim(edges[0], edges[-1])
+    label(axes, "range error (cm)", "ranges (%)")
+    legend(figure)
+    return figure
+
+
+def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, logarithmic: bool = False) -> Figure:
+    """Draw bias and standard deviation over something: simulated as points, predicted as lines."""
+    figure, (left, right) = sheet(width_in, 2)
+    for k, (name, c) in enumerate(curves.items()):
+        own = look(k)
+        line: dict[str, Any] = {"color": own.colour, "ls": own.dashes, "lw": 1.1}
+        dots: dict[str, Any] = {"color": own.colour, "ls": "", "marker": own.marker, "ms": 3}
+        left.plot(c.x, 100 * c.predicted_bias_m, **line)
+        left.plot(c.x, 100 * c.bias_m, **dots)
+        right.plot(c.x, 100 * c.predicted_std_m, **line)
+        mark(right.plot(c.x, 100 * c.std_m, **dots)[0], name)
+        left.plot([], [], **(line | dots | {"ls": own.dashes}), label=name)
+    most = max(float(np.abs(100 * bias).max()) for c in curves.values() for bias in (c.bias_m, c.predicted_bias_m))
+    spreads = 100 * np.concatenate([c.std_m for c in curves.values()])
+    label(left, x, "bias (cm)")
+    label(right, x, "standard deviation (cm)")
+    if most > 20 * LINEAR_CM:
+        # Biases have a sign: to scale about zero, logarithmic beyond.
+        left.set_ylabel("bias (cm), log axis")
+        left.set_yscale("symlog", linthresh=LINEAR_CM)
+        low, high = left.get_ylim()
+        decades = [10.0**k for k in range(int(np.ceil(np.log10(most))) + 1)]
+        for finer in ((1,), (1, 2, 5)):
+            above = [m * t for t in decades for m in finer]
+            kept = [t for t in [*(-t for t in above), 0.0, *above] if low <= t <= high]
+            if len(kept) >= 4:
+                break
+        _plain_ticks(left.yaxis, kept)
+    if spreads.max() > 10 * spreads.min():
+        right.set_ylabel("standard deviation (cm), log axis")
+        right.set_yscale("log")
+        ticks = [m * 10.0**k for k in range(-2, 6) for m in (1, 2, 5)]
+        ticks = [t for t in ticks if 0.8 * spreads.min() <= t <= 1.25 * spreads.max()]
+        _plain_ticks(right.yaxis, ticks if len(ticks) < 8 else ticks[::3])
+    else:
+        right.set_ylim(bottom=0)
+    for axes in (left, right):
+        if logarithmic:
+            _logarithmic_delays(axes)
+        else:
+            axes.locator_params(axis="x", nbins=6)  # nine of powers cover each other
+    legend(figure, left)
+    return figure
+
+
+def optimum_curve(width_in: float, found: Optimum) -> Figure:
+    """Draw the root mean squared error of one range, and of the mean of a second full of them, over the delay."""
+    figure, panels = sheet(width_in, 2)
+    delays, best = 1e6 * found.delays_s, 1e6 * found.delay_s
+    range_cm, second_mm = 100 * np.sqrt(found.range_m2), 1000 * np.sqrt(found.second_m2)
+    curves = (
+        (range_cm, 100 * found.rms_m, "error of one range (cm)"),
+        (second_mm, 1000 * found.second_rms_m, "error of the mean of one second (mm)"),
+    )
+    for axes, (curve, y, name) in zip(panels, curves, strict=True):
+        axes.plot(delays, curve, color=BLUE)
+        axes.plot([best], [y], "o", color=VERMILION)
+        axes.annotate(f"{best:.0f} µs", (best, y), (6, 8), textcoords="offset points")
+        _logarithmic_delays(axes)
+        label(axes, "delay of the scheduled message (µs)", name)
+    return figure
+
+
+def room(width_in: float, scenario: Scenario) -> Figure:
+    """Draw bodies' paths, tags at the start, obstacles and the room's walls, from above and from the side, to scale."""
+    world = World.of(scenario)
+    time = np.linspace(0, min(scenario.run.duration_s, 120.0), 1200)
+    paths = {body.name: world.trajectories[body.name].position_m(time) for body in scenario.bodies}
+    tags = {tag.id: world.trajectories[tag.body].point_m(np.zeros(1), tag.lever_arm_m)[0] for tag in scenario.tags}
+    boxes = [*scenario.obstacles, *([scenario.room] if scenario.room else [])]
+    corners = np.array([corner for box in boxes for corner in (box.min_m, box.max_m)]).reshape(-1, 3)
+    points = np.concatenate([*paths.values(), np.array(list(tags.values())), corners])
+    # What is drawn is at least a metre large, with a margin.
+    middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, np.maximum(np.ptp(points, axis=0) / 2, 0.5)
+    half = half + (0.04 if scenario.room else 0.12) * float(half.max())
+    low, high = middle - half, middle + half
+    figure, panels, scale = _to_scale(width_in, 2 * half)
+    for axes, (x, y), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
+        _draw_walls(axes, scenario, x, y, scale)
+        for k, body in enumerate(scenario.bodies):
+            own = np.array([tags[tag.id] for tag in scenario.tags if tag.body == body.name]).reshape(-1, 3)
+            path, kind = paths[body.name], look(k)
+            axes.plot(path[:, x], path[:, y], color=kind.colour, lw=0.6, alpha=0.6)
+            (dots,) = axes.plot(own[:, x], own[:, y], kind.marker, color=kind.colour, ms=4, label=body.name)
+            mark(dots, body.name)
+        _name_tags(axes, {tag: spot[[x, y]] for tag, spot in tags.items()}, scale, high[x])
+        axes.set_xlim(low[x], high[x])
+        axes.set_ylim(low[y], high[y])
+        axes.set_aspect("equal", adjustable="box")
+        axes.set_xlabel(f"{'xyz'[x]} (m)")
+        axes.set_ylabel(f"{'xyz'[y]} (m)")
+        axes.grid(True)
+        axes.set_axisbelow(True)
+        axes.set_title(name, loc="left")
+    legend(figure, panels[0])
+    return figure
+
+
+def _to_scale(width_in: float, size_m: Floats) -> tuple[Figure, list[Axes], float]:
+    """Return a figure whose two panels have the same scale, and inches of a metre; on a phone above each other."""
+    narrow = width_in < NARROW_IN
+    across = size_m[0] if narrow else 2 * size_m[0]
+    scale = min((width_in - (0.7 if narrow else 1.4)) / across, (3.6 if narrow else 4.2) / max(size_m[1], size_m[2]))
+    heights = [size_m[1] * scale, size_m[2] * scale]
+    figure, panels = sheet(width_in, 2, height_ratios=heights if narrow else None)
+    figure.set_figheight(sum(heights) + 1.9 if narrow else max(heights) + 1.2)
+    return figure, panels, float(scale)
+
+
+def _draw_walls(axes: Axes, scenario: Scenario, x: int, y: int, scale: float) -> None:
+    if scenario.room:
+        low, high = np.array(scenario.room.min_m), np.array(scenario.room.max_m)
+        axes.add_patch(Rectangle((low[x], low[y]), *(high - low)[[x, y]], fill=False, ec=INK, lw=1.2, zorder=1))
+    for box in scenario.obstacles:
+        low, high = np.array(box.min_m), np.array(box.max_m)
+        width, height = (high - low)[[x, y]]
+        axes.add_patch(Rectangle((low[x], low[y]), width, height, fc=GRID, ec=MUTED, lw=0.6))
+        # A name is written into what it names, along or up, or not at all.
+        length = LETTER_IN * len(box.name) + 0.05
+        for angle, along, aside in ((0, width, height), (90, height, width)):
+            if along * scale > length and aside * scale > 0.13:
+                place = (float((low + high)[x] / 2), float((low + high)[y] / 2))
+                middle: dict[str, Any] = {"ha": "center", "va": "center", "clip_on": True}
+                axes.text(*place, box.name, rotation=angle, color=INK, **middle)
+                break
+
+
+def _name_tags(axes: Axes, spots: dict[int, Floats], scale: float, right: float) -> None:
+    """Write numbers beside tags; those that would cover each other are written together, at the first of them."""
+    groups: list[tuple[Floats, list[int]]] = []
+    for tag, spot in spots.items():
+        near = next((names for place, names in groups if np.abs(place - spot).max() * scale < 0.3), None)
+        if near is None:
+            groups.append((spot, [tag]))
+        else:
+            near.append(tag)
+    for spot, names in groups:
+        text = ", ".join(map(str, names)) if len(names) < 5 else f"{names[0]} … {names[-1]}"
+        # Beside the edge to the left, so that no name runs out of the picture.
+        left = (right - spot[0]) * scale < LETTER_IN * len(text) + 0.1
+        place, side = (float(spot[0]), float(spot[1])), "right" if left else "left"
+        axes.annotate(text, place, (-4 if left else 4, 4), textcoords="offset points", color=INK, ha=side)
+
+
+def timing(width_in: float, scenario: Scenario, name: str) -> Figure:
+    """Draw one exchange of the first pair with its real delays: who sends what when, each stamp, and all intervals.
+
+    Stamps have the names of ICRA 2023 (Fig. 2) beside them.
+    """
+    protocol, narrow = PROTOCOLS[name], width_in < NARROW_IN
+    stamped, pair = _one_exchange(scenario, protocol)
+    departures = [int(frame.departure[0]) for frame in stamped.frames]
+    times_us = [(one - departures[0]) / SUBTICKS_PER_SECOND * 1e6 for one in departures]
+    figure, (axes,) = sheet(width_in, height_in=2.3)
+    for level in (0, 1):
+        axes.axhline(level, color=MUTED, lw=0.8)
+    _draw_messages(axes, scenario, protocol, times_us, width_in)
+    _draw_spans(axes, protocol, stamped, times_us, width_in)
+    axes.set_yticks([0, 1], [f"target {pair[1]}", f"initiator {pair[0]}"], rotation=90 if narrow else 0, va="center")
+    axes.set_ylim(-0.8, 1.8)
+    axes.set_xlabel("time since the poll's marker (µs)" if narrow else "time since the poll's ranging marker (µs)")
+    axes.set_title(protocol.title, loc="left")
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    axes.autoscale_view(scaley=False)
+    return figure
+
+
+def _draw_messages(
+    axes: Axes, scenario: Scenario, protocol: RangingProtocol, times_us: list[float], width_in: float
+) -> None:
+    """Draw each message on the lane of who sends it (initiator 1, target 0), and its stamps on both lanes."""
+    before = before_marker_s(scenario.radio.preamble_symbols) * 1e6
+    whole = max(times_us) - min(times_us) + 2 * before
+    placed: dict[float, float] = {}
+    for k, (message, size, at_us) in enumerate(zip(protocol.messages, message_bytes(protocol), times_us, strict=True)):
+        y = 1.0 if message.sender == "initiator" else 0.0
+        axes.add_patch(Rectangle((at_us - before, y - 0.09), before, 0.18, fc=SERIES[k], alpha=0.35))
+        axes.add_patch(Rectangle((at_us, y - 0.09), after_marker_s(size) * 1e6, 0.18, fc=SERIES[k], alpha=0.9))
+        arrow: dict[str, Any] = {"arrowstyle": "->", "color": SERIES[k], "lw": 1.2}
+        axes.annotate("", (at_us, 1.0 - y), (at_us, y), arrowprops=arrow)
+        for level, text in ((y, f"tx{k + 1} (t{2 * k + 1})"), (1.0 - y, f"rx{k + 1} (t{2 * k + 2})")):
+            # Stamps that are closer than their names are written in the next line.
+            close = level in placed and (at_us - placed[level]) / whole * (width_in - 1.2) < 0.62
+            placed[level] = at_us
+            away = (22 if close else 9) * (1 if level else -1)
+            upright: dict[str, Any] = {"ha": "center", "va": "bottom" if level else "top"}
+            axes.annotate(text, (at_us, level), (0, away), textcoords="offset points", **upright)
+
+
+def _draw_spans(
+    axes: Axes, protocol: RangingProtocol, stamped: Stamped, times_us: list[float], width_in: float
+) -> None:
+    """Draw the intervals a time of flight is made of between the lanes, with name and length.
+
+    dt53 is the third leg as its sender has it, dt64 as its receiver.
+    """
+    spans = [("dt41", "tx1", "rx2", True), ("dt32", "rx1", "tx2", False)]
+    if len(protocol.messages) == 3:
+        sent_by_initiator = protocol.messages[2].sender == "initiator"
+        sender, receiver = ("rx2", "tx2") if sent_by_initiator else ("tx2", "rx2")
+        spans += [("dt53", sender, "tx3", sent_by_initiator), ("dt64", receiver, "rx3", not sent_by_initiator)]
+    for name, first, second, above in spans:
+        length_us = (int(stamped.stamps[second][0]) - int(stamped.stamps[first][0])) * TICK_S * 1e6
+        left, right = (times_us[int(end[-1]) - 1] for end in (first, second))
+        level = 0.62 if above else 0.38
+        axes.annotate("", (right, level), (left, level), arrowprops={"arrowstyle": "<->", "color": MUTED, "lw": 0.7})
+        text = f"{name} = {length_us:.1f} µs"
+        if (right - left) / (max(times_us) - min(times_us)) * (width_in - 1.2) < 1.2 * LETTER_IN * len(text):
+            text = name
+        place, away = ((left + right) / 2, level), (0, 1.5 if above else -1.5)
+        upright: dict[str, Any] = {"ha": "center", "va": "bottom" if above else "top", "color": INK}
+        axes.annotate(text, place, away, textcoords="offset points", **upright)
+
+
+def _one_exchange(scenario: Scenario, protocol: RangingProtocol) -> tuple[Stamped, tuple[int, int]]:
+    """Return an exchange of the first pair without noise, and the pair."""
+    first, second = scenario.pairs()[0]
+    place = {tag.id: k for k, tag in enumerate(scenario.tags)}
+    zeros = np.zeros((len(protocol.messages), 1))
+    reply = stream(scenario.run.seed, "timing diagram")
+    draws = Draws(zeros, zeros, draw_reply_s(scenario, reply, 1), np.zeros(1))
+    start = np.array([SUBTICKS_PER_SECOND // 100])
+    begun = Begun(start=start, initiator=np.array([place[first]]), target=np.array([place[second]]))
+    medium = Medium(scenario, World.of(scenario), Clocks.of(scenario))
+    return stamp(medium, protocol, begun, draws), (first, second)
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """Rows of a sweep as columns: `values` (rows,) by key, `protocol` (rows,), and one figure (rows,), NaN if none."""
+
+    values: dict[str, Sequence[Any]]
+    protocol: Sequence[str]
+    figure: Floats
+
+    def protocols(self) -> list[str]:
+        """Return the protocols, in the order of the rows."""
+        return list(dict.fromkeys(self.protocol))
+
+    def rows_of(self, protocol: str) -> Any:
+        """Return which rows are of a protocol and have the figure (rows,)."""
+        return np.array([name == protocol for name in self.protocol]) & np.isfinite(self.figure)
+
+    def numbers(self, key: str) -> Floats | None:
+        """Return the values of a key as numbers (rows,), or None where one is none."""
+        values = self.values[key]
+        if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+            return None
+        return np.array(values, dtype=np.float64)
+
+
+def figure_over_keys(width_in: float, swept: Swept, name: str) -> Figure:
+    """Draw a figure: as heat map over two keys of numbers that form a grid, else over each key, as medians in bands.
+
+    A band holds all seeds and all values of the other keys.
+    """
+    keys = list(swept.values)
+    grid = [numbers for key in keys if (numbers := swept.numbers(key)) is not None]
+    if len(keys) == len(grid) == 2:
+        sizes = [len(np.unique(numbers)) for numbers in grid]
+        # Unless all combinations are there, a map would be mostly holes.
+        if len(np.unique(np.column_stack(grid), axis=0)) == sizes[0] * sizes[1] and sizes[0] > 1:
+            return _heat_maps(width_in, swept, grid, name)
+    figure, panels = sheet(width_in, max(len(keys), 1), height_in=2.6)
+    for axes, key in zip(panels, keys, strict=False):
+        _lines(axes, swept, key)
+        label(axes, key.replace(".", ".\N{ZERO WIDTH SPACE}"), name)
+    legend(figure, panels[0])
+    return figure
+
+
+def _lines(axes: Axes, swept: Swept, key: str) -> None:
+    """Draw medians over a key, a line a protocol, in bands from the least to the largest."""
+    numbers, words = swept.numbers(key), [str(value) for value in swept.values[key]]
+    names, places = np.unique(words, return_inverse=True)
+    at = places.astype(np.float64) if numbers is None else numbers
+    for k, protocol in enumerate(swept.protocols()):
+        rows = swept.rows_of(protocol)
+        if not rows.any():
+            continue
+        x, group = _grouped(at[rows])
+        y = swept.figure[rows]
+        low, middle, high = np.array([np.quantile(y[group == g], (0, 0.5, 1)) for g in range(len(x))]).T
+        if np.any(high > low):
+            axes.fill_between(x, low, high, color=look(k).colour, alpha=0.18, lw=0)
+        mark(axes.plot(x, middle, label=protocol, **look(k).line())[0], protocol)
+    if numbers is None:
+        axes.set_xticks(np.arange(len(names)), list(names))
+    elif numbers.min() > 0 and numbers.max() > 30 * numbers.min():
+        axes.set_xscale("log")
+
+
+def _grouped(places: Floats, most: int = 12) -> tuple[Floats, Any]:
+    """Return where values (rows,) are drawn, and each one's group: single values if few, else groups of equal size."""
+    alone, group = np.unique(places, return_inverse=True)
+    if len(alone) <= most:
+        return alone, group
+    edges = np.quantile(places, np.linspace(0, 1, most + 1))
+    group = np.clip(np.searchsorted(edges, places, side="right") - 1, 0, most - 1)
+    kept, group = np.unique(group, return_inverse=True)
+    return np.array([np.median(places[group == g]) for g in range(len(kept))]), group
+
+
+def _heat_maps(width_in: float, swept: Swept, grid: list[Floats], name: str) -> Figure:
+    """Draw medians over seeds as colours over two keys, a panel a protocol, four at most."""
+    protocols = swept.protocols()[:4]
+    across = 1 if width_in < NARROW_IN else min(2, len(protocols))
+    figure, panels = sheet(width_in, len(protocols), height_in=2.6, across=across, sharex=True, sharey=True)
+    (x, column), (y, row) = (np.unique(numbers, return_inverse=True) for numbers in grid)
+    shown = np.full((len(protocols), len(y), len(x)), np.nan)
+    for k, protocol in enumerate(protocols):
+        rows = swept.rows_of(protocol)
+        for at in set(zip(row[rows].tolist(), column[rows].tolist(), strict=True)):
+            shown[k, at[0], at[1]] = np.median(swept.figure[rows & (row == at[0]) & (column == at[1])])
+    # "cividis" grows lighter evenly, and alike for all eyes.
+    colours: dict[str, Any] = {"cmap": "cividis", "vmin": np.nanmin(shown), "vmax": np.nanmax(shown)}
+    for axes, protocol, values in zip(panels, protocols, shown, strict=True):
+        image = axes.pcolormesh(np.arange(len(x) + 1), np.arange(len(y) + 1), values, **colours)
+        for axis, own in ((axes.xaxis, x), (axes.yaxis, y)):
+            kept = np.arange(len(own))[:: max(1, len(own) // 6)]
+            axis.set_ticks(kept + 0.5, labels=[f"{own[k]:g}" for k in kept])
+        axes.set_title(protocol, loc="left")
+    figure.colorbar(image, ax=panels, label=name)
+    first, second = swept.values
+    figure.supxlabel(first, fontsize="medium")
+    figure.supylabel(second, fontsize="medium")
+    return figure
+
+
+def marginals(width_in: float, found: Sequence[Compared]) -> Figure:
+    """Draw the distributions of both sides, one panel a quantity; the outermost bins hold what lies beyond them."""
+    figure, panels = sheet(width_in, len(found), height_in=1.7, across=1 if width_in < NARROW_IN else 3)
+    for axes, one in zip(panels, found, strict=True):
+        low, high = np.quantile(np.concatenate([one.measured, one.simulated]), [0.005, 0.995])
+        edges = np.linspace(low, high if high > low else low + 1, 41)
+        for values, colour, name in ((one.measured, BLUE, "measured"), (one.simulated, VERMILION, "simulated")):
+            share = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0] / len(values)
+            mark(axes.stairs(share, edges, color=colour, label=name, linewidth=1.2), name)
+        axes.set_title(one.name, loc="left")
+        axes.set_xlabel(one.unit)
+        axes.set_yticks([])
+    legend(figure, panels[0])
+    return figure
+
+
+def by_pair(width_in: float, found: Sequence[Compared], fewest: int = 5) -> Figure:
+    """Draw medians, 90 % quantiles and autocorrelations of pairs, simulated over measured, one row a quantity."""
+    figure, panels = sheet(width_in, 3 * len(found), across=1 if width_in < NARROW_IN else 3)
+    columns = (("median", "median"), ("high", "90 %"), ("lag1", "to the next"))
+    drawn = [(one, what, name) for one in found for what, name in columns]
+    for axes, (one, what, name) in zip(panels, drawn, strict=True):
+        pairs = [pair for pair in one.pairs.values() if pair["count"] >= fewest]
+        points = np.array([[pair[f"{what}_measured"], pair[f"{what}_simulated"]] for pair in pairs]).reshape(-1, 2)
+        points = points[np.isfinite(points).all(axis=1)]
+        if len(points):
+            ends = [float(points.min()), float(points.max())]
+            axes.plot(ends, ends, color=PALE, linewidth=1)
+            axes.plot(points[:, 0], points[:, 1], "o", color=BLUE, markersize=3.5, alpha=0.7)
+        else:
+            axes.text(0.5, 0.5, "too few exchanges a pair", ha="center", va="center", transform=axes.transAxes)
+        axes.set_title(f"{one.name}:\n{name}", loc="left")
+        axes.set_xlabel(f"measured ({'autocorrelation' if what == 'lag1' else one.unit})")
+        axes.set_ylabel("simulated")
+    return figure
