@@ -134,9 +134,9 @@ def room(width_in: float, scenario: Scenario) -> Figure:
     time = np.linspace(0, min(scenario.run.duration_s, 120.0), 1200)
     paths = {body.name: world.trajectories[body.name].position_m(time) for body in scenario.bodies}
     tags = {tag.id: world.trajectories[tag.body].point_m(np.zeros(1), tag.lever_arm_m)[0] for tag in scenario.tags}
-    boxes = [*scenario.obstacles, *([scenario.room] if scenario.room else [])]
-    corners = np.array([corner for box in boxes for corner in (box.min_m, box.max_m)]).reshape(-1, 3)
-    points = np.concatenate([*paths.values(), np.array(list(tags.values())), corners])
+    corners = [corner for box in scenario.obstacles for corner in (box.min_m, box.max_m)]
+    corners += [scenario.room.min_m, scenario.room.max_m] if scenario.room else []
+    points = np.concatenate([*paths.values(), np.array(list(tags.values())), np.array(corners).reshape(-1, 3)])
     # What is drawn is at least a metre large, with a margin.
     middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, np.maximum(np.ptp(points, axis=0) / 2, 0.5)
     half = half + (0.04 if scenario.room else 0.12) * float(half.max())

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.browser import lies_well
-from uwblink.pages.blocks import Document, Listing, Picture, Table, Text, to_html
+from uwblink.pages.blocks import Block, Document, Listing, Picture, Table, Text, to_html
 from uwblink.pages.colours import BLUE, DARK, INK, look
 from uwblink.pages.figures import WIDTHS, drawn, label, legend, mark, picture, sheet
 from uwblink.pages.html import VARIABLES, inline, table_html
@@ -78,14 +78,14 @@ def test_a_page_knows_what_each_panel_shows():
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_page_lies_well(width, tmp_path):
     header = ["pair", *(f"column {k}" for k in range(20))]
-    blocks = [
+    blocks: list[Block] = [
         Picture("two", two_panels, "A caption. " * 12),
         Table(header, [["1-2", *("12345.6" for _ in range(20))]] * 3),
         Table(["what", "is"], [["a question " * 9, "an answer " * 9], ["file", "0a" * 32]], words=True),
         Text(f"{'word ' * 60}. {'x' * 90}", "bad"),
         Listing("y" * 300),
     ]
-    lies_well(to_html(Document("A page", [*blocks])), width, tmp_path)
+    lies_well(to_html(Document("A page", blocks)), width, tmp_path)
 
 
 def test_a_picture_is_on_white():
