@@ -24,7 +24,7 @@ from typing import Final, NamedTuple, Self
 
 from uwblink.boards.listeners import Correction, Listener, Pair, PairState, Progress, Turn, check_pairs
 from uwblink.errors import PortError
-from uwblink.pages.stylesheet import CSS
+from uwblink.pages.html import CSS
 from uwblink.recording.schema import Fault
 from uwblink.wire.bulk import exchanges_of
 
