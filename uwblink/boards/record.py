@@ -97,9 +97,11 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     if not duration_s > 0:
         raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
     if known not in SHAPES or (known and not arrangement):
-        raise PlanError(f"known: found {known!r:.40}, allowed: line, plane, of an arrangement that has a name")
+        raise PlanError(
+            f"found {known!r:.40}, allowed: line, plane, of an `arrangement` that has a name", parameter="known"
+        )
     if order and known != "line":
-        raise PlanError("order: is that of boards on a line; say that they are known to be on one")
+        raise PlanError("is the order of boards that are `known` to be on a line", parameter="order")
     path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
     check_output(path, force=force, recording=True)
     found = identify(ports, using)

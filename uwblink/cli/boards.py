@@ -7,17 +7,16 @@ import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from uwblink.cli.guide import add, choice, starting
-from uwblink.cli.shared import INTERRUPTED, AsJson, interrupts, print_json
+from uwblink.cli.options import AsJson, Force, Plot, count
+from uwblink.cli.shared import INTERRUPTED, interrupts, print_json
 
 if TYPE_CHECKING:
     from uwblink.wire import RangeReport
-
-PANEL: Final = "Boards"
 
 
 def _plugged(incomplete: str) -> list[str]:
@@ -33,54 +32,54 @@ ProtocolName = Annotated[str, typer.Option(help="Single-sided or double-sided ra
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    for command, *examples in (
-        (ports, "uwblink ports --probe"),
-        (info, "uwblink info ports/tag10"),
-        (twr, "uwblink twr ports/tag10 20 -n 5", "uwblink twr ports/tag10 20 --protocol ss --json"),
-        (test, "uwblink test ports/tag10"),
-        (passive, "uwblink passive ports/tag20 on"),
-        (send, 'uwblink send ports/tag10 "hello"'),
-        (cir, "uwblink cir ports/tag10 20 --plot cir.png"),
+    for command, name, *examples in (
+        (ports, "ports", "uwblink ports --probe"),
+        (info, "info", "uwblink info ports/tag10"),
+        (twr, "twr", "uwblink twr ports/tag10 20 -n 5", "uwblink twr ports/tag10 20 --protocol ss --json"),
+        (test, "test", "uwblink test ports/tag10"),
+        (set_delay, "set-delay", "uwblink set-delay ports/tag20 3000"),
+        (passive, "passive", "uwblink passive ports/tag20 on"),
+        (send, "send", 'uwblink send ports/tag10 "hello"'),
+        (cir, "cir", "uwblink cir ports/tag10 20 --plot cir.png"),
     ):
-        add(app, command, *examples, panel=PANEL)
-    add(app, set_delay, "uwblink set-delay ports/tag20 3000", panel=PANEL, name="set-delay")
+        add(app, command, *examples, panel="Boards", name=name)
 
 
 def ports(
     names: Annotated[
         list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to probe.", autocompletion=_plugged)
     ] = None,
-    probe: Annotated[bool, typer.Option("--probe", help="Ask the named ports, or all listed, for their id.")] = False,
+    probe: Annotated[bool, typer.Option("--probe", help="Ask each board for its id.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List the serial devices with the boards' USB identity (0483:5740); nothing is written to any, unless probed."""
+    """List the serial devices with the USB identity of the boards (0483:5740).
+
+    Nothing is written to a port without --probe.
+    """
     from uwblink import Board
     from uwblink.boards import boards_ports
     from uwblink.errors import UwblinkError
 
-    found = boards_ports()
-    rows = [asdict(port) for port in found]
-    if names:
-        known = {port.device: asdict(port) for port in found}
-        rows = [known.get(n, {"device": n, "description": "", "serial_number": None}) for n in names]
-    if probe:
-        for row in rows:
-            try:
-                with Board.open(str(row["device"])) as board:
-                    row["board"] = board.id
-            except UwblinkError as error:
-                row["error"] = str(error)
+    known: dict[str, dict[str, Any]] = {port.device: asdict(port) for port in boards_ports()}
+    unknown = {"description": "", "serial_number": None}
+    rows = [known.get(name, {"device": name, **unknown}) for name in names or known]
+    for row in rows if probe else ():
+        try:
+            with Board.open(str(row["device"])) as board:
+                row["board"] = board.id
+        except UwblinkError as error:
+            row["error"] = str(error)
     if as_json:
         print_json(rows)
         return
     if not rows:
         typer.echo(
             "no serial device with the boards' USB identity (0483:5740) is plugged in; "
-            "boards at other devices are named as they are, and `uwbsim serve` makes simulated ones"
+            "name other ports on the command line, or make simulated ones with `uwbsim serve`"
         )
     for row in rows:
-        said = f"board {row['board']}" if "board" in row else row.get("error", row["description"])
-        typer.echo(f"{row['device']}  {said}")
+        found = f"board {row['board']}" if "board" in row else row.get("error", row["description"])
+        typer.echo(f"{row['device']}  {found}")
 
 
 def info(port: Port, as_json: AsJson = False) -> None:
@@ -100,10 +99,9 @@ def info(port: Port, as_json: AsJson = False) -> None:
     if as_json:
         print_json(facts)
         return
-    number = facts["usb_serial_number"] or "none"
     typer.echo(
         f"{port}: board {facts['board']}, frames of up to {facts['longest_frame_bytes']} bytes, "
-        f"USB serial number {number}"
+        f"USB serial number {facts['usb_serial_number'] or 'none'}"
     )
 
 
@@ -111,10 +109,10 @@ def twr(
     port: Port,
     target: Target,
     protocol: ProtocolName = "ds",
-    count: Annotated[int, typer.Option("-n", min=1, help="How many exchanges.")] = 1,
+    exchanges: Annotated[int, count("Number of exchanges.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Range with another board; a line each as it comes, and a summary at the end, also of what Ctrl-C cut short."""
+    """Range with another board; a line for each range, and a summary at the end, also after Ctrl-C."""
     from uwblink import Board
     from uwblink.errors import RangingFailedError
 
@@ -122,7 +120,7 @@ def twr(
     failures: list[RangingFailedError] = []
     with interrupts() as stop, Board.open(port) as board:
         initiator = board.id
-        while len(ranges) + len(failures) < count and not stop():
+        while len(ranges) + len(failures) < exchanges and not stop():
             try:
                 report = board.range(target, protocol=protocol)
             except RangingFailedError as error:
@@ -136,27 +134,27 @@ def twr(
         interrupted = stop()
     if failures and not ranges and not interrupted:
         raise failures[-1]
-    if as_json or count > 1:
-        _print_now(_summary_of(ranges, len(failures), count, as_json=as_json))
+    if as_json or exchanges > 1:
+        _print_now(_summary_of(ranges, len(failures), exchanges, as_json=as_json))
     if interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
 def _print_now(line: str) -> None:
-    """Print a line so that whoever reads it through a pipe has it at once."""
+    """Print a line so that a program that reads it through a pipe has it at once."""
     typer.echo(line)
     sys.stdout.flush()
 
 
-def _summary_of(ranges: list[float], failed: int, count: int, *, as_json: bool) -> str:
+def _summary_of(ranges: list[float], failed: int, asked: int, *, as_json: bool) -> str:
     import statistics
 
     mean = statistics.fmean(ranges) if ranges else None
     spread = statistics.stdev(ranges) if len(ranges) > 1 else None
     if as_json:
-        figures = {"exchanges": len(ranges), "failed": failed, "asked": count, "mean_m": mean, "std_m": spread}
+        figures = {"exchanges": len(ranges), "failed": failed, "asked": asked, "mean_m": mean, "std_m": spread}
         return json.dumps({"summary": figures})
-    text = f"{len(ranges)} of {count} exchanges"
+    text = f"{len(ranges)} of {asked} exchanges"
     if mean is not None:
         text += f", mean {mean:.4f}" + (f" ± {spread:.4f}" if spread is not None else "") + " m"
     return text
@@ -197,7 +195,7 @@ def set_delay(
 def passive(
     port: Port, state: Annotated[str, typer.Argument(help="Whether to listen.", **choice("on", "off"))]
 ) -> None:
-    """Have a board listen to the exchanges of others, or stop to."""
+    """Have a board listen to the exchanges of others, or stop listening."""
     from uwblink import Board
     from uwblink.errors import RefusedError
 
@@ -222,8 +220,8 @@ def cir(
     port: Port,
     target: Target,
     protocol: ProtocolName = "ds",
-    plot: Annotated[Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the picture if it exists.")] = False,
+    plot: Plot = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Range with another board and print the channel impulse response."""
@@ -241,7 +239,7 @@ def cir(
     if plot:
         from uwblink.boards import plot_cir
 
-        plot_cir(response, plot, force=force)
+        plot_cir(response, Path(plot), force=force)
     index = response.first_path_milli / 1000
     if as_json:
         typer.echo(json.dumps({"first_path_index": index, "magnitudes": list(response.magnitudes), **_fields(report)}))

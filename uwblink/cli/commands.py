@@ -1,10 +1,305 @@
-"""All sub-commands of `uwblink`."""
+"""All sub-commands of `uwblink`; those on recordings are here: show, import, export, poses, replay."""
 
 from __future__ import annotations
 
-from uwblink.cli import boards, files, recording, streaming
-from uwblink.cli.shared import new_app
+from collections.abc import Callable
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from uwblink.cli import boards, recording
+from uwblink.cli.guide import add, apart, choice, epilog, plain
+from uwblink.cli.options import AsJson, Command, Force, Group, LinkDir, PlaybackSpeed, output
+from uwblink.cli.shared import new_app, print_json
+from uwblink.cli.waiting import waiting
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from uwblink.importers import Importer
+    from uwblink.recording import Summary
+
+
+def _importers() -> Any:
+    from uwblink.importers import IMPORTERS
+
+    return IMPORTERS
+
+
+def _exporters() -> list[str]:
+    from uwblink.exporters import EXPORTERS
+
+    return list(EXPORTERS)
+
+
+class ImportGroup(Group):
+    """A group whose commands are the importers, those of other distributions included, each made when asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the importers."""
+        return [*_importers(), "guess"]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of one importer, None where there is none of the name."""
+        text = "Look at a table and write the map that it would be imported with."
+        if cmd_name == "guess":
+            run, example = guess, "uwblink import guess ranges.csv -o map.toml"
+        elif cmd_name in _importers():
+            row: Importer = _importers()[cmd_name]
+            source = f"measured{row.suffixes[0]}" if row.suffixes else "folder"
+            run, text, example = _importing(row), row.help, f"uwblink import {row.name} {source} -o measured.uwb"
+        else:
+            return None
+        app = typer.Typer(add_completion=False)
+        app.command(cmd_name, cls=Command, help=plain(text), epilog=epilog(example))(apart(run))
+        return typer.main.get_command(app)
+
+
+imports = typer.Typer(
+    cls=ImportGroup,
+    help="Turn other files into recordings.",
+    epilog=epilog(
+        "uwblink import guess ranges.csv -o map.toml",
+        "uwblink import csv ranges.csv --map map.toml -o ranges.uwb",
+        "uwblink import csv folder_of_tables -o all.uwb",
+        "uwblink import miluv cirObstacles_3_random_0 -o flight.uwb",
+    ),
+    no_args_is_help=True,
+)
+
+
+@imports.callback()
+def _imports() -> None:
+    """Hold one command for each importer; a group of typer must have something of its own."""
+
+
+def guess(
+    table: Annotated[Path, typer.Argument(help="Table (.csv, .csv.gz, .parquet, .jsonl).")],
+    output: Annotated[Path | None, output("Map to write (.toml); else printed.")] = None,
+    force: Force = False,
+) -> None:
+    """Look at a table and write the map that it would be imported with, and why."""
+    from uwblink.importers.guess import guess_map
+    from uwblink.output import check_output, write_text
+
+    if output is not None:
+        check_output(output, force=force)
+    with waiting("reading"):
+        found = guess_map(table)
+    if output is None:
+        typer.echo(found.text, nl=False)
+        return
+    write_text(output, found.text, force=force)
+    then = f"uwblink import csv {quote(str(table))} --map {quote(str(output))} -o {quote(table.name.split('.')[0])}.uwb"
+    asked = f"say {' and '.join(found.asked)} in it" if found.asked else "look at it"
+    typer.echo(f"{output}: {asked if found.complete else 'fill in what is missing'}, then {then}")
+
+
+def _importing(row: Importer) -> Callable[..., None]:
+    """Return the command of an importer: its parameters depend on the row, and typer reads their annotations."""
+
+    def run(table: Any, output: Path, map_file: Path | None = None, force: bool = False) -> None:
+        from uwblink.display import printable
+        from uwblink.importers import import_file
+
+        with waiting("importing") as say:
+            done = import_file(
+                table,
+                output,
+                importer=row.name,
+                map_file=map_file,
+                force=force,
+                watch=lambda what, share: say(f"{what}, {share:.0%}" if share else what),
+            )
+        typer.echo(f"{output}: {', '.join(f'{count} {table}' for table, count in done.counts.items())}")
+        for note in done.notes:
+            typer.echo(f"  {printable(note)}")
+
+    def without_map(table: Any, output: Path, force: bool = False) -> None:
+        run(table, output, force=force)
+
+    what = f"File to import ({' or '.join(row.suffixes)})." if row.suffixes else "Folder to import."
+    several = typer.Argument(help=f"{what} Several are one table.")
+    one = typer.Argument(help=what)
+    command = run if row.map_help else without_map
+    command.__annotations__ |= {
+        "table": Annotated[Path, one] if row.read_all is None else Annotated[list[Path], several],
+        "output": Annotated[Path, output("Recording to write (.uwb).")],
+        "force": Force,
+    }
+    if row.map_help:
+        command.__annotations__["map_file"] = Annotated[Path | None, typer.Option("--map", help=row.map_help)]
+    return command
+
+
+def show(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    as_json: AsJson = False,
+) -> None:
+    """Print what a recording holds."""
+    from uwblink import Recording
+
+    with waiting("counting"), Recording.open(recording) as opened:
+        summary = opened.show()
+    if as_json:
+        print_json(summary.to_dict())
+        return
+    from rich.console import Console
+
+    print_summary(summary, Console(highlight=False))
+
+
+def print_summary(summary: Summary, console: Console) -> None:
+    """Print what a recording holds; text from a file or a board is escaped, since it may be anyone's."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from uwblink.display import printable
+    from uwblink.recording import counted
+
+    def row(*values: Any) -> list[str]:
+        return [escape(printable("" if value is None else value)) for value in values]
+
+    console.print(escape(summary.headline()))
+    tags = Table("tag", "body", "lever arm (m)")
+    for tag in summary.tags:
+        tags.add_row(*row(tag.tag, tag.body, " ".join(f"{v:+.3f}" for v in tag.lever_arm_m)))
+    pairs = Table("initiator", "target", "exchanges", "rate (Hz)", "success")
+    for pair in summary.pairs:
+        rate = "" if pair.rate_hz is None else f"{pair.rate_hz:.1f}"
+        tried = pair.exchanges + pair.failed
+        success = f"{100 * pair.exchanges / tried:.1f} %" if tried else ""
+        pairs.add_row(*row(pair.initiator, pair.target, pair.exchanges, rate, success))
+    skews = Table("pair", "by stamps (ppm)", "by carriers", "slope", "residual", "sign")
+    for one in summary.skews:
+        values = ((one.carrier_ppm, "+.2f"), (one.slope, ".3f"), (one.residual_ppm, ".2f"))
+        told = ["" if value is None else f"{value:{form}}" for value, form in values]
+        sign = {True: "same", False: "OTHER", None: ""}[one.same_sign]
+        skews.add_row(*row(one.pair, f"{one.stamps_ppm:+.2f}", *told, sign))
+    for table in (tags, pairs, *([skews] if summary.skews else [])):
+        console.print(table)
+    if summary.reported_twice:
+        console.print(f"{summary.reported_twice} reported by both ends, {summary.contradictory} of them differently")
+    console.print(f"poses: {escape(counted(summary.poses))}")
+    console.print(f"faults: {escape(counted(summary.faults))}")
+    for key, value in summary.provenance.items():
+        console.print("  {}: {}".format(*row(key, value)))
+
+
+def export(
+    recording: Annotated[Path, typer.Argument(help="Recording (.uwb).")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="Format to write: tables, trajectories, or messages for Foxglove and ROS 2.",
+            **choice("csv", "parquet", "tum", "mcap", "rosbag2", more=_exporters),
+        ),
+    ],
+    output: Annotated[Path, output("Folder to write.")],
+    force: Force = False,
+) -> None:
+    """Write a recording in a format that other programs read."""
+    from uwblink.exporters import export_recording
+
+    with waiting("exporting"):
+        written = export_recording(recording, output, to=to, force=force)
+    for name, rows in written.items():
+        typer.echo(f"{output / name}: {rows} rows")
+
+
+def poses(
+    recording: Annotated[Path, typer.Argument(help="Recording to add poses to (.uwb).")],
+    source: Annotated[
+        list[str], typer.Option("--from", help="Poses (.csv, .tum or a ROS bag), or BODY=FILE. May be repeated.")
+    ],
+    offset: Annotated[str, typer.Option(help="Seconds to add to the times of the poses, or auto.")] = "0",
+    tags: Annotated[Path | None, typer.Option(help="File with the tags and anchors to use (.toml).")] = None,
+    body: Annotated[str | None, typer.Option(help="Body of a TUM or EuRoC file.")] = None,
+    topic: Annotated[
+        list[str] | None, typer.Option(help="BODY=TOPIC of a bag; else found by name. May be repeated.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Add motion-capture truth to a recording of boards; --force replaces the poses that it has."""
+    from uwblink.importers import add_poses
+
+    sources: Any = Path(source[0])
+    if len(source) > 1 or ("=" in source[0] and not sources.exists()):
+        sources = {name: Path(file) for name, file in _by_body("from", "FILE", source).items()}
+    topics = _by_body("topic", "TOPIC", topic) if topic else None
+    with waiting("adding poses"):
+        found = add_poses(recording, sources, offset=offset, tags_from=tags, body=body, topics=topics, force=force)
+    typer.echo(
+        f"{recording}: {found.poses} poses of {', '.join(found.bodies)}, offset {found.offset_s:+.4f} s; "
+        f"{found.covered} of {found.exchanges} exchanges have a true distance"
+    )
+
+
+def _by_body(option: str, what: str, words: list[str]) -> dict[str, str]:
+    """Return what stands behind each body; raises `ImportTableError` for words that are not BODY=SOMETHING."""
+    from uwblink.errors import ImportTableError
+
+    found: dict[str, str] = {}
+    for word in words:
+        body, _, rest = word.partition("=")
+        if not body or not rest or body in found:
+            raise ImportTableError(f"--{option}: found {word!r}, expected BODY={what}, each body once")
+        found[body] = rest
+    return found
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(help="Recording of boards (.uwb).")],
+    output: Annotated[Path | None, output("Recording to write, decoded again (.uwb).")] = None,
+    speed: PlaybackSpeed = 1.0,
+    serve: Annotated[bool, typer.Option("--serve", help="Play back on pseudo-terminals.")] = False,
+    link_dir: LinkDir = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Decode the stored bytes again, or play them back as boards would have sent them."""
+    from uwblink import Recording
+    from uwblink.boards import decode_again, play, rewrite, summarize
+    from uwblink.output import check_output
+
+    def announce(names: dict[str, str]) -> None:
+        for was, now in names.items():
+            typer.echo(f"{was} plays at {now}")
+
+    if output:
+        check_output(output, force=force, recording=True)
+    with Recording.open(recording) as opened:
+        if serve:
+            count = play(opened, announce, speed=speed, link_dir=link_dir)
+            typer.echo(f"{count} pieces played")
+            return
+        with waiting("decoding"):
+            decoded = decode_again(opened)
+            summary = summarize(opened, decoded)
+            if output:
+                rewrite(opened, decoded, output, force=force)
+    if as_json:
+        print_json(summary)
+        return
+    typer.echo(f"{summary['messages']} messages, {summary['skipped_bytes']} bytes skipped")
+    for table in ("exchanges", "overheard", "cirs"):
+        typer.echo(f"  {table}: {summary[table]['decoded']} decoded now, {summary[table]['stored']} stored then")
+
 
 app = new_app("Talk to ranging boards, record and stream them, and look at, import and replay recordings.")
-for room in (boards, recording, streaming, files):
-    room.add_to(app)
+boards.add_to(app)
+recording.add_to(app)
+add(app, show, "uwblink show flight.uwb", panel="Recordings")
+app.add_typer(imports, name="import", rich_help_panel="Recordings")
+for _command, *_examples in (
+    (export, "uwblink export flight.uwb --to csv -o tables"),
+    (
+        poses,
+        "uwblink poses bench.uwb --from poses.csv --tags bench.toml",
+        "uwblink poses bench.uwb --from drone=drone.tum --offset auto",
+    ),
+    (replay, "uwblink replay bench.uwb -o again.uwb", "uwblink replay bench.uwb --serve --link-dir ports"),
+):
+    add(app, _command, *_examples, panel="Recordings")

@@ -1,80 +1,92 @@
-"""The command that records."""
+"""The commands that play a ranging plan on boards: `record` into a file, `stream` to whoever listens."""
 
 from __future__ import annotations
 
+import math
+import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from uwblink.cli.guide import add, choice
-from uwblink.cli.shared import Force, interrupts
+from uwblink.cli.options import (
+    AntennaDelays,
+    Duration,
+    Force,
+    OptionalCalibration,
+    PlanFile,
+    PlaybackSpeed,
+    Rate,
+    output,
+)
+from uwblink.cli.shared import interrupts
 
 if TYPE_CHECKING:
-    from uwblink import RangingPlan
-    from uwblink.boards import LivePage, Progress
+    from rich.table import Table
 
-AntennaDelays = Annotated[
-    Path | None,
-    typer.Option(help="What was programmed into the boards, as calib export wrote it (.toml); else 16436 into all."),
-]
-PANEL: Final = "Recording and streaming"
-LIVE: Final = "Live page"
-LINE_EVERY_S = 2.0
+    from uwblink import RangingPlan, StreamedRange
+    from uwblink.boards import Correction, LivePage, Progress
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the command."""
-    add(
-        app,
-        record,
-        "uwblink record ports/tag10 ports/tag20 -o bench.uwb --pairs all",
-        "uwblink record ports/* -o flight.uwb --plan plan.toml --live",
-        panel=PANEL,
-    )
+    """Register the commands."""
+    for command, *examples in (
+        (
+            record,
+            "uwblink record ports/tag10 ports/tag20 -o bench.uwb --pairs all",
+            "uwblink record ports/* -o flight.uwb --plan plan.toml --live",
+        ),
+        (
+            stream,
+            "uwblink stream ports/tag10 ports/tag20 -c calibration.json",
+            "uwblink stream flight.uwb -c calibration.json --udp 127.0.0.1:9870",
+        ),
+    ):
+        add(app, command, *examples, panel="Recording and streaming")
 
 
 def record(
     ports: Annotated[list[str], typer.Argument(metavar="PORT...", help="Serial ports or pyserial URLs.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb).")],
-    plan: Annotated[Path | None, typer.Option(help="Who ranges with whom (.toml).")] = None,
+    output: Annotated[Path, output("Recording to write (.uwb).")],
+    plan: PlanFile = None,
     pairs: Annotated[
-        str | None, typer.Option(help="Every two boards, or none: only listen.", **choice("all", "none"))
+        str | None, typer.Option(help="Range every two boards, or none: only listen.", **choice("all", "none"))
     ] = None,
-    rate: Annotated[float | None, typer.Option(min=0.001, help="Exchanges a second in total (Hz).")] = None,
-    duration: Annotated[float | None, typer.Option(min=0.001, help="Seconds; without it, until Ctrl-C.")] = None,
+    rate: Rate = None,
+    duration: Duration = None,
     arrangement: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Boards stand still: name how, for calib survey.")
+        str | None,
+        typer.Option(metavar="NAME", help="Name of the arrangement of boards that stand still, for calib survey."),
     ] = None,
     known: Annotated[
-        str, typer.Option(help="How boards of an arrangement are known to stand.", **choice("line", "plane"))
+        str,
+        typer.Option(
+            help="What is known of the arrangement: all boards on a line or on a plane.", **choice("line", "plane")
+        ),
     ] = "",
     order: Annotated[
-        str, typer.Option(metavar="TAG,TAG...", help="In which order they lie along a line, from either end.")
+        str, typer.Option(metavar="TAG,TAG...", help="Order of the boards along the line, from either end.")
     ] = "",
     antenna_delays: AntennaDelays = None,
     passive: Annotated[bool, typer.Option("--passive", help="Record what boards overhear, too.")] = False,
     cir: Annotated[bool, typer.Option("--cir", help="Record channel impulse responses, too.")] = False,
     live: Annotated[
-        bool, typer.Option("--live", rich_help_panel=LIVE, help="Serve a page about it to this computer's browser.")
+        bool, typer.Option("--live", help="Serve a page that shows the recording to this computer's browser.")
     ] = False,
-    live_port: Annotated[
-        int, typer.Option(min=0, max=65535, rich_help_panel=LIVE, help="Port of the page; 0: a free one.")
-    ] = 0,
-    calibration: Annotated[
-        Path | None, typer.Option(rich_help_panel=LIVE, help="Show ranges corrected, too (.json).")
-    ] = None,
+    live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of that page; 0: a free one.")] = 0,
+    calibration: OptionalCalibration = None,
     force: Force = False,
 ) -> None:
-    """Play a ranging plan on boards and record everything they say."""
-    from dataclasses import replace
+    """Play a ranging plan on boards and record everything they send.
 
-    from uwblink import RangingPlan
-    from uwblink import record as run
-    from uwblink.boards import load_plan
+    Ends after --duration, else with Ctrl-C. The page of --live shows ranges that --calibration corrects, too.
+    """
+    import uwblink
     from uwblink.errors import PlanError
     from uwblink.output import check_output
 
@@ -83,18 +95,11 @@ def record(
         raise PlanError("give either --plan plan.toml or --pairs all")
     if pairs not in (None, "all", "none"):
         raise PlanError(f"--pairs: found {pairs!r}, expected all or none; a plan file can name pairs")
-    chosen = load_plan(plan) if plan else RangingPlan("all" if pairs == "all" else ())
-    chosen = with_antenna_delays(chosen, antenna_delays)
-    if rate:
-        chosen = replace(chosen, rate_hz=rate)
-    if cir:
-        chosen = replace(chosen, get_cir=True)
-    if known and not arrangement:
-        raise PlanError("--known: is said of an arrangement; give --arrangement NAME, too")
-    if order and known != "line":
-        raise PlanError("--order: is that of boards on a line; give --known line, too")
     if calibration and not live:
         raise PlanError("--calibration: corrected ranges are shown on the page of --live; give that, too")
+    chosen = _plan(plan, rate, antenna_delays, pairs="all" if pairs == "all" else ())
+    if cir:
+        chosen = replace(chosen, get_cir=True)
     with interrupts() as stop, _watcher() as watch, _page(output, calibration, live_port, live, chosen) as page:
 
         def watch_all(progress: Progress) -> None:
@@ -102,11 +107,11 @@ def record(
             if page:
                 page.watch(progress)
 
-        progress = run(
+        progress = uwblink.record(
             ports,
             output,
             chosen,
-            duration_s=duration or float("inf"),
+            duration_s=duration or math.inf,
             passive=passive,
             arrangement=arrangement,
             known=known,
@@ -119,20 +124,124 @@ def record(
     typer.echo(f"{output}: {_summary(progress)}")
 
 
-def with_antenna_delays(plan: RangingPlan, path: Path | None) -> RangingPlan:
-    """Return a plan with the antenna delays of a file; raises `PlanError` where it has some of its own."""
-    from dataclasses import replace
+def stream(
+    source: Annotated[list[str], typer.Argument(metavar="SOURCE...", help="Ports of boards, or one recording (.uwb).")],
+    calibration: OptionalCalibration = None,
+    plan: PlanFile = None,
+    rate: Rate = None,
+    antenna_delays: AntennaDelays = None,
+    duration: Duration = None,
+    speed: PlaybackSpeed = 1.0,
+    udp: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Address for JSON datagrams (PlotJuggler: 9870).")
+    ] = None,
+    foxglove: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Address of a WebSocket for Foxglove (its default: 8765)."),
+    ] = None,
+    output: Annotated[Path | None, output("Recording of the boards to write as well (.uwb).")] = None,
+    force: Force = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print no ranges.")] = False,
+) -> None:
+    """Print ranges as they come, one line of JSON each, and send them on.
 
+    Every two boards range, without --plan. Ends after --duration, else with the recording or Ctrl-C.
+    """
+    import uwblink
+    from uwblink.boards import Progress
+    from uwblink.errors import PlanError
+    from uwblink.streaming import FoxgloveServer, RangeListener, UdpSender
+
+    of_boards = not (len(source) == 1 and source[0].endswith(".uwb"))
+    if not of_boards and (plan or rate or output or antenna_delays):
+        raise PlanError(
+            f"{source[0]}: it is streamed as it is; --plan, --rate, --antenna-delays and --output are for boards"
+        )
+    seen, count = Progress(), 0
+    senders: list[Callable[[StreamedRange], object]] = [] if quiet else [_print]
+
+    def send_on(found: StreamedRange) -> None:
+        nonlocal count
+        count += 1
+        for send in senders:
+            send(found)
+
+    with ExitStack() as stack:
+        stop = stack.enter_context(interrupts())
+        if udp is not None:
+            senders.append(stack.enter_context(UdpSender(udp)).send)
+        if foxglove is not None:
+            server = stack.enter_context(FoxgloveServer(foxglove))
+            typer.echo(f"foxglove: {server.url}", err=True)
+            senders.append(server.send)
+        chosen = _plan(plan, rate, antenna_delays) if of_boards else None
+        correct = _correction(calibration, chosen, None if of_boards else source[0])
+        duration_s = duration or math.inf
+        try:
+            if output and chosen:
+                told = [seen, RangeListener(send_on, correct)]
+                uwblink.record(source, output, chosen, duration_s=duration_s, stop=stop, listeners=told, force=force)
+            else:
+                ranges = uwblink.stream(
+                    source if of_boards else source[0],
+                    calibration=correct,
+                    plan=chosen,
+                    duration_s=duration_s,
+                    speed=speed,
+                    stop=stop,
+                    listeners=[seen],
+                )
+                stack.callback(ranges.close)
+                for found in ranges:
+                    send_on(found)
+        except BrokenPipeError:
+            # The reader of the lines went away, which ends the stream; Python must not write what is left at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    faults = ", ".join(f"{kind} {number}" for kind, number in sorted(seen.faults.items()))
+    typer.echo(f"{count} ranges" + (f"; faults: {faults}" if faults else ""), err=True)
+
+
+def _print(found: StreamedRange) -> None:
+    sys.stdout.write(found.to_json() + "\n")
+    sys.stdout.flush()
+
+
+def _plan(
+    path: Path | None, rate: float | None, antenna_delays: Path | None, pairs: str | tuple[()] = "all"
+) -> RangingPlan:
+    """Return a plan of a file, or of `pairs`; raises `PlanError` where it has antenna delays of its own."""
+    from uwblink import RangingPlan
+    from uwblink.boards import load_plan
     from uwblink.errors import PlanError
     from uwblink.recording import load_antenna_delays
 
-    if path is None:
-        return plan
-    if plan.antenna_delays:
+    chosen = load_plan(path) if path else RangingPlan("all" if pairs == "all" else ())
+    if antenna_delays and chosen.antenna_delays:
         raise PlanError(
-            f"{path}: the plan has [antenna_delays], too; leave one of them out", parameter="antenna_delays"
+            f"{antenna_delays}: the plan has [antenna_delays], too; leave one of them out", parameter="antenna_delays"
         )
-    return replace(plan, antenna_delays=load_antenna_delays(path))
+    if antenna_delays:
+        chosen = replace(chosen, antenna_delays=load_antenna_delays(antenna_delays))
+    return replace(chosen, rate_hz=rate) if rate else chosen
+
+
+def _correction(path: Path | None, plan: RangingPlan | None, recording: str | None = None) -> Correction | None:
+    """Return the correction of a calibration, and warn where it is of other antenna delays than the ranges."""
+    from uwblink import Recording
+    from uwblink.boards import delays_warning, load_correction
+    from uwblink.recording import delays_in_meta
+
+    if path is None:
+        return None
+    correct = load_correction(path)
+    if plan is not None:
+        warning = delays_warning(correct, plan.delays())
+    else:
+        with Recording.open(recording or "") as opened:
+            warning = delays_warning(correct, delays_in_meta(opened.meta()), [t.tag for t in opened.tags()])
+    if warning:
+        typer.echo(f"warning: {path}: {warning}", err=True)
+    return correct
 
 
 def _ids(text: str) -> tuple[int, ...]:
@@ -145,19 +254,14 @@ def _ids(text: str) -> tuple[int, ...]:
 
 
 @contextmanager
-def _page(
-    output: Path, calibration: Path | None, port: int, live: bool, plan: RangingPlan
-) -> Iterator[LivePage | None]:
+def _page(path: Path, calibration: Path | None, port: int, live: bool, plan: RangingPlan) -> Iterator[LivePage | None]:
     """Serve the live page, if it was asked for."""
     if not live:
         yield None
         return
-    from uwblink.boards import LivePage, delays_warning, load_correction
+    from uwblink.boards import LivePage
 
-    correct = load_correction(calibration) if calibration else None
-    if warning := delays_warning(correct, plan.delays()):
-        typer.echo(f"warning: {calibration}: {warning}", err=True)
-    with LivePage(output, correct=correct, port=port) as page:
+    with LivePage(path, correct=_correction(calibration, plan), port=port) as page:
         typer.echo(f"live page: {page.url}", err=True)
         yield page
 
@@ -165,32 +269,26 @@ def _page(
 @contextmanager
 def _watcher() -> Iterator[Callable[[Progress], None]]:
     """Show a live table on a terminal, and a line every two seconds elsewhere."""
-    if not sys.stderr.isatty():
-        yield _Lines().watch
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.live import Live
+
+        with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
+            yield lambda progress: live.update(_progress_table(progress), refresh=True)
         return
-    from rich.console import Console
-    from rich.live import Live
+    next_s, fault = 2.0, ""
 
-    from uwblink.cli.tables import progress_table
-
-    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
-        yield lambda progress: live.update(progress_table(progress), refresh=True)
-
-
-class _Lines:
-    """Plain lines of progress."""
-
-    def __init__(self) -> None:
-        self._next_s = LINE_EVERY_S
-        self._fault = ""
-
-    def watch(self, progress: Progress) -> None:
-        if progress.last_fault != self._fault:
-            self._fault = progress.last_fault
-            typer.echo(f"{progress.time_s:7.1f} s  {_printable(self._fault)}", err=True)
-        if progress.time_s >= self._next_s:
-            self._next_s = progress.time_s + LINE_EVERY_S
+    def watch(progress: Progress) -> None:
+        nonlocal next_s, fault
+        if progress.last_fault != fault:
+            fault = progress.last_fault
+            plain = "".join(c if c.isprintable() else "?" for c in fault)
+            typer.echo(f"{progress.time_s:7.1f} s  {plain}", err=True)
+        if progress.time_s >= next_s:
+            next_s = progress.time_s + 2.0
             typer.echo(f"{progress.time_s:7.1f} s  {_summary(progress)}", err=True)
+
+    yield watch
 
 
 def _summary(progress: Progress) -> str:
@@ -203,5 +301,25 @@ def _summary(progress: Progress) -> str:
     return text + f"; faults: {faults or 'none'}"
 
 
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)
+def _progress_table(progress: Progress) -> Table:
+    """Return a recorder's progress as a table: rate and success of each pair, last range and power, faults."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from uwblink.display import printable
+    from uwblink.recording import counted
+
+    table = Table(title=f"{progress.time_s:.1f} s, {progress.exchanges} of {progress.tried} exchanges")
+    for name in ("pair", "rate (Hz)", "success", "range (m)", "FPP (dBm)"):
+        table.add_column(name, justify="right")
+    for (initiator, target), pair in progress.pairs.items():
+        table.add_row(
+            f"{initiator} -> {target}",
+            f"{pair.rate_hz(progress.time_s):.1f}",
+            f"{100 * pair.good / pair.tried:.0f} %" if pair.tried else "",
+            f"{pair.range_m:.3f}" if pair.good else "",
+            f"{pair.fpp_dbm:.1f}" if pair.good else "",
+        )
+    last = f"\n{escape(printable(progress.last_fault))}" if progress.last_fault else ""
+    table.caption = f"faults: {escape(counted(progress.faults))}{last}"
+    return table

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from tests.uwblink.recording.test_file import random_exchanges
-from uwblink.cli.tables import print_summary
+from uwblink.cli.commands import print_summary
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Tag
 from uwblink.recording.summary import failures_by_pair
