@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from calib.planning.result import Plan
     from calib.report.campaign import run_campaign
     from calib.report.sections import register_report_section, write_report
+    from calib.settings import FitSettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
     from calib.surveys.samples import sample_arrangements
@@ -46,6 +47,7 @@ __all__ = [
     "Calibration",
     "CorrectedRanges",
     "FitResult",
+    "FitSettings",
     "FlightPlan",
     "Knowledge",
     "KnownPosition",
@@ -83,6 +85,7 @@ _HOMES: Final = {
     "Calibration": "calib.calibration.model",
     "CorrectedRanges": "calib.calibration.parts",
     "FitResult": "calib.estimation.result",
+    "FitSettings": "calib.settings",
     "FlightPlan": "calib.planning.flight_result",
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",

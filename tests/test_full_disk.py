@@ -72,8 +72,8 @@ COMMANDS = (
     ("calib fit {f.uwb} -o out.json", 1_000),
     ("calib add-tag {f.uwb} -c {five.json} --tag 6 -o out.json", 1_000),
     ("calib survey {string.uwb} --known line -o out.json", 100),
-    ("calib plan 4 --on line -o out.html", 1_000),
-    ("calib plan 4 --on line --figures out", 1_000),
+    ("calib plan survey 4 --on line -o out.html", 1_000),
+    ("calib plan survey 4 --on line --figures out", 1_000),
     ("calib import miluv {miluv.json} -o out.json", 100),
     ("calib sample -o out.uwb -n 100", 20_000),
     ("calib apply {f.uwb} -c {c.json} -o out.uwb", 50_000),
@@ -101,7 +101,6 @@ SAME = {
     "calib survey --report": "calib report --output",
     "calib survey --plot": "uwblink cir --plot",
     # These are written as calibrations are, by `uwblink.output.write_text`.
-    "calib survey --anchors": "calib survey --output",
     # The same function imports whatever form a source has.
     "uwblink import miluv --output": "uwblink import csv --output",
 }

@@ -28,7 +28,10 @@ def setting(
     `min`, `max`, `rich_help_panel`.
     """
     typed = {"flag": flag, "kind": kind, "parse": parse, "names": names, "more": more, "tags": tags, "shown": shown}
-    return field(default=default, metadata={"help": help, **typed})
+    metadata = {"help": help, **typed}
+    if isinstance(default, dict):
+        return field(default_factory=default.copy, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 def flags_of(settings: Any) -> Mapping[str, str]:

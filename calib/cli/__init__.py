@@ -17,10 +17,10 @@ def _run() -> NoReturn:
     import sys
 
     from calib.cli.commands import app
-    from calib.cli.flags import FLAGS
-    from calib.cli.reporting import spread
+    from calib.cli.judging import spread_tests
+    from calib.cli.shared import FLAGS
     from calib.errors import CalibError, UnanswerableError
     from uwblink.cli import shared
 
-    words = spread(sys.argv[1:])
+    words = spread_tests(sys.argv[1:])
     shared.run(app, CalibError, statuses={UnanswerableError: 1}, arguments=words, flags=FLAGS)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from calib.cli import evaluating, files, fitting, planning, reporting, sampling, showing, surveying
+from calib.cli import calibrating, files, judging, planning
 from uwblink.cli.shared import new_app
 
-app = new_app("Fit antenna delays and power curves to ultra-wideband ranges, apply them, and say how good they are.")
-for room in (fitting, planning, surveying, showing, sampling, evaluating, reporting, files):
+app = new_app("Fit antenna delays and power curves to ultra-wideband ranges, apply them, and judge them.")
+for room in (calibrating, planning, judging, files):
     room.add_to(app)

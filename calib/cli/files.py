@@ -1,4 +1,4 @@
-"""Commands that turn files into others: apply, export, import."""
+"""Commands that convert files: apply, export, import."""
 
 from __future__ import annotations
 
@@ -7,16 +7,10 @@ from typing import Annotated, Final
 
 import typer
 
-from calib.cli.arguments import CalibrationFile, Force
-from calib.cli.loading import known_calibration
+from calib.cli.shared import known_calibration, warn
 from uwblink.cli.guide import add, choice, epilog
-from uwblink.cli.options import Group
+from uwblink.cli.options import CalibrationFile, Force, Group, output
 from uwblink.cli.waiting import waiting
-
-PANEL: Final = "Use"
-
-WITHOUT_ERRORS: Final = ("miluv", "ros-yaml", "c-header")
-"""Forms that hold delays and not how well they are known."""
 
 MILUV: Final = "calib import miluv uwb_calib.json -o calibration.json"
 
@@ -36,26 +30,29 @@ def _exporters() -> list[str]:
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
-    add(app, apply, "calib apply flight.uwb -c calibration.json -o corrected.uwb", panel=PANEL)
+    panel = "Use"
+    add(app, apply, "calib apply flight.uwb -c calibration.json -o corrected.uwb", panel=panel)
     add(
         app,
         export,
         "calib export calibration.json --to registers",
         "calib export calibration.json --to c-header -o calibration.h",
-        panel=PANEL,
+        panel=panel,
+        renamed={"--base": "--antenna-delays"},
     )
-    app.add_typer(imports, name="import", rich_help_panel=PANEL)
+    app.add_typer(imports, name="import", rich_help_panel=panel)
     add(imports, import_miluv, MILUV, name="miluv")
 
 
 def apply(
     recording: Annotated[Path, typer.Argument(help="Recording to correct (.uwb).")],
     calibration: CalibrationFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Recording to write (.uwb); a folder with --to.")],
+    output: Annotated[Path, output("Recording to write (.uwb); with --to a folder.")],
     to: Annotated[
         str | None,
         typer.Option(
-            help="A folder in this form instead.", **choice("csv", "parquet", "mcap", "rosbag2", more=_exporters)
+            help="Format to write, in a folder, instead of a recording.",
+            **choice("csv", "parquet", "mcap", "rosbag2", more=_exporters),
         ),
     ] = None,
     force: Force = False,
@@ -67,27 +64,25 @@ def apply(
         applied = calib.apply(recording, known_calibration(calibration, [recording]), output, to=to, force=force)
     typer.echo(f"{output}: {applied.count} ranges corrected, {applied.clamped} beyond the fitted power")
     if applied.unpowered:
-        typer.echo(
-            f"warning: {applied.unpowered} without power: corrected by delays alone, and without sigma", err=True
-        )
+        warn(f"{applied.unpowered} without power: corrected by delays alone, and without sigma")
 
 
 def export(
-    calibration: Annotated[Path, typer.Argument(help="Calibration to turn (.json).")],
+    calibration: Annotated[Path, typer.Argument(help="Calibration to export (.json).")],
     to: Annotated[
         str,
         typer.Option(
-            help="registers: antenna delays of the DW1000; firmware: those, and constants of its build; csv: delays "
-            "in ns; c-header: a function for a robot's code.",
+            help="Format to write. registers: antenna delays of the DW1000; firmware: those, and constants of its "
+            "build; csv: delays in ns; c-header: a function for a robot's code.",
             **choice("registers", "firmware", "json", "csv", "miluv", "ros-yaml", "c-header"),
         ),
     ],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; else it is printed.")] = None,
-    base: Annotated[
+    output: Annotated[Path | None, output("File to write; by default it is printed.")] = None,
+    antenna_delays: Annotated[
         Path | None,
         typer.Option(
-            help="What was programmed when a calibration was fitted that does not say it: a recording or antenna "
-            "delays (.toml)."
+            help="Antenna delays programmed into the boards when the calibration was fitted, where it does not say: "
+            "a recording (.uwb) or antenna delays (.toml)."
         ),
     ] = None,
     force: Force = False,
@@ -96,13 +91,12 @@ def export(
     import calib
     from calib.calibration import free_delays, programmed
 
-    registers = programmed(base) if base else None
+    registers = programmed(antenna_delays) if antenna_delays else None
     known = known_calibration(calibration)
     text = calib.export(known, to, output, base=registers, force=force)
     free = free_delays(known)
-    if free and to in WITHOUT_ERRORS:
-        tags = ", ".join(map(str, free))
-        typer.echo(f"warning: {to} does not say that the data leave the delay of tag {tags} free", err=True)
+    if free and to in ("miluv", "ros-yaml", "c-header"):  # which hold delays without their standard errors
+        warn(f"{to} does not say that the data leave the delay of tag {', '.join(map(str, free))} free")
     if output is None:
         typer.echo(text, nl=False)
     else:
@@ -111,7 +105,7 @@ def export(
 
 def import_miluv(
     source: Annotated[Path, typer.Argument(help="MILUV's published calibration (.json).")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration to write (.json).")],
+    output: Annotated[Path, output("Calibration to write (.json).")],
     force: Force = False,
 ) -> None:
     """Turn the calibration published with the MILUV dataset into one that apply and evaluate take."""

@@ -5,16 +5,13 @@ from typing import TYPE_CHECKING, Final
 from uwblink.lazy import offer
 
 if TYPE_CHECKING:
-    from calib.estimation.arguments import FitSettings
     from calib.estimation.losses import known_losses
 
 __all__ = [
-    "FitSettings",
     "known_losses",
 ]
 
 _HOMES: Final = {
-    "FitSettings": "calib.estimation.arguments",
     "known_losses": "calib.estimation.losses",
 }
 

@@ -8,8 +8,7 @@ returned (`calib.estimation.doubts`, `plausibility`).
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Final
 
@@ -18,16 +17,14 @@ from threadpoolctl import threadpool_limits
 
 import uwblink
 from calib.calibration.model import Calibration
-from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
 from calib.data.ranges import COLUMNS, Ranges
 from calib.data.sources import Data, load_ranges
-from calib.estimation.arguments import check_fit
 from calib.estimation.building import build_problem
 from calib.estimation.doubts import doubts
 from calib.estimation.known_delays import imported, std_taken_over, taken_over
 from calib.estimation.limits import limits
-from calib.estimation.losses import MIXTURE
+from calib.estimation.losses import MIXTURE, check_loss
 from calib.estimation.pairs import pairs_of
 from calib.estimation.plausibility import implausible, one_way, refuse_impossible, refuse_refuted
 from calib.estimation.power_levels import unlike_powers
@@ -38,6 +35,7 @@ from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
 from calib.long_columns import computed, empty, let_go, put, spans, std_of
+from calib.settings import FitSettings
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -49,40 +47,14 @@ FEWEST_A_PAIR: Final = 15
 """Of fewer ranges a pair on average the likelihood's intervals are too narrow, and its delays no better."""
 
 
-def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its default
-    data: Data | Iterable[Data],
-    *,
-    loss: str | None = None,
-    scale_ns: float | None = None,
-    lift: str = "mean-of-lifted",
-    alpha_dbm: float = ALPHA_DBM,
-    fixed_ns: Mapping[int, float] | None = None,
-    groups: Mapping[str, tuple[int, ...]] | None = None,
-    sequential: bool = False,
-    minimum_norm: bool = False,
-    reference_power_dbm: float | None = None,
-    delays_only: bool = False,
-    delays_from: Calibration | str | os.PathLike[str] | None = None,
-    constants: str = "tag",
-) -> FitResult:
+def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **changes: Any) -> FitResult:
     """Fit antenna delays and the curves of bias and standard deviation to ranges with known truth.
 
-    `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `loss` is
-    "mixture" (the default), the likelihood of core, reflections and outliers with a share of reflections by pair, or a
-    robust loss of residuals: "cauchy" (the default of a sequential fit, and of recordings with so few ranges a pair
-    that they do not tell what a pair's errors are made of), "huber", "soft_l1", "l2", one that `register_loss` added.
+    `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `settings`
+    and keyword arguments named like its fields (`FitSettings`, which explains them) say what is fitted and how.
 
-    `scale_ns` is the scale of the robust loss in time of flight, estimated from the data by default; `fixed_ns` are
-    delays that are known; `groups` name tags that share a curve (by default all do). `sequential` is the recipe of ICRA
-    2023, sections III and IV: delays first, then the curve on what they leave. `reference_power_dbm` is the power at
-    which the curve is zero, `alpha_dbm` by default (a sequential fit keeps the recipe's own constant, unless one is
-    given). `minimum_norm` fits even where the pairs leave delays free, with the smallest ones that agree with the data.
-
-    Not everything can be had from all data, and `warnings` begin with what a fit of the chosen kind cannot know:
-    `delays_only` looks for no curve and needs no power; `delays_from` is a calibration, or its path, whose delays are
-    taken over as they are (with those of all tags, or all `fixed_ns`, only the curve is fitted, and keeps the
-    constant); `constants` "pair" gives each pair a constant of its own instead of each tag a delay. Where power never
-    changes the curve is flat.
+    `warnings` begin with what a fit of the chosen kind cannot know: without a curve (`delays_only`), with taken delays
+    (`delays_from`), with constants by pair (`constants`). Where power never changes the curve is flat.
 
     Raises `UnanswerableError` when there are too few ranges, when the pairs do not determine the delays, or when what
     was found is beyond what any radio has (true distances in millimetres, say), and `BadInputError` for pinned tags or
@@ -94,26 +66,15 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
     >>> f"{delays[2] - delays[1]:.2f} ns, planted 0.40 ns"
     '0.41 ns, planted 0.40 ns'
     """
-    source = imported(delays_from)
-    fixed, groups = dict(fixed_ns or {}), dict(groups or {})
-    check_fit(
-        loss=loss or (SEQUENTIAL_LOSS if sequential else MIXTURE),
-        scale_ns=scale_ns,
-        lift=lift,
-        alpha_dbm=alpha_dbm,
-        fixed_ns=fixed,
-        groups=groups,
-        sequential=sequential,
-        reference_power_dbm=reference_power_dbm,
-        constants=constants,
-    )
-    pinned = {int(tag): float(delay) for tag, delay in fixed.items()}
-    groups = {name: tuple(map(int, tags)) for name, tags in groups.items()}
+    settings = replace(settings or FitSettings(), **changes)
+    pinned, groups, sequential = dict(settings.fixed_ns), dict(settings.groups), settings.sequential
+    lift, alpha_dbm, delays_only = settings.lift, settings.alpha_dbm, settings.delays_only
+    check_loss(settings.loss)
+    source = imported(settings.delays_from)
     ranges = load_ranges(data, need_power=not delays_only)
     fixed = taken_over(source, ranges, curve=not delays_only) | pinned
     refuse_impossible(ranges)
-    chosen = loss
-    loss = loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)
+    loss = settings.loss or (SEQUENTIAL_LOSS if sequential or _too_few(ranges) else MIXTURE)
     # Before the columns of a fit are there: sorting millions of ranges takes memory too.
     skewed = list(one_way(ranges))
     let_go(*(getattr(ranges, name) for name in COLUMNS))
@@ -125,16 +86,16 @@ def fit(  # noqa: PLR0913 - keyword-only settings of one fit, each with its defa
             alpha_dbm=alpha_dbm,
             fixed=fixed,
             groups=groups,
-            minimum_norm=minimum_norm,
+            minimum_norm=settings.minimum_norm,
             sequential=sequential,
-            unknowns=Unknowns(curve=not delays_only, constants=constants),
+            unknowns=Unknowns(curve=not delays_only, constants=settings.constants),
         ).without_readings()
-        reference = _reference(reference_power_dbm, alpha_dbm, sequential=sequential)
-        found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)
+        reference = _reference(settings.reference_power_dbm, alpha_dbm, sequential=sequential)
+        found = _solved(problem, loss, settings.scale_ns, reference, alpha_dbm, sequential=sequential)
         if found.astray:
-            if chosen is None:
+            if settings.loss is None:
                 loss = SEQUENTIAL_LOSS
-                found = _solved(problem, loss, scale_ns, reference, alpha_dbm, sequential=sequential)
+                found = _solved(problem, loss, settings.scale_ns, reference, alpha_dbm, sequential=sequential)
             else:
                 found = replace(found, success=False)
         problem.let_go()

@@ -123,3 +123,9 @@ _OWN: Final = (
 
 LOSSES: Final[Registry[RobustLoss]] = Registry("loss", "uwbcal.losses", _OWN, check_robust_loss)
 """Losses by name: the project's, those of `register_loss`, and those of installed distributions."""
+
+
+def check_loss(name: str | None) -> None:
+    """Raise `BadInputError` for the name of a loss that nobody knows."""
+    if name not in (None, MIXTURE) and name not in LOSSES:
+        raise BadInputError(f"found {name!r}, allowed: {', '.join(known_losses())}", parameter="loss")

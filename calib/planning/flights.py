@@ -13,12 +13,12 @@ from threadpoolctl import threadpool_limits
 
 from calib.data.sources import Data
 from calib.errors import BadInputError
-from calib.estimation.arguments import check_choice
 from calib.planning.flight_result import FlightPlan
 from calib.planning.flying import flying
 from calib.planning.foresight import Errors, Flight, Foreseen, best_tape, flight_of, foresee
 from calib.planning.rehearsal import Flown, rehearse
 from calib.planning.result import NextBest
+from calib.settings import check_choice
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.fitting import ANCHORS, usable_of
 from calib.trajectories.given import Usable

@@ -6,9 +6,9 @@ import json
 import os
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Unpack
+from typing import Any, Final
 
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges, concatenate
@@ -16,7 +16,6 @@ from calib.data.sources import Data, each, held_open, load_each, opened
 from calib.doctor.base import Finding
 from calib.doctor.examine import examine
 from calib.errors import UnanswerableError
-from calib.estimation.arguments import FitSettings
 from calib.estimation.fitting import fit
 from calib.estimation.losses import MIXTURE
 from calib.estimation.passive_listeners import heard_delays
@@ -26,6 +25,7 @@ from calib.evaluation.localization import localize
 from calib.evaluation.tracking import Localization
 from calib.report.results import Results, check_places, origin_of
 from calib.report.sections import TITLE, document
+from calib.settings import FitSettings
 from uwblink.pages.blocks import write_document
 
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
@@ -94,37 +94,39 @@ def run_campaign(
     trim_static: bool = False,
     progress: Progress = lambda _: None,
     command: str = "",
-    **settings: Unpack[FitSettings],
+    settings: FitSettings | None = None,
+    **changes: Any,
 ) -> Campaign:
     """Fit to the training recordings, judge and localize on the tests, and return all that a report tells of.
 
-    Recordings are what `load_ranges` takes, `settings` what `fit` takes. Without tests the training is judged, and the
-    report says so. `Ranges` alone are fitted and judged, but neither examined nor localized: that takes a recording.
-    `trim_static` leaves out of the training where nothing moves; `progress` is told what is being done; `command` is
-    what the report says it was made by. Raises what `load_ranges` and `fit` raise.
+    Recordings are what `load_ranges` takes, `settings` and keyword arguments what `fit` takes. Without tests the
+    training is judged, and the report says so. `Ranges` alone are fitted and judged, but neither examined nor
+    localized: that takes a recording. `trim_static` leaves out of the training where nothing moves; `progress` is
+    called with what is being done; `command` is the command line that the report states. Raises what `load_ranges` and
+    `fit` raise.
 
     >>> import calib
     >>> campaign = calib.run_campaign(calib.sample_flight(), calib.sample_flight(300, seed=2), loss="huber")
     >>> campaign.evaluation.overall.full.n
     300
     """
+    settings = replace(settings or FitSettings(), **changes)
     given = each(training), each(tests) if tests else []
     progress("loading")
     with ExitStack() as stack:
         recordings, judged = ([stack.enter_context(held_open(one)) for one in some] for some in given)
-        need_power = not settings.get("delays_only", False)
+        need_power = not settings.delays_only
         fitted = load_each(recordings, trim_static=trim_static, need_power=need_power)
         testing = load_each(judged, need_power=need_power) if judged else []
         progress("fitting")
         ranges = concatenate(fitted)
-        found = fit(ranges, **settings)
+        found = fit(ranges, settings)
         known = found.calibration
         refits: dict[float, Calibration] = {}
         # The mixture and least squares have no scale.
         for factor in SCALES if known.loss not in (MIXTURE, "l2") else ():
-            changed = settings.copy()
-            changed["scale_ns"] = factor * known.scale_ns
-            refits[factor * known.scale_ns] = fit(ranges, **changed).calibration
+            scale_ns = factor * known.scale_ns
+            refits[scale_ns] = fit(ranges, replace(settings, scale_ns=scale_ns)).calibration
         progress("examining")
         findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
         progress("localizing")

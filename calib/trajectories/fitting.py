@@ -18,10 +18,8 @@ from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.arguments import check_choice, check_fit
 from calib.estimation.building import build_problem
 from calib.estimation.limits import limits
-from calib.estimation.losses import MIXTURE
 from calib.estimation.plausibility import implausible, one_way, refuse_refuted
 from calib.estimation.power_levels import unlike_powers
 from calib.estimation.problem import Problem
@@ -29,6 +27,7 @@ from calib.estimation.result import FitResult
 from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
 from calib.estimation.warnings import warnings_of
+from calib.settings import FitSettings, check_choice
 from calib.trajectories.beginning import beginning
 from calib.trajectories.climbing import Climbed, climb
 from calib.trajectories.given import Usable, scene_from
@@ -94,16 +93,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     if known is not None:
         lift, alpha_dbm = known.lift, known.alpha_dbm
         reference_power_dbm = known.provenance.get("reference_power_dbm", alpha_dbm)
-    check_fit(
-        loss=MIXTURE,
-        scale_ns=None,
-        lift=lift,
-        alpha_dbm=alpha_dbm,
-        fixed_ns=fixed,
-        groups=groups,
-        sequential=False,
-        reference_power_dbm=reference_power_dbm,
-    )
+    FitSettings(lift=lift, alpha_dbm=alpha_dbm, fixed_ns=fixed, groups=groups, reference_power_dbm=reference_power_dbm)
     asked = Asked(
         usable=usable_of(poses_until_s, attitudes, heading_std_deg, anchors, tuple(distances), heights),
         lift=lift,

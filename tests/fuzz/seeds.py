@@ -85,9 +85,9 @@ RECORDING_PAGES: Final = (
 )
 
 ALONE: Final = (
-    "calib plan 4 --on plane --taped 2 --tape-sigma 0.01 --size 3,4",
-    "calib plan 1,2,3,4,5 --on space --anchors 1,2,3,4 --anchor-sigma 0.01 --pair-error 0.02 --rate 50 --json",
-    "calib plan 3 --on line --arrangements 3 --size 5",
+    "calib plan survey 4 --on plane --taped 2 --tape-sigma 0.01 --size 3,4",
+    "calib plan survey 1,2,3,4 --on space --anchor-tags 1,2,3 --anchor-sigma 0.01 --pair-error 0.02 --rate 50 --json",
+    "calib plan survey 3 --on line --arrangements 3 --size 5",
     "calib sample -o {out} -n 50 --seed 2",
     "calib sample -o {out} -n 50 --with-anchors",
     "uwbsim scenarios icra2023 -o {out}",

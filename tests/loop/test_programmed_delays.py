@@ -109,7 +109,7 @@ def test_what_was_programmed_comes_out_again(loop):
         assert again[tag] == pytest.approx(once[tag], abs=1)
     delays = json.loads((loop / "second.json").read_text())["delays_ns"]
     assert max(map(abs, delays.values())) < 1.5 * TICK_S * 1e9
-    by_base = run("calib", "export", loop / "second.json", "--to", "firmware", "--base", loop / "second.uwb")
+    by_base = run("calib", "export", loop / "second.json", "--to", "firmware", "--antenna-delays", loop / "second.uwb")
     assert by_base.stdout == (loop / "second.toml").read_text()
 
 
@@ -197,8 +197,8 @@ def test_a_calibration_of_other_delays_is_told_wherever_it_is_used(loop, tmp_pat
         )
     done = processes.run("calib", "localize", second, "-c", first)
     assert "tag 1: 16436/16436 then" in done.stderr
-    done = run("calib", "export", first, "--to", "registers", "--base", second, status=2)
-    assert "--base" in done.stderr
+    done = run("calib", "export", first, "--to", "registers", "--antenna-delays", second, status=2)
+    assert "--antenna-delays" in done.stderr
     with pytest.raises(BadInputError, match=r"second\.uwb: tag 1"):
         calib.load_ranges([loop / "first.uwb", second])
 
@@ -208,7 +208,7 @@ def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path)
     known = calib.fit(replace(calib.load_ranges(flight), antenna_delays={})).calibration
     known.save(tmp_path / "c.json")
     done = run("calib", "export", tmp_path / "c.json", "--to", "registers", status=2)
-    assert "--base" in done.stderr
+    assert "--antenna-delays" in done.stderr
     (tmp_path / "d.toml").write_text("[antenna_delays]\ntx = 100\nrx = 200\nreply = 300\n")
     run(
         "calib",
@@ -216,7 +216,7 @@ def test_where_nothing_says_what_was_programmed_no_register_is_guessed(tmp_path)
         tmp_path / "c.json",
         "--to",
         "firmware",
-        "--base",
+        "--antenna-delays",
         tmp_path / "d.toml",
         "-o",
         tmp_path / "o.toml",

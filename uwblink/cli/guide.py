@@ -12,11 +12,13 @@ from typing import Annotated, Any, Final, get_type_hints
 import typer
 
 from uwblink.cli.options import Command
+from uwblink.errors import OfParameter
+from uwblink.settings import flags_of
 
 COMMA: Final = ","
 """What separates names in one word."""
 
-WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot", "anchors")
+WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot")
 """Parameters of commands that name what is written; all other paths are read."""
 
 WIDEST: Final = 20
@@ -33,7 +35,8 @@ def add(
 ) -> None:
     """Register a command in a panel of the list of commands, with examples below its own help.
 
-    A parameter that is a dataclass of settings (`uwblink.settings`) becomes one option a field. `renamed` maps old
+    A parameter that is a dataclass of settings (`uwblink.settings`) becomes one option per field, and errors name its
+    fields by their options. `renamed` maps old
     names of options to what the command answers: "--old is now --new".
     """
     kind = type("RenamedCommand", (Command,), {"renamed": renamed}) if renamed else Command
@@ -56,12 +59,25 @@ def with_settings(command: Callable[..., None]) -> Callable[..., None]:
             if field.metadata:
                 parameters.append(_parameter(field, types[field.name]))
 
+    flags = {name: flag for kind in settings.values() for name, flag in flags_of(kind).items()}
+
     @wraps(command)
     def run(**given: Any) -> None:
-        for name, kind in settings.items():
-            values = {field: given.pop(field.name) for field in fields(kind) if field.metadata}
-            given[name] = kind(**{field.name: _parsed(field, value) for field, value in values.items()})
-        command(**given)
+        try:
+            for name, kind in settings.items():
+                values = {}
+                for field in fields(kind):
+                    value = given.pop(field.name) if field.metadata else None
+                    if value not in (None, [], ()):
+                        values[field.name] = _parsed(field, value)
+                given[name] = kind(**values)
+            command(**given)
+        except OfParameter as error:
+            text = str(error)
+            for name, flag in flags.items():
+                text = text.replace(f"`{name}`", flag)
+            error.args = (text,)
+            raise
 
     run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
@@ -84,10 +100,14 @@ def _parameter(field: Field[Any], kind: Any) -> Parameter:
 
 
 def _parsed(field: Field[Any], value: Any) -> Any:
+    """Return the value of a field from what was typed; an error of parsing names the field."""
     parse = field.metadata["parse"]
-    if parse is None:
-        return value
-    return field.default if value in (None, [], ()) else parse(value)
+    try:
+        return parse(value) if parse else value
+    except OfParameter as error:
+        if error.parameter is None:
+            error.args = (f"`{field.name}`: {error}",)
+        raise
 
 
 def apart(command: Callable[..., None]) -> Callable[..., None]:

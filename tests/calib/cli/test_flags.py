@@ -1,4 +1,4 @@
-"""The command line speaks of flags where the library speaks of parameters."""
+"""The command line names options where the library names parameters, and makes the fit's options of its settings."""
 
 import re
 from pathlib import Path
@@ -7,42 +7,28 @@ from typing import Any
 import pytest
 import typer
 
+import calib
+from calib.calibration.power_curves import ALPHA_DBM
+from calib.calibration.power_curves import LIFTS as KNOWN_LIFTS
 from calib.cli.commands import app
-from calib.cli.flags import with_flags
-from calib.estimation.arguments import FitSettings
+from calib.cli.shared import with_flags
+from calib.settings import LIFTS, FitSettings
+from docs.site.commands import leaves
 
 ROOT = Path(__file__).parents[3]
 COMMANDS: Any = typer.main.get_command(app)
-OPTIONS = {
-    option for command in COMMANDS.commands.values() for parameter in command.params for option in parameter.opts
-}
-# A reference power of the lifting is not an option: the calibrations of all commands share the published one.
+OPTIONS = {o for _, command in leaves(COMMANDS, ("calib",)) for parameter in command.params for o in parameter.opts}
+# Not options: the power of the lifting, which all calibrations share, and what only functions take.
 ONLY_FROM_PYTHON = {
-    "alpha_dbm",
-    "data",
-    "truth_m",
-    "range_m",
-    "target",
-    "weights",
-    "protocol",
-    "name",
-    "before",
-    "section",
-    "shares",
-    "start_m",
-    "information",
-    "loosest",
-    "boards",
-    "robots",
+    *("alpha_dbm", "data", "truth_m", "range_m", "target", "weights", "protocol", "name", "before", "section"),
+    *("shares", "start_m", "information", "loosest", "boards", "robots"),
+    # Named by the command itself, as its own option.
+    *("seconds", "speed_m_s", "apart_m", "still_s", "noise_m", "size_m", "rate_hz", "tape_sigma_m", "anchor_sigma_m"),
+    "anchor_places",
 }
 
 
-@pytest.mark.parametrize("parameter", sorted(set(FitSettings.__annotations__) - ONLY_FROM_PYTHON))
-def test_every_setting_of_a_fit_has_its_flag(parameter):
-    assert with_flags(f"`{parameter}`") in OPTIONS
-
-
-def test_every_parameter_that_an_error_names_has_its_flag():
+def test_every_parameter_that_an_error_names_has_its_option():
     named = set()
     for path in (ROOT / "calib").rglob("*.py"):
         named |= set(re.findall(r'(?:parameter=|check_choice\()"([a-z_0-9]+)"', path.read_text()))
@@ -50,17 +36,9 @@ def test_every_parameter_that_an_error_names_has_its_flag():
     assert {with_flags(f"`{name}`") for name in named - ONLY_FROM_PYTHON} <= OPTIONS
 
 
-def test_every_parameter_that_a_warning_names_has_its_flag():
-    said = ["surveys/saying", "estimation/warnings", "estimation/limits", "estimation/confounding"]
-    texts = [(ROOT / "calib" / f"{name}.py").read_text() for name in said]
-    named = {name for text in texts for name in re.findall(r'^ +f?"[^"\n]*`([a-z_0-9]+)`', text, re.MULTILINE)}
-    assert {"known", "delays_only"} <= named
-    assert {with_flags(f"`{name}`") for name in named} <= OPTIONS
-
-
-def test_the_library_does_not_speak_of_flags():
+def test_the_library_names_no_options():
     for path in (ROOT / "calib").rglob("*.py"):
-        if "cli" in path.parts:
+        if "cli" in path.parts or path.parts[-2:] in (("planning", "commands.py"), ("calib", "settings.py")):
             continue
         texts = re.findall(r'"[^"\n]*?(?<![-\w])--[a-z][-a-z]+[^"\n]*"', path.read_text())
         # Docstrings and remedies may name a whole command.
@@ -71,3 +49,37 @@ def test_other_text_stays_as_it_is():
     assert (
         with_flags("a `Path` and -0.5, `minimum_norm` and `fixed_ns`") == "a `Path` and -0.5, --minimum-norm and --fix"
     )
+
+
+def test_settings_know_what_the_curves_know():
+    assert set(LIFTS) == set(KNOWN_LIFTS)
+    assert FitSettings().alpha_dbm == ALPHA_DBM
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("lift", "up"),
+        ("constants", "board"),
+        ("scale_ns", 0.0),
+        ("alpha_dbm", float("nan")),
+        ("reference_power_dbm", float("inf")),
+        ("fixed_ns", {-1: 0.1}),
+        ("fixed_ns", {1: float("nan")}),
+        ("groups", {"a": ()}),
+        ("groups", {"a": "12"}),
+        ("groups", {"a": (1,), "b": (1,)}),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named(name, value):
+    with pytest.raises(calib.BadInputError) as caught:
+        FitSettings(**{name: value})
+    assert caught.value.parameter == name
+
+
+def test_settings_and_keywords_make_the_same_fit():
+    flight = calib.sample_flight()
+    by_name = calib.fit(flight, loss="huber", fixed_ns={1: -0.3}).calibration
+    assert calib.fit(flight, FitSettings(loss="huber"), fixed_ns={1: -0.3}).calibration == by_name
+    with pytest.raises(TypeError, match="los"):
+        calib.fit(flight, los="huber")

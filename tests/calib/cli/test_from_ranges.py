@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from calib.cli.from_ranges import taped
+from calib.settings import read_distances
 from tests import processes
 from tests.calib.trajectories.sines import flight
 from uwblink import KnownDistance
@@ -45,7 +45,7 @@ def test_a_known_start_is_enough(recording, tmp_path):
     ],
 )
 def test_a_distance_is_read_as_one_types_it(text, found):
-    assert taped(text) == found
+    assert read_distances([text]) == (found,)
 
 
 @pytest.mark.parametrize(

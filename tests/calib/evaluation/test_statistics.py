@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from calib.cli.table import print_table
+from calib.cli.judging import print_table
 from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate, pair_rows, statistics
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges

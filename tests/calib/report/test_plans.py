@@ -12,7 +12,9 @@ from uwblink.pages.figures import picture
 
 
 def written(folder, *words):
-    done = CliRunner().invoke(app, ["plan", *words, "-o", str(folder / "plan.html"), "--figures", str(folder / "f")])
+    done = CliRunner().invoke(
+        app, ["plan", "survey", *words, "-o", str(folder / "plan.html"), "--figures", str(folder / "f")]
+    )
     assert done.exit_code == 0, done.output
     return (folder / "plan.html").read_text(encoding="utf-8"), {path.name for path in (folder / "f").iterdir()}
 
@@ -46,8 +48,8 @@ def test_boards_in_space_are_seen_from_the_side_as_well():
 
 def test_a_flight_has_its_path_its_intervals_and_what_brings_more(tmp_path):
     page = tmp_path / "plan.html"
-    words = ["plan", "2", "--on", "flight", "--seconds", "8", "--rate", "40", "--anchors", "11,12,13,14"]
-    done = CliRunner().invoke(app, [*words, "--anchor-places", "sought", "--poses-until", "4", "-o", str(page)])
+    words = ["plan", "flight", "2", "--duration", "8", "--rate", "40", "--anchor-tags", "11,12,13,14"]
+    done = CliRunner().invoke(app, [*words, "--anchors", "sought", "--poses-until", "4", "-o", str(page)])
     assert done.exit_code == 0, done.output
     text = page.read_text(encoding="utf-8")
     assert {"anchor12", "stays open", "+ the places of the anchors, measured"} <= set(words_of(text))
@@ -57,6 +59,6 @@ def test_a_flight_has_its_path_its_intervals_and_what_brings_more(tmp_path):
 def test_a_page_that_is_there_is_not_replaced(tmp_path):
     page = tmp_path / "plan.html"
     page.write_text("mine", encoding="utf-8")
-    done = CliRunner().invoke(app, ["plan", "3", "--arrangements", "1", "-o", str(page)])
+    done = CliRunner().invoke(app, ["plan", "survey", "3", "--arrangements", "1", "-o", str(page)])
     assert "already" in str(done.exception) or "exists" in str(done.exception)
     assert page.read_text(encoding="utf-8") == "mine"

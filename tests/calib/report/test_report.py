@@ -12,7 +12,7 @@ import pytest
 from matplotlib.image import imread
 from pypdf import PdfReader
 
-from calib.cli.reporting import spread
+from calib.cli.judging import spread_tests
 from calib.estimation.fitting import fit
 from calib.report.sections import render
 from tests import processes
@@ -204,8 +204,8 @@ def test_a_browser_shows_it(campaign, tmp_path, width):
 
 def test_tests_take_several_files():
     told = ["report", "a", "-o", "r", "--tests", "b", "c", "--force", "d"]
-    assert spread(told) == ["report", "a", "-o", "r", "--tests", "b", "--tests", "c", "--force", "d"]
-    assert spread(["fit", "a", "-o", "c"]) == ["fit", "a", "-o", "c"]
+    assert spread_tests(told) == ["report", "a", "-o", "r", "--tests", "b", "--tests", "c", "--force", "d"]
+    assert spread_tests(["fit", "a", "-o", "c"]) == ["fit", "a", "-o", "c"]
 
 
 def test_a_campaign_s_tables_have_the_numbers_of_its_test(campaign):

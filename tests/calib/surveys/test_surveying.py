@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import calib
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
-from calib.cli.flags import FLAGS
+from calib.cli.shared import FLAGS
 from calib.errors import BadInputError, UnanswerableError
 from calib.surveys.knowledge import load_knowledge
 from calib.surveys.samples import DELAYS_NS
@@ -398,7 +398,7 @@ def recording(tmp_path):
 
 def test_the_command_takes_a_recording_an_arrangement_and_writes_what_others_read(recording, tmp_path):
     out, anchors = tmp_path / "c.json", tmp_path / "anchors.toml"
-    words = ["survey", *recording, "-o", str(out), "--anchors", str(anchors), "--arrangement", "B", "--json"]
+    words = ["survey", *recording, "-o", str(out), "--save-anchors", f"B={anchors}", "--json"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)

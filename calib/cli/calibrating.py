@@ -1,0 +1,354 @@
+"""Commands that make calibrations, and show them: fit, add-tag, survey, show, sample."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calib.cli.shared import (
+    STOPPED,
+    NewCalibration,
+    Recordings,
+    TrimStatic,
+    command_line,
+    known_calibration,
+    progress_bar,
+    warn,
+    with_flags,
+)
+from calib.errors import BadInputError, UnanswerableError
+from calib.settings import FitSettings, FlightSettings, check_choice, read_fixed
+from uwblink.cli.guide import add, choice, tags_of
+from uwblink.cli.options import AsJson, CalibrationFile, Force, Plot, ReportFile, Seed, count, output
+from uwblink.cli.waiting import waiting
+
+if TYPE_CHECKING:
+    import calib
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    panel = "Calibrate"
+    add(
+        app,
+        fit,
+        "calib fit flight.uwb -o calibration.json",
+        "calib fit monday.uwb tuesday.uwb -o both.json --fix 1=-0.36",
+        "calib fit ranges.uwb -o delays.json --delays-only",
+        "calib fit flight.uwb -o found.json --truth ranges --poses-until 10",
+        panel=panel,
+    )
+    add(app, add_tag, "calib add-tag new.uwb -c calibration.json --tag 7 -o seven.json", panel=panel, name="add-tag")
+    add(
+        app,
+        survey,
+        "calib survey string.uwb -o delays.json --known line",
+        "calib survey a.uwb b.uwb c.uwb -o delays.json --known known.toml",
+        "calib survey room.uwb -o delays.json --known known.toml --save-anchors anchors.yaml",
+        panel=panel,
+        renamed={"--anchors": "--save-anchors", "--arrangement": "a part of --save-anchors NAME=FILE"},
+    )
+    add(app, show, "calib show calibration.json", panel=panel)
+    add(
+        app,
+        sample,
+        "calib sample -o sample.uwb",
+        "calib sample -o other.uwb --seed 2",
+        panel=panel,
+        renamed={"--anchors": "--with-anchors"},
+    )
+
+
+def fit(
+    recordings: Recordings,
+    output: NewCalibration,
+    settings: FitSettings,
+    flight: FlightSettings,
+    truth: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel="Without known distances (--truth ranges)",
+            help="Source of true distances. recorded: poses or measured distances; ranges: none, distances are "
+            "estimated together with the delays.",
+            **choice("recorded", "ranges"),
+        ),
+    ] = "recorded",
+    trim_static: TrimStatic = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Fit the tags' antenna delays (ns) and the curves of bias and standard deviation over first-path power (m)."""
+    import calib
+    from uwblink.output import check_output
+
+    check_choice("truth", truth, ("recorded", "ranges"))
+    given = {one.name: value for one in fields(flight) if (value := getattr(flight, one.name)) != one.default}
+    if truth == "recorded":
+        for name in given:
+            raise BadInputError("goes with a fit whose `truth` is ranges", parameter=name)
+    check_output(output, force=force)
+    with _undetermined_as_json(as_json):
+        if truth == "ranges":
+            result = _fit_from_ranges(recordings, settings, given, trim_static=trim_static)
+        else:
+            with waiting("fitting"):
+                ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not settings.delays_only)
+                result = calib.fit(ranges, settings)
+    result.save(output, force=force)
+    if as_json:
+        typer.echo(result.calibration.to_json(), nl=False)
+    else:
+        found = result.calibration
+        typer.echo(f"{output}: {len(result.ranges)} exchanges, {result.message}, scale {found.scale_ns:.3f} ns")
+        for line in delay_lines(found):
+            typer.echo(line)
+        for reason, number in result.ranges.excluded.items():
+            typer.echo(f"  left out: {number} exchanges, {reason}")
+        for warning in result.warnings:
+            warn(warning)
+    if not result.success:
+        raise typer.Exit(STOPPED)
+
+
+class _undetermined_as_json:  # noqa: N801 - a context manager
+    """Print an `UnanswerableError` as JSON, too, where JSON was asked for."""
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if self.as_json and isinstance(error, UnanswerableError):
+            typer.echo(json.dumps({"error": with_flags(str(error)), "undetermined": error.undetermined}, indent=1))
+
+
+def _fit_from_ranges(
+    recordings: Sequence[Path], settings: FitSettings, given: dict[str, Any], *, trim_static: bool
+) -> calib.FitResult:
+    """Fit without known distances; raises `BadInputError` for settings that need them."""
+    import calib
+
+    if len(recordings) != 1:
+        raise BadInputError("ranges takes one recording, of one flight", parameter="truth")
+    both = ("fixed_ns", "groups", "lift", "reference_power_dbm", "delays_only", "minimum_norm")
+    others = [one.name for one in fields(settings) if getattr(settings, one.name) != getattr(FitSettings(), one.name)]
+    for name in [name for name in others if name not in both] + ["trim_static"] * trim_static:
+        raise BadInputError("goes with known distances only, not with `truth` ranges", parameter=name)
+    with progress_bar(recordings[0].name) as report:
+        shared = {name: getattr(settings, name) for name in both}
+        return calib.fit_from_ranges(recordings[0], progress=report, **shared, **given)
+
+
+def delay_lines(found: calib.Calibration) -> Iterator[str]:
+    """Yield a line a pair that has a constant and a line a tag: the constant or delay, and its 95 % interval."""
+    from calib.spread import TWO_SIDED_95
+
+    for pair, offset in sorted(found.pair_offsets.items()):
+        half = 100 * TWO_SIDED_95 * offset.std_m
+        yield f"  pair {pair[0]:3d} {pair[1]:3d}  ranges {100 * offset.offset_m:+.2f} cm too long  ± {half:.2f} (95 %)"
+    if found.pair_offsets and not any(found.delays_ns.values()):
+        return
+    for tag, delay in sorted(found.delays_ns.items()):
+        half = TWO_SIDED_95 * found.delays_std_ns.get(tag, math.nan)
+        interval = f"  ± {half:.4f} (95 %)"
+        if not math.isfinite(half):
+            interval = "  undetermined" if math.isinf(half) else "  standard error not stated"
+        yield f"  tag {tag:3d}  delay {delay:+.4f} ns{'  pinned' if half == 0 else interval}"
+
+
+def add_tag(
+    recording: Annotated[Path, typer.Argument(help="Recording of the new tag with calibrated ones (.uwb).")],
+    calibration: CalibrationFile,
+    tag: Annotated[int, typer.Option(help="Id of the tag to add.", autocompletion=tags_of())],
+    output: NewCalibration,
+    force: Force = False,
+) -> None:
+    """Fit the delay of one more tag from its ranges with calibrated ones, and leave everything else as it is."""
+    import calib
+    from calib.spread import TWO_SIDED_95
+    from uwblink.output import check_output
+
+    check_output(output, force=force)
+    with waiting("fitting"):
+        found = calib.add_tag(recording, known_calibration(calibration), tag)
+    found.save(output, force=force)
+    half = TWO_SIDED_95 * found.delays_std_ns[tag]
+    typer.echo(f"{output}: tag {tag}  delay {found.delays_ns[tag]:+.4f} ns  ± {half:.4f} (95 %)")
+
+
+def survey(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings of boards that stand still (.uwb).")],
+    output: NewCalibration,
+    known: Annotated[
+        str,
+        typer.Option(
+            metavar="line|plane|FILE",
+            help="What is known of the arrangements: all boards on a line or on a plane, or a file that says more "
+            "(.toml).",
+        ),
+    ] = "",
+    save_anchors: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[NAME=]FILE",
+            help="File for the positions of the boards, of the arrangement NAME where there are several: "
+            "\\[\\[anchors]] (.toml) or for ROS (.yaml).",
+        ),
+    ] = None,
+    plot: Plot = None,
+    report: ReportFile = None,
+    fix: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TAG=NS", help="Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated."
+        ),
+    ] = None,
+    pair_error: Annotated[
+        float | None, typer.Option(help="Constant error of a pair in an arrangement (m); by default estimated.")
+    ] = None,
+    delays_only: Annotated[bool, typer.Option("--delays-only", help="Fit no curve over power.")] = False,
+    curve_from: Annotated[
+        Path | None, typer.Option(help="Calibration whose curve over power is taken over (.json).")
+    ] = None,
+    regardless: Annotated[
+        bool, typer.Option("--regardless", help="Survey even where ranges contradict what is known.")
+    ] = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Calibrate without true distances: boards that stand still, in arrangements of which little is known."""
+    import calib
+    from uwblink.output import check_apart, check_output
+
+    arrangement, anchors = _named_file(save_anchors)
+    written = {"output": output, "save_anchors": anchors, "plot": plot, "report": report}
+    for path in filter(None, written.values()):
+        check_output(path, force=force)
+    read = [*recordings, *([Path(known)] if known.endswith(".toml") else []), *filter(None, [curve_from])]
+    check_apart(written, read)
+    with _undetermined_as_json(as_json):
+        with waiting("surveying"):
+            result = calib.survey(
+                recordings,
+                known=known,
+                fixed_ns=read_fixed(fix or ()),
+                pair_error_m=pair_error,
+                delays_only=delays_only,
+                curve_from=curve_from,
+                regardless=regardless,
+            )
+        if anchors:
+            result.save_anchors(anchors, arrangement=arrangement, force=force)
+        if plot:
+            result.save_picture(plot, force=force)
+    result.save(output, force=force)
+    if report:
+        from calib.report import origin_of, write_survey_report
+
+        write_survey_report(report, result.calibration, origin=origin_of(recordings, command_line()), force=force)
+    if as_json:
+        typer.echo(json.dumps(_survey_figures(result), indent=1))
+        return
+    typer.echo(f"{output}: {result.headline()}")
+    for line in [*delay_lines(result.calibration), *_arrangement_lines(result)]:
+        typer.echo(line)
+    if anchors:
+        typer.echo(f"{anchors}: boards of {result.arrangement(arrangement).name}")
+    if plot:
+        typer.echo(f"{plot}: where boards stood, with ellipses of 95 %")
+    if report:
+        typer.echo(f"{report}: whether it is fit for use")
+    for warning in result.warnings:
+        warn(warning)
+
+
+def _named_file(text: str | None) -> tuple[str | None, Path | None]:
+    """Return the name before a file, if there is one, and the file: "NAME=FILE" or "FILE"."""
+    name, equals, path = (text or "").rpartition("=")
+    return (name if equals else None), (Path(path) if path else None)
+
+
+def _arrangement_lines(result: calib.SurveyResult) -> Iterator[str]:
+    for one in result.arrangements:
+        shape = f", on a {one.known}" if one.known else ""
+        yield f"  arrangement {one.name}{shape}: {one.frame}"
+        for board in one.boards:
+            place = "  ".join(f"{value:+8.3f}" for value in board.position_m)
+            half = 196 * math.sqrt(max(float(board.covariance_m2.trace()), 0.0))
+            known = f"± {half:.1f} cm (95 %)" if board.determined else "undetermined"
+            yield f"    tag {board.tag:3d}  {place} m  {known}"
+
+
+def _survey_figures(result: calib.SurveyResult) -> dict[str, Any]:
+    return {
+        "calibration": json.loads(result.calibration.to_json()),
+        "arrangements": [one.to_dict() for one in result.arrangements],
+        "pair_error_m": result.pair_error_m,
+        "findings": list(result.findings),
+        "reflected": [one.to_dict() for one in result.reflected],
+        "warnings": [with_flags(text) for text in result.warnings],
+    }
+
+
+def show(
+    calibration: Annotated[Path, typer.Argument(help="Calibration to show (.json).")], as_json: AsJson = False
+) -> None:
+    """Print a calibration: delays, curves, what it was fitted to, and what its fit could not know."""
+    import calib
+    from calib.calibration import rests_on
+
+    known = calib.load_calibration(calibration)
+    if as_json:
+        typer.echo(known.to_json(), nl=False)
+        return
+    typer.echo(repr(known))
+    for name in ("fitted", "gauge", "recordings"):
+        if name in known.provenance:
+            value = known.provenance[name]
+            typer.echo(f"  {name}: {', '.join(map(str, value)) if isinstance(value, list) else value}")
+    distances = rests_on(known.provenance)
+    for line in [f"distances: {distances}"] if distances else _survey_lines(known.provenance.get("rests_on")):
+        typer.echo(f"  {line}")
+    for warning in known.provenance.get("warnings", []):
+        typer.echo(f"warning: {with_flags(str(warning))}")
+
+
+def _survey_lines(rests: object) -> Iterator[str]:
+    """Yield what a survey rests on: arrangements by what was known of them, and known distances and positions."""
+    if not isinstance(rests, dict):
+        return
+    rows = [row for row in rests.get("arrangements", []) if isinstance(row, dict)]
+    for shape in dict.fromkeys(str(row.get("known", "")) for row in rows):
+        names = ", ".join(str(row.get("name")) for row in rows if row.get("known", "") == shape)
+        yield f"rests on arrangements {names}{f', on a {shape}' if shape else ''}"
+    distances, positions = rests.get("known_distances", 0), rests.get("known_positions", 0)
+    yield f"rests on {distances} known distances and {positions} known positions"
+
+
+def sample(
+    output: Annotated[Path, output("Recording to write (.uwb).")],
+    count: Annotated[int, count("Number of exchanges, 100 per second.", min=3, max=1_000_000)] = 3000,
+    seed: Seed = 1,
+    with_anchors: Annotated[bool, typer.Option("--with-anchors", help="One moving tag and four anchors.")] = False,
+    force: Force = False,
+) -> None:
+    """Write a small flight with known delays, to try the other commands with; no simulator is needed for it."""
+    import calib
+    from uwblink import Contents
+    from uwblink.output import check_output
+
+    check_output(output, force=force, recording=True)
+    seed = 1 if seed is None else seed
+    flight = calib.sample_flight(count, seed=seed, anchors=with_anchors)
+    meta = {"planted": flight.planted, "source": "sample", "seed": seed}
+    contents = Contents(exchanges=flight.exchanges, poses=flight.poses, tags=flight.tags, meta=meta)
+    contents.save(output, force=force)
+    typer.echo(f"{output}: {count} exchanges of tags {', '.join(str(tag.tag) for tag in flight.tags)}, known delays")

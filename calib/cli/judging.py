@@ -1,0 +1,374 @@
+"""Commands that judge: evaluate, localize, doctor, compare, report."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calib.cli.shared import STOPPED, Recordings, TrimStatic, command_line, known_calibration, warn, with_flags
+from calib.settings import FitSettings
+from uwblink.cli.guide import add, choice
+from uwblink.cli.options import AsJson, CalibrationFile, Figures, Force, ReportFile, Seeds, output
+from uwblink.cli.starting import keep_imported
+from uwblink.cli.waiting import waiting
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from calib import Calibration
+    from calib.evaluation import ErrorStatistics, Evaluation
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    for command, *examples in (
+        (
+            evaluate,
+            "calib evaluate test.uwb -c calibration.json",
+            "calib evaluate test.uwb -c calibration.json --report r.html",
+        ),
+        (
+            localize,
+            "calib localize test.uwb -c calibration.json",
+            "calib localize test.uwb -c calibration.json --model imu",
+        ),
+        (doctor, "calib doctor flight.uwb"),
+        (compare, "calib compare before.json after.json"),
+        (
+            report,
+            "calib report train.uwb --tests test1.uwb test2.uwb -o report.html",
+            "calib report train.uwb -o report.html --pdf report.pdf --figures figures",
+        ),
+    ):
+        add(app, command, *examples, panel="Judge")
+
+
+def evaluate(
+    recordings: Recordings,
+    calibration: CalibrationFile,
+    report: ReportFile = None,
+    figures: Figures = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Compare raw, delay-corrected and fully corrected ranges with the true distances, in cm, pair by pair."""
+    import calib
+    from calib.data import load_each
+
+    if report or figures:
+        from calib.report import check_places
+
+        check_places(report, None, figures, force=force)
+        keep_imported()
+    known = known_calibration(calibration, recordings)
+    with waiting("evaluating"):
+        parts = load_each(recordings, need_power=known.needs_power)
+        evaluation = calib.evaluate(parts, known)
+        if report or figures:
+            from calib.report import origin_of
+
+            origin = origin_of([*recordings, calibration], command_line())
+            calib.write_report(report, parts, known, figures=figures, evaluation=evaluation, origin=origin, force=force)
+    _warn_of_seen(evaluation)
+    if as_json:
+        typer.echo(json.dumps(evaluation.to_dict(), indent=1))
+        return
+    from rich.console import Console
+
+    # Columns that the table never needs more than: in a file no figure must lose its last digits.
+    print_table(evaluation, Console(width=None if sys.stdout.isatty() else 110))
+    for path in filter(None, (report, figures)):
+        typer.echo(f"report: {path}")
+
+
+def _warn_of_seen(evaluation: Evaluation) -> None:
+    """Warn where a calibration was judged on what it was fitted to."""
+    if evaluation.seen:
+        warn(
+            f"the calibration was fitted to {', '.join(evaluation.seen)}: errors there are smaller than where it is "
+            "used; judge it on recordings that the fit has not seen"
+        )
+
+
+def localize(
+    recordings: Recordings,
+    calibration: CalibrationFile,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="Motion model between ranges. poses: velocity and attitude from motion capture, to compare "
+            "calibrations; imu, constant-velocity: on board, by ranges to anchors and a height sensor.",
+            **choice("poses", "imu", "constant-velocity"),
+        ),
+    ] = "poses",
+    training: Annotated[
+        Path | None,
+        typer.Option(help="Flight on which the fixed variances are tuned (.uwb); by default those of the fit."),
+    ] = None,
+    process_noise: Annotated[
+        float, typer.Option(help="White noise of the velocity input (m/s per axis at 100 Hz).")
+    ] = 0.3,
+    seeds: Seeds = 3,
+    tum: Annotated[
+        Path | None, typer.Option(help="Folder for the estimated trajectories, one file per body and filter (.tum).")
+    ] = None,
+    figures: Figures = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Track each moving body by its ranges, with and without calibration, and print the RMSE in m."""
+    import calib
+    from calib.evaluation import Settings, localization_json, localization_text, summarize, write_tum
+
+    if figures:
+        from calib.report import check_places, write_track_figures
+
+        check_places(None, None, figures, force=force)
+    known = known_calibration(calibration, recordings)
+    if model != "poses":
+        _onboard(recordings, known, model, tum, figures, as_json=as_json, force=force)
+        return
+    settings = Settings(velocity_std_mps=process_noise, seeds=3 if seeds is None else seeds)
+    with waiting("localizing"):
+        found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
+    # The text first: where it cannot be made, nothing is written.
+    told = (
+        json.dumps(localization_json(found), indent=1)
+        if as_json
+        else localization_text(found, summarize(found), settings)
+    )
+    if tum:
+        write_tum(found, tum, force=force)
+    if figures:
+        write_track_figures(found, figures, force=force)
+    typer.echo(told)
+
+
+def _onboard(
+    recordings: list[Path],
+    known: Calibration,
+    model: str,
+    tum: Path | None,
+    figures: Path | None,
+    *,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Localize by what is on board, and print it."""
+    from calib.evaluation import OnboardSettings, localize_onboard, onboard_json, onboard_text, write_onboard_tum
+
+    settings = OnboardSettings(model=model)
+    with waiting("localizing"):
+        found = [one for path in recordings for one in localize_onboard(path, known, settings)]
+    told = json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings)
+    if tum:
+        write_onboard_tum(found, tum, force=force)
+    if figures:
+        from calib.report import write_onboard_figures
+
+        write_onboard_figures(found, figures, force=force)
+    typer.echo(told)
+
+
+def doctor(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings (.uwb); several are compared with each other, too.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Find faults in recordings, each with evidence and remedy, and compare the clocks of pairs."""
+    from dataclasses import asdict, replace
+
+    import calib
+    from calib.doctor import examined_part
+    from uwblink import Recording
+    from uwblink.recording import clock_skews
+
+    skews = {}
+    with waiting("examining"):
+        found = calib.examine(recordings)
+        parts = {str(path): part for path in recordings if (part := examined_part(path))}
+        for path in recordings:
+            with Recording.open(path) as recording:
+                skews[str(path)] = clock_skews(recording.exchange_blocks())
+    findings = [replace(f, evidence=with_flags(f.evidence), remedy=with_flags(f.remedy)) for f in found]
+    if as_json:
+        clocks = {path: [asdict(one) | {"slope": one.slope} for one in some] for path, some in skews.items()}
+        found_all = {"findings": [asdict(f) for f in findings], "clock_skews": clocks}
+        typer.echo(json.dumps(found_all | ({"examined": parts} if parts else {}), indent=1))
+        return
+    for name, part in parts.items():
+        typer.echo(f"{name}: {part}")
+    if not findings:
+        typer.echo(f"{', '.join(map(str, recordings))}: nothing found")
+    for finding in findings:
+        typer.echo(f"{finding.fault}" + (f" (p = {finding.p_value:.1g})" if finding.p_value else ""))
+        typer.echo(f"  evidence: {finding.evidence}")
+        typer.echo(f"  remedy:   {finding.remedy}")
+    for name, some in skews.items():
+        if some:
+            typer.echo(f"clock skew in {name}, the second tag against the first")
+        for one in some:
+            typer.echo(f"  {one}")
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(help="Calibration to compare with (.json).")],
+    second: Annotated[Path, typer.Argument(help="Calibration whose differences are told (.json).")],
+    figures: Figures = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Test whether the delays of two calibrations differ by more than their standard errors explain (ns)."""
+    import calib
+
+    if figures:
+        from calib.report import check_places, write_comparison_figures
+
+        check_places(None, None, figures, force=force)
+    known = [known_calibration(path) for path in (first, second)]
+    found = calib.compare(*known)
+    if figures:
+        write_comparison_figures(found, known, [first.stem, second.stem], figures, force=force)
+    if as_json:
+        typer.echo(json.dumps(found.to_dict(), indent=1))
+        return
+    typer.echo(found.table(str(first), str(second)))
+
+
+def spread_tests(arguments: Sequence[str]) -> list[str]:
+    """Let `--tests` take several files: repeat it before every word up to the next option."""
+    many, found = "--tests", list[str]()
+    inside = False
+    for word in arguments:
+        if word.startswith("-"):
+            inside = word == many
+            if not inside:
+                found.append(word)
+        else:
+            found += [many, word] if inside else [word]
+    return found
+
+
+def report(
+    recordings: Recordings,
+    output: Annotated[Path, output("Report to write (.html or .pdf).")],
+    settings: FitSettings,
+    tests: Annotated[
+        list[Path] | None,
+        typer.Option(help="Recordings to judge the calibration by, which the fit does not see (.uwb). Takes several."),
+    ] = None,
+    pdf: Annotated[Path | None, typer.Option(help="The same report as PDF (.pdf).")] = None,
+    figures: Figures = None,
+    trim_static: TrimStatic = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Fit, judge on other recordings, localize, and write everything as one page with tables and figures."""
+    from rich.console import Console
+
+    import calib
+    from calib.report import check_places
+
+    check_places(output, pdf, figures, force=force)
+    keep_imported()
+    with Console(file=sys.stderr).status("loading") as status:
+        campaign = calib.run_campaign(
+            recordings,
+            tests or [],
+            trim_static=trim_static,
+            progress=status.update,
+            command=command_line(),
+            settings=settings,
+        )
+        campaign.write(output, pdf, figures, force=force, progress=status.update)
+    if as_json:
+        typer.echo(json.dumps(campaign.to_dict(), indent=1))
+    else:
+        for path in filter(None, (output, pdf, figures)):
+            typer.echo(f"report: {path}")
+        if tests:  # without tests the report itself says that the training was judged
+            _warn_of_seen(campaign.evaluation)
+        findings = [f"{name}: {finding.fault}" for name, finding in campaign.findings]
+        for warning in [*campaign.fit.warnings, *findings]:
+            warn(warning)
+    if not campaign.fit.success:
+        raise typer.Exit(STOPPED)
+
+
+def print_table(evaluation: Evaluation, console: Console) -> None:
+    """Print errors in centimetres, a row per pair and one for all.
+
+    The last columns are the share in % that chi-square rejects, the spread of errors over the total sigma, and how many
+    of them lie between the quantiles for 95 %.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from calib.evaluation import CORRECTION_STAGES
+
+    # From 92 columns on there is room for two blanks between figures; a terminal of 80 has room for one.
+    gap = 1 if console.width >= 92 else 0
+    short = {"raw": "raw", "delays": "delay", "full": "full"}
+    table = Table(
+        title="Range error in cm", title_justify="left", box=SIMPLE_HEAD, padding=(0, gap, 0, 0), pad_edge=False
+    )
+    table.add_column("pair", no_wrap=True)
+    table.add_column("n", justify="right", no_wrap=True)
+    for stage in CORRECTION_STAGES:
+        for what in ("mean", "std", "rob."):
+            table.add_column(f"{short[stage]}\n{what}", justify="right", no_wrap=True)
+    table.add_column("chi2\nout%", justify="right", no_wrap=True)
+    for what in ("total\nz std", "in\n95%"):
+        table.add_column(what, justify="right", no_wrap=True)
+    for name, group in evaluation.pairs.items():
+        table.add_row(name, *_cells(group))
+    table.add_section()
+    table.add_row("all", *_cells(evaluation.overall), style="bold")
+    console.print(table)
+    for line in _remarks(evaluation):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _remarks(evaluation: Evaluation) -> Iterator[str]:
+    """Yield what the table has no room for: quantiles, coverage, errors from planted values."""
+    group = evaluation.overall
+    yield (
+        f"95 % of the calibrated errors lie between {100 * group.full.low_m:+.1f} and {100 * group.full.high_m:+.1f} cm"
+        f"; {100 * group.rejected:.1f} % lie beyond what sigma explains at 95 % (5 % without reflections)"
+    )
+    covered = ", ".join(f"{100 * share:.1f} % for {name} %" for name, share in group.coverage.items())
+    yield f"sigma covers {covered}"
+    if group.total_std == group.total_std:
+        yield (
+            f"with reflections, of which {100 * group.tail_share:.1f} % are expected: errors over the total sigma have "
+            f"a standard deviation of {group.total_std:.2f}, and {100 * group.inside_95:.1f} % lie between their "
+            "quantiles for 95 %"
+        )
+    planted = evaluation.planted
+    if planted:
+        rms = (sum(d**2 for d in planted.delay_error_ns.values()) / len(planted.delay_error_ns)) ** 0.5
+        yield (
+            f"from what was planted: delays {rms:.4f} ns rms, bias curve {100 * planted.curve_rms_m:.2f} cm, "
+            f"whole correction {100 * planted.correction_rms_m:.2f} cm rms"
+        )
+
+
+def _cells(group: ErrorStatistics) -> list[str]:
+    from calib.evaluation import CORRECTION_STAGES
+
+    cells = [str(group.raw.n)]
+    for stage in CORRECTION_STAGES:
+        stats = getattr(group, stage)
+        figures = (stats.mean_m, stats.std_m, stats.robust_std_m)
+        cells += [f"{100 * figure:.1f}" for figure in figures]
+    return [*cells, f"{100 * group.rejected:.1f}", _known(group.total_std, "{:.2f}"), _known(100 * group.inside_95)]
+
+
+def _known(value: float, form: str = "{:.1f}") -> str:
+    return form.format(value) if value == value else "-"

@@ -1,0 +1,95 @@
+"""What the commands of `calib` share: calibrations as they read them, and the options that errors and warnings name."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from calib.settings import FitSettings, FlightSettings
+from uwblink.cli import shared
+from uwblink.cli.options import output
+from uwblink.settings import flags_of
+
+if TYPE_CHECKING:
+    from calib import Calibration
+
+STOPPED: Final = 1
+"""Exit status of a command whose fit stopped before it converged: what it wrote says so, and is not final."""
+
+FLAGS: Final = {
+    "boards": "COUNT",
+    "data": "RECORDINGS",
+    "robots": "COUNT",
+    "arrangement": "--save-anchors",
+    "base": "--antenna-delays",
+    "pair_error_m": "--pair-error",
+    "velocity_std_mps": "--process-noise",
+    **flags_of(FitSettings),
+    **flags_of(FlightSettings),
+}
+"""The options that stand for parameters of calib, where they are not the parameter's name with dashes."""
+
+Recordings = Annotated[list[Path], typer.Argument(help="Recordings with true distances (.uwb).")]
+NewCalibration = Annotated[Path, output("Calibration to write (.json).")]
+TrimStatic = Annotated[
+    bool,
+    typer.Option(
+        "--trim-static",
+        rich_help_panel="How errors count",
+        help="Leave out spans of 2 s in which a pair's distance stays within 2 cm.",
+    ),
+]
+
+
+def with_flags(text: str) -> str:
+    """Return a text with options for the parameters in backticks: `minimum_norm` becomes --minimum-norm."""
+    return shared.with_flags(text, FLAGS)
+
+
+def warn(text: str) -> None:
+    """Print a warning on standard error."""
+    typer.echo(f"warning: {with_flags(text)}", err=True)
+
+
+def command_line() -> str:
+    """Return how the command was called, for reports."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def known_calibration(path: Path, recordings: Iterable[Path] = ()) -> Calibration:
+    """Return a calibration from its file, and warn on standard error where its fit stopped before it converged.
+
+    Warns, too, where other antenna delays were programmed into the tags of recordings than where it was fitted.
+    """
+    import calib
+    from calib.calibration import antenna_delays_warning
+
+    known = calib.load_calibration(path)
+    if known.stopped:
+        warn(f"{path}: its fit stopped before it settled: delays and intervals are not final")
+    for recording in recordings:
+        warning = antenna_delays_warning(known, recording)
+        if warning:
+            warn(f"{recording}: {path}: {warning}")
+    return known
+
+
+@contextmanager
+def progress_bar(name: str) -> Iterator[Callable[[float], None] | None]:
+    """Show a bar on a terminal, and nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(escape(name), total=1.0)
+        yield lambda fraction: bar.update(task, completed=fraction)

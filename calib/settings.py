@@ -1,0 +1,293 @@
+"""The settings of a fit, once for Python and for the command line, and the checks of what they may be."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from numbers import Integral
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from calib.errors import BadInputError
+from uwblink.settings import setting
+from uwblink.toml import TomlReader
+
+if TYPE_CHECKING:
+    from uwblink import KnownDistance
+
+LIFTS: Final = ("mean-of-lifted", "lift-of-mean")
+CONSTANTS: Final = ("tag", "pair")
+HIGHEST_TAG: Final = 65_535
+"""Ids of tags have 16 bits in recordings."""
+
+ERRORS_PANEL: Final = "How errors count"
+MODEL_PANEL: Final = "What is fitted"
+FLIGHT_PANEL: Final = "Without known distances (--truth ranges)"
+
+
+def check_choice(parameter: str, value: str, allowed: Iterable[str]) -> None:
+    """Raise `BadInputError` that lists what is allowed."""
+    if value not in allowed:
+        raise BadInputError(f"found {value!r}, allowed: {', '.join(allowed)}", parameter=parameter)
+
+
+def check_tag(tag: object) -> None:
+    """Raise `BadInputError` for what cannot be the id of a tag."""
+    if not is_tag(tag):
+        raise BadInputError(f"found {tag!r}, expected the id of a tag, 0 to {HIGHEST_TAG}", parameter="tag")
+
+
+def is_tag(value: object) -> bool:
+    """Return whether a value can be the id of a tag."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and 0 <= int(value) <= HIGHEST_TAG
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def read_scale(text: str) -> float | None:
+    """Return a scale in nanoseconds, None for "auto"; raises `BadInputError`."""
+    if text == "auto":
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise BadInputError(f"found {text!r}, expected auto or a positive number of ns", parameter="scale_ns") from None
+
+
+def read_fixed(texts: Iterable[str]) -> dict[int, float]:
+    """Return known delays in ns by tag from texts TAG=NS; raises `BadInputError`."""
+    fixed: dict[int, float] = {}
+    for text in texts:
+        tag, equals, value = text.partition("=")
+        try:
+            delay = float(value)
+        except ValueError:
+            delay = math.nan
+        if not (equals and tag.strip().isdecimal() and math.isfinite(delay)):
+            raise BadInputError(f"found {text!r}, expected TAG=NS, as in 1=-0.36", parameter="fixed_ns")
+        if int(tag) in fixed:
+            raise BadInputError(f"tag {int(tag)} is pinned twice", parameter="fixed_ns")
+        fixed[int(tag)] = delay
+    return fixed
+
+
+def read_groups(path: Path) -> dict[str, tuple[int, ...]]:
+    """Read a design file: a table `groups` that maps names to lists of tags; raises `BadInputError`."""
+    table = TomlReader(path, partial(BadInputError, parameter="groups")).table
+    groups = table.get("groups")
+    if not isinstance(groups, dict) or not groups or set(table) != {"groups"}:
+        raise BadInputError(f"{path}: expected one table [groups], as in: monopole = [1, 2]", parameter="groups")
+    for name, tags in groups.items():
+        if not isinstance(tags, list):
+            raise BadInputError(f"{path}: {name}: expected a list of tag ids, as in [1, 2]", parameter="groups")
+    return {name: tuple(tags) for name, tags in groups.items()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitSettings:
+    """The settings of `fit`, which it takes as keyword arguments, too; raises `BadInputError` that names the setting.
+
+    `loss` is "mixture", the likelihood of direct ranges, reflections and outliers with a share of reflections by pair,
+    or a robust loss of residuals: "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added; None chooses the
+    mixture, and "cauchy" for a sequential fit and for fewer than 15 ranges a pair. `scale_ns` is the scale of a robust
+    loss in time of flight, None to estimate it. `lift` and `alpha_dbm` make the lifted power of an exchange.
+
+    `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
+    fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). `minimum_norm` fits the
+    smallest delays that agree with the data where the pairs leave delays free. The curve is zero at
+    `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
+    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay.
+
+    >>> import calib
+    >>> settings = calib.FitSettings(loss="huber", fixed_ns={1: -0.3})
+    >>> calib.fit(calib.sample_flight(), settings).calibration.delays_ns[1]
+    -0.3
+    """
+
+    loss: str | None = setting(
+        None,
+        "Likelihood or loss that is fitted. mixture (the default): reflections by pair; cauchy: for --sequential, and "
+        "for fewer than 15 ranges per pair; l2: least squares; or a registered loss.",
+        names=("mixture", "cauchy", "huber", "soft_l1", "l2"),
+        rich_help_panel=ERRORS_PANEL,
+    )
+    scale_ns: float | None = setting(
+        None,
+        "Error in ns of flight beyond which a robust loss discounts a range; auto: estimated from the data.",
+        flag="--scale",
+        kind=str | None,
+        parse=read_scale,
+        metavar="NS|auto",
+        rich_help_panel=ERRORS_PANEL,
+    )
+    lift: str = setting(
+        "mean-of-lifted",
+        "Lifted power of an exchange from the powers of its two ends.",
+        names=LIFTS,
+        rich_help_panel=MODEL_PANEL,
+    )
+    alpha_dbm: float = -82.0
+    fixed_ns: Mapping[int, float] = setting(
+        {},
+        "Known delay of a tag, which stays as it is, as in 1=-0.36. May be repeated.",
+        flag="--fix",
+        kind=list[str] | None,
+        parse=read_fixed,
+        tags="{}=",
+        metavar="TAG=NS",
+        rich_help_panel=MODEL_PANEL,
+    )
+    groups: Mapping[str, tuple[int, ...]] = setting(
+        {},
+        "Groups of tags that share curves (.toml with a table \\[groups]); by default all tags share them.",
+        flag="--group",
+        kind=Path | None,
+        parse=read_groups,
+        rich_help_panel=MODEL_PANEL,
+    )
+    sequential: bool = setting(
+        False,
+        "Fit the delays first, and then the curve to what they leave (ICRA 2023).",
+        rich_help_panel=MODEL_PANEL,
+    )
+    minimum_norm: bool = setting(
+        False,
+        "Fit the smallest delays that agree with the data where the pairs leave delays free.",
+        rich_help_panel=MODEL_PANEL,
+    )
+    reference_power_dbm: float | None = setting(
+        None,
+        "Power in dBm at which the curve is zero, for which the delays are stated (default: -82, the published alpha).",
+        flag="--reference-power",
+        rich_help_panel=MODEL_PANEL,
+    )
+    delays_only: bool = setting(
+        False,
+        "Fit no curve: for ranges without power, or whose power follows distance.",
+        rich_help_panel=MODEL_PANEL,
+    )
+    delays_from: Any = setting(  # a Calibration or its path
+        None,
+        "Calibration whose delays are taken over (.json); with the delays of all tags only the curve is fitted.",
+        kind=Path | None,
+        rich_help_panel=MODEL_PANEL,
+    )
+    constants: str = setting(
+        "tag",
+        "What has a constant error: each tag (antenna delays), or each pair.",
+        names=CONSTANTS,
+        rich_help_panel=MODEL_PANEL,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the settings; whether a loss is known, the fit checks."""
+        check_choice("lift", self.lift, LIFTS)
+        check_choice("constants", self.constants, CONSTANTS)
+        if self.scale_ns is not None and not (_is_finite(self.scale_ns) and self.scale_ns > 0):
+            raise BadInputError(f"found {self.scale_ns!r}, expected a positive number of ns", parameter="scale_ns")
+        for name, power in (("alpha_dbm", self.alpha_dbm), ("reference_power_dbm", self.reference_power_dbm)):
+            if not _is_finite(power) and (name == "alpha_dbm" or power is not None):
+                raise BadInputError(f"found {power!r}, expected a power in dBm", parameter=name)
+        if self.sequential and self.loss == "mixture":
+            raise BadInputError(
+                "goes with a loss, not with the mixture; leave one of the two away", parameter="sequential"
+            )
+        for tag, delay in (self.fixed_ns or {}).items():
+            if not (is_tag(tag) and _is_finite(delay)):
+                raise BadInputError(
+                    f"found {tag!r}: {delay!r}, expected a tag id and its delay in ns", parameter="fixed_ns"
+                )
+        seen: dict[int, str] = {}
+        for name, tags in (self.groups or {}).items():
+            listed = list(tags) if isinstance(tags, Iterable) and not isinstance(tags, str) else []
+            if not listed or not all(map(is_tag, listed)):
+                raise BadInputError(f"{name}: expected a list of tag ids, as in [1, 2]", parameter="groups")
+            for tag in listed:
+                if tag in seen:
+                    raise BadInputError(f"tag {tag} is in {seen[tag]!r} and in {name!r}", parameter="groups")
+                seen[tag] = name
+        fixed = {int(tag): float(delay) for tag, delay in (self.fixed_ns or {}).items()}
+        object.__setattr__(self, "fixed_ns", fixed)
+        object.__setattr__(self, "groups", {name: tuple(map(int, tags)) for name, tags in (self.groups or {}).items()})
+
+
+def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
+    """Return distances by a tape from texts TAG-TAG=METRES; raises `BadInputError`."""
+    from uwblink import KnownDistance
+
+    number = r"\s*(\d+(?:\.\d*)?|\.\d+)\s*"
+    form = re.compile(rf"\s*(\d+)\s*-\s*(\d+)\s*={number}(?:(?:\+-|±){number})?(?:@(.+))?$")
+    found = []
+    for text in texts:
+        parts = form.match(text)
+        if parts is None:
+            raise BadInputError(
+                f"found {text!r:.60}, expected TAG-TAG=METRES, as in 11-12=3.06, 11-12=3.06+-0.005 or 1-3=1.52@2..8",
+                parameter="distances",
+            )
+        first, second, distance, sigma, when = parts.groups()
+        # A tape between antennas is good to a centimetre.
+        found.append(
+            KnownDistance(int(first), int(second), float(distance), float(sigma or 0.01), (when or "").strip())
+        )
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightSettings:
+    """What is known of a flight without true distances: the settings of `fit_from_ranges`, which explains them."""
+
+    poses_until_s: float | None = setting(
+        None,
+        "How long the poses' positions are known (all along by default).",
+        flag="--poses-until",
+        metavar="SECONDS",
+        rich_help_panel=FLIGHT_PANEL,
+    )
+    attitudes: str = setting(
+        "poses",
+        "Source of attitudes: the poses, all along; the IMU; or none.",
+        names=("poses", "imu", "none"),
+        rich_help_panel=FLIGHT_PANEL,
+    )
+    heading_std_deg: float = setting(
+        3.0,
+        "Standard deviation of headings; 0: headings are exact.",
+        flag="--heading-std",
+        metavar="DEGREES",
+        rich_help_panel=FLIGHT_PANEL,
+    )
+    anchors: str = setting(
+        "given",
+        "Positions of bodies that stand still: given by the poses, or sought (estimated).",
+        names=("given", "sought"),
+        rich_help_panel=FLIGHT_PANEL,
+    )
+    distances: tuple[Any, ...] = setting(
+        (),
+        "Distance of two antennas by a tape, as in 11-12=3.06 (good to 1 cm) or 3.06+-0.005; of tags that move, while "
+        "they stood still: 1-3=1.52@2..8 (seconds, or the name of an arrangement). May be repeated.",
+        flag="--distance",
+        kind=list[str] | None,
+        parse=read_distances,
+        metavar="TAG-TAG=METRES",
+        rich_help_panel=FLIGHT_PANEL,
+    )
+    heights: str = setting(
+        "used",
+        "Readings of height sensors in the recording: used or ignored.",
+        names=("used", "ignored"),
+        rich_help_panel=FLIGHT_PANEL,
+    )
+    curve_from: Any = setting(  # a Calibration or its path
+        None,
+        "Calibration whose curve over power is taken over (.json).",
+        kind=Path | None,
+        rich_help_panel=FLIGHT_PANEL,
+    )
