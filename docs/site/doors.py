@@ -21,10 +21,11 @@ FACTORY: Final = "<factory>"
 def reference(package: str) -> str:
     """Return the Markdown of a package: its front door, doors of rooms, and what these take and return."""
     rooms = [room for room in _rooms(package) if _own(package, room)]
-    parts = [_module(package), "## Doors of rooms", "What is seldom needed stands at the doors of the package's rooms."]
+    seldom = "Names that are seldom needed are imported from the rooms of the package."
+    parts = [_module(package), "## Rooms", seldom]
     for room in rooms:
         parts += [f"### {room}", _module(room, ", ".join(_own(package, room)))]
-    parts += ["## What these take and return", "Nobody makes these: they come from the functions above."]
+    parts += ["## Arguments and results", "Classes that the functions above take and return."]
     parts += [_class(cls) for cls in _returned(package, rooms)]
     return "\n\n".join(parts)
 
