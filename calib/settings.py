@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from calib.errors import BadInputError
 from uwblink.settings import setting
-from uwblink.toml import TomlReader
+from uwblink.text_files import TomlReader
 
 if TYPE_CHECKING:
     from uwblink import KnownDistance

@@ -34,7 +34,7 @@ CONFINED = {
     "yaml": lambda path: path == "uwblink/importers/miluv_yaml.py",
     "mcap": lambda path: path in {"uwblink/importers/json_mcap.py", "uwblink/exporters/mcap.py"},
     "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/rosbag2.py"},
-    "foxglove": lambda path: path == "uwblink/streaming/foxglove_server.py",
+    "foxglove": lambda path: path == "uwblink/streaming/senders.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",
 }
 NEVER = {"pickle", "pandas", "pyarrow"}

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from uwblink.recording.contents import Contents, load
     from uwblink.recording.file import Recording
     from uwblink.recording.schema import Arrangement, KnownDistance, Poses, Tag
-    from uwblink.streaming.ranges import StreamedRange
-    from uwblink.streaming.sources import stream
+    from uwblink.streaming.sources import StreamedRange, stream
     from uwblink.ticks import SPEED_OF_LIGHT
     from uwblink.twr import Exchanges, raw_range
     from uwblink.wire.messages import register_message
@@ -73,7 +72,7 @@ _HOMES: Final = {
     "RangingPlan": "uwblink.boards.ranging_plan",
     "RangingProtocol": "uwblink.protocols.rows",
     "Recording": "uwblink.recording.file",
-    "StreamedRange": "uwblink.streaming.ranges",
+    "StreamedRange": "uwblink.streaming.sources",
     "Tag": "uwblink.recording.schema",
     "UwblinkError": "uwblink.errors",
     "import_recording": "uwblink.importers",

@@ -1,11 +1,134 @@
-"""The arrays of the project, by what they hold: shapes stand in the docstrings of whoever takes or returns them."""
+"""The arrays of the project by what they hold, and columns made of what callers have.
+
+Shapes stand in the docstrings of whoever takes or returns arrays. Callers give lists, arrays, data-frame columns or one
+value for all rows; every check raises `ArgumentError` that names the column, the first row that is wrong, and what is
+expected.
+"""
 
 from __future__ import annotations
 
+from typing import Any, NoReturn
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from uwblink.errors import ArgumentError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Complexes = NDArray[np.complex128]
+
+
+def length(name: str, values: ArrayLike) -> int:
+    """Return the number of rows that a column has; raises for what is not one-dimensional."""
+    shape = np.shape(values)
+    if len(shape) != 1:
+        raise ArgumentError(f"{name}: found an array of shape {shape}, expected one value a row, shape (n,)")
+    return int(shape[0])
+
+
+def whole_numbers(name: str, values: ArrayLike, count: int, low: int, high: int, hint: str = "") -> Ints:
+    """Return int64 (count,) of whole numbers from `low` to `high`; `hint` is added to what a refusal says."""
+    found = _rows(name, values, count)
+    if found.dtype.kind not in "iufb" or found.dtype.kind == "b":
+        raise ArgumentError(f"{name}: found {_kind(found)}, expected whole numbers")
+    with np.errstate(invalid="ignore"):
+        bad = ~((found >= low) & (found <= high))
+        if found.dtype.kind == "f":
+            bad |= found != np.rint(found)
+    if bad.any():
+        _refuse(name, found, bad, f"a whole number from {low} to {high}{hint}")
+    return found.astype(np.int64)
+
+
+def numbers(name: str, values: ArrayLike | None, count: int) -> Floats:
+    """Return float64 (count,), NaN where nothing is known; all of them where `values` is None."""
+    if values is None:
+        return np.full(count, np.nan)
+    found = _rows(name, values, count)
+    if found.dtype.kind not in "iuf":
+        raise ArgumentError(f"{name}: found {_kind(found)}, expected numbers")
+    endless: Bools = np.isinf(found)
+    if endless.any():
+        _refuse(name, found, endless, "a finite number, or NaN where nothing is known")
+    return found.astype(np.float64)
+
+
+def words(name: str, values: ArrayLike, count: int) -> NDArray[np.str_]:
+    """Return text (count,)."""
+    found = _rows(name, values, count)
+    if not count:  # an empty list has no type of its own
+        return np.zeros(0, np.str_)
+    if found.dtype.kind not in "UTO" or not all(isinstance(value, str) for value in found.tolist()):
+        raise ArgumentError(f"{name}: found {_kind(found)}, expected text")
+    return found.astype(np.str_)
+
+
+def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
+    """Return float64 (count, size) of finite numbers; one vector stands for all rows."""
+    try:
+        found = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"{name}: found what is no array of numbers, expected shape ({count}, {size})") from error
+    if not count and not found.size:
+        return np.zeros((0, size))
+    if found.shape not in ((size,), (count, size)):
+        raise ArgumentError(f"{name}: found an array of shape {found.shape}, expected ({count}, {size}) or ({size},)")
+    found = np.array(np.broadcast_to(found, (count, size)))
+    bad = ~np.isfinite(found).all(axis=1)
+    if bad.any():
+        _refuse(name, found, np.asarray(bad), "finite numbers")
+    return found
+
+
+def few_words(column: NDArray[Any]) -> tuple[NDArray[np.str_], Ints] | None:
+    """Return the different words of a column of text (n,), as they first come, and which each row has (n,), from 0.
+
+    None where there are more than 16, which sorting finds sooner, and for a column that is not of text, or empty.
+
+    >>> words, which = few_words(np.array(["b", "a", "b"]))
+    >>> words.tolist(), which.tolist()
+    (['b', 'a'], [0, 1, 0])
+    """
+    if column.dtype.kind != "U" or isinstance(column, np.ma.MaskedArray) or not len(column):
+        return None
+    which = np.zeros(len(column), dtype=np.int64)
+    words: list[Any] = []
+    row = 0
+    while row < len(column):
+        if len(words) == 16:
+            return None
+        words.append(column[row])
+        which[column == column[row]] = len(words)
+        row += int(np.argmin(which[row:])) if not which[row:].all() else len(column)
+    return np.array(words), which - 1
+
+
+def reject(name: str, values: NDArray[Any], bad: Bools, expected: str) -> None:
+    """Raise for the first row that is bad; nothing where none is."""
+    if bad.any():
+        _refuse(name, values, bad, expected)
+
+
+def _rows(name: str, values: ArrayLike, count: int) -> NDArray[Any]:
+    try:
+        found = np.asarray(values)
+    except ValueError as error:
+        raise ArgumentError(f"{name}: its rows have different lengths, expected one value a row") from error
+    if found.ndim == 0:
+        return np.full(count, found)
+    if length(name, found) != count:
+        raise ArgumentError(f"{name}: found {len(found)} rows, expected {count} as in the first column")
+    return found
+
+
+def _refuse(name: str, values: NDArray[Any], bad: Bools, expected: str) -> NoReturn:
+    row = int(np.argmax(bad))
+    raise ArgumentError(f"{name}: row {row}: found {str(values[row])[:60]}, expected {expected}")
+
+
+def _kind(values: NDArray[Any]) -> str:
+    if not values.size:
+        return f"nothing (of type {values.dtype})"
+    return f"{str(values.flat[0])[:40]!r} (of type {values.dtype})"

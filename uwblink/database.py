@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uwblink.errors import RecordingError
-from uwblink.interrupts import interrupts_held
+from uwblink.output import interrupts_held
 
 with interrupts_held():  # an interrupt within this import ends the process in C++
     import duckdb as duckdb

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -10,12 +11,12 @@ from tempfile import TemporaryDirectory
 from typing import Final, TextIO
 
 from uwblink.errors import ArgumentError, OutputError, RecordingError, RecordingExistsError, UwblinkError
-from uwblink.interrupts import interrupts_held
 
-__all__: Final = [
+__all__ = [
     "check_apart",
     "check_folder",
     "check_output",
+    "interrupts_held",
     "made_folder",
     "new_file",
     "whole",
@@ -27,8 +28,18 @@ __all__: Final = [
 PARTIAL: Final = ".partial"
 """Ending of folders for what is being written."""
 
-LONGEST_PREFIX: Final = 255 - len(PARTIAL) - 8
-"""Bytes of a name before the eight letters that `tempfile` draws; file systems take names of 255."""
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Deliver SIGINT and SIGTERM to this thread after the block, not within it; where the system cannot, do nothing."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
@@ -77,7 +88,8 @@ def place_beside(path: Path) -> Iterator[Path]:
     whoever opens the file, and whatever he writes beside it.
     """
     prefix = f".{path.name}."
-    if len(os.fsencode(prefix)) > LONGEST_PREFIX:
+    # File systems take names of 255 bytes, of which `tempfile` draws eight.
+    if len(os.fsencode(prefix)) > 255 - len(PARTIAL) - 8:
         prefix = "."
     # It goes at the end of the process at the latest, wherever an interrupt hits.
     with interrupts_held():  # one between making the folder and knowing of it would leave it behind
@@ -164,8 +176,10 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
         taken[place] = name
 
 
-_TABLES: Final = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson")
-OTHER_FORMATS: Final = (*_TABLES, ".bag", ".mcap", ".db3", ".toml", ".html", ".pdf")
+OTHER_FORMATS: Final = (
+    *(".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson"),
+    *(".bag", ".mcap", ".db3", ".toml", ".html", ".pdf"),
+)
 """Endings by which programs choose how to read a file, and none of which is a recording's."""
 
 

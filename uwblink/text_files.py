@@ -1,11 +1,19 @@
-"""Reads files of other people: whatever keeps one from being read is one line in the caller's own error."""
+"""Reads text and TOML files: whatever is wrong with one is one line in the caller's own error.
+
+The line names the file, and in a TOML file the key.
+"""
 
 from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable
+import sys
+import tomllib
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any, NamedTuple
+
+__all__ = ["FileKey", "TomlReader", "heads", "is_number", "read_text", "require_regular"]
 
 
 def require_regular(
@@ -43,3 +51,70 @@ def read_text(path: str | os.PathLike[str], error: Callable[[str], Exception], w
         raise error(f"{path}: not a text file in UTF-8 (byte {problem.start}), expected a {what}") from problem
     except OSError as problem:
         raise error(f"{path}: cannot be read ({problem.strerror})") from problem
+
+
+class FileKey(NamedTuple):
+    """A key of a file, for readers and for the reference: dotted below tables, in capitals where people choose it."""
+
+    name: str
+    kind: str
+    default: str
+    meaning: str
+
+
+def heads(keys: Iterable[FileKey]) -> tuple[str, ...]:
+    """Return the keys and tables of the first level, each once, in order."""
+    return tuple(dict.fromkeys(key.name.split(".")[0] for key in keys))
+
+
+class TomlReader:
+    """Reads one file and checks its values; raises `error`, whose text begins with the path and the key."""
+
+    def __init__(self, path: Path, error: Callable[[str], Exception], what: str = "file") -> None:
+        """Read `path`, which holds a `what`."""
+        self.path, self.error = path, error
+        self.text = read_text(path, error, what)
+        try:
+            self.table: dict[str, Any] = tomllib.loads(self.text)
+        except (tomllib.TOMLDecodeError, RecursionError) as problem:
+            raise error(f"{path}: not valid TOML: {problem}") from problem
+
+    def known(self, table: dict[str, Any], names: Iterable[str], prefix: str = "") -> None:
+        """Raise for a key that is none of `names`."""
+        listed = list(names)
+        for key in table:
+            if key not in listed:
+                raise self.error(f"{self.path}: {prefix}{key}: unknown key; known are {', '.join(listed)}")
+
+    def section(self, name: str) -> dict[str, Any]:
+        """Return a table of the file, empty where there is none."""
+        found = self.table.get(name, {})
+        self.check(name, found, isinstance(found, dict), "a table")
+        return dict(found)
+
+    def rows(self, name: str, keys: Iterable[str] | None) -> list[dict[str, Any]]:
+        """Return an array of tables, which may be absent; raises for a key that is none of `keys` (None: any)."""
+        found = self.table.get(name, [])
+        good = isinstance(found, list) and all(isinstance(row, dict) for row in found)
+        self.check(name, found, good, f"tables [[{name}]]" + (f" with {', '.join(keys)}" if keys else ""))
+        for k, row in enumerate(found if keys is not None else ()):
+            self.known(row, keys or (), f"{name}[{k}].")
+        return list(found)
+
+    def choice(self, key: str, value: Any, allowed: Iterable[Any]) -> Any:
+        """Return a value that is one of `allowed`; None among them stands for a key that is not there."""
+        listed = list(allowed)
+        if not any(type(value) is type(one) and value == one for one in listed):
+            names = ", ".join(str(a) for a in listed if a is not None)
+            raise self.error(f"{self.path}: {key}: found {value!r}, allowed: {names}")
+        return value
+
+    def check(self, key: str, value: Any, good: bool, expected: str) -> None:
+        """Raise where a value is not good."""
+        if not good:
+            raise self.error(f"{self.path}: {key}: found {value!r}, expected {expected}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of a TOML file is a finite number, and no whole one that a float cannot hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -14,12 +14,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uwblink import columns
+from uwblink import arrays
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, as_text, excerpt, first_few
 from uwblink.errors import ArgumentError
-from uwblink.protocols.formulas import Intervals
-from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.rows import Intervals, RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import COUNTER_BITS, METRES_PER_TICK, REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 
@@ -99,16 +98,16 @@ class Exchanges:
         >>> x.protocol.tolist(), x.range_m.round(3).tolist()
         (['ss', 'ss'], [4.69, 4.69])
         """
-        count = columns.length("tx1", tx1)
+        count = arrays.length("tx1", tx1)
         if bits not in BITS:
             raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")
         chosen: dict[str, Any] = {
-            n: columns.whole_numbers(n, v, count, 0, LARGEST_ID) for n, v in _ends(initiator, target, reporter)
+            n: arrays.whole_numbers(n, v, count, 0, LARGEST_ID) for n, v in _ends(initiator, target, reporter)
         }
-        columns.reject(
+        arrays.reject(
             "target", chosen["target"], chosen["target"] == chosen["initiator"], "another tag than the initiator"
         )
-        names = columns.words("protocol", _protocol_of(protocol, tx3, rx3), count)
+        names = arrays.words("protocol", _protocol_of(protocol, tx3, rx3), count)
         messages = _messages(names)
         given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
         hint = f"; stamps of {BITS[-1]} bits need bits={BITS[-1]}" if bits < BITS[-1] else ""
@@ -116,15 +115,15 @@ class Exchanges:
             needed = messages >= int(name[-1])
             if values is None and needed.any():
                 raise ArgumentError(f"{name}: is not given, but protocol {str(names[int(np.argmax(needed))])!r} has it")
-            found = columns.whole_numbers(name, 0 if values is None else values, count, 0, (1 << bits) - 1, hint)
+            found = arrays.whole_numbers(name, 0 if values is None else values, count, 0, (1 << bits) - 1, hint)
             chosen[name] = np.where(needed, found, 0)
         levels = {"fpp1_dbm": fpp1_dbm, "fpp2_dbm": fpp2_dbm, "skew1_ppm": skew1_ppm, "skew2_ppm": skew2_ppm}
-        chosen |= {name: columns.numbers(name, values, count) for name, values in levels.items()}
+        chosen |= {name: arrays.numbers(name, values, count) for name, values in levels.items()}
         exchanges = cls(
-            time_ns=columns.whole_numbers("time_ns", time_ns, count, -LATEST_NS, LATEST_NS),
+            time_ns=arrays.whole_numbers("time_ns", time_ns, count, -LATEST_NS, LATEST_NS),
             protocol=names,
-            range_m=columns.numbers("range_m", range_m, count),
-            truth_m=columns.numbers("truth_m", truth_m, count),
+            range_m=arrays.numbers("range_m", range_m, count),
+            truth_m=arrays.numbers("truth_m", truth_m, count),
             bits=bits,
             **chosen,
         )

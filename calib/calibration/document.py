@@ -18,8 +18,8 @@ from calib.calibration.power_curves import LIFTS, Curve
 from calib.data.ranges import MAX_RANGE_M
 from calib.errors import BadInputError
 from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay
+from uwblink.text_files import FileKey
 from uwblink.ticks import SPEED_OF_LIGHT
-from uwblink.toml import FileKey
 from uwblink.twr import LARGEST_ID
 
 if TYPE_CHECKING:

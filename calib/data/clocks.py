@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.arrays import Bools, Floats
-from uwblink.protocols.formulas import Intervals
+from uwblink.protocols.rows import Intervals
 from uwblink.protocols.table import PROTOCOLS, is_single_sided
 from uwblink.recording import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S

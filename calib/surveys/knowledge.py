@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from calib.errors import BadInputError
 from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance
-from uwblink.toml import TomlReader, is_number
+from uwblink.text_files import TomlReader, is_number
 
 TAPE_M: Final = 0.005
 """Standard deviation of a distance by tape where none is stated."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from uwblink.toml import FileKey
+from uwblink.text_files import FileKey
 
 
 def reference(keys: Iterable[FileKey]) -> str:

@@ -32,7 +32,7 @@ from uwblink.recording.antenna_delays import FILE_KEYS as DELAY_KEYS
 from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of, read_antenna_delays
 from uwblink.recording.schema import Tag
 from uwblink.recording.tags import is_board_id, read_tags
-from uwblink.toml import FileKey, TomlReader, heads, is_number
+from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
 PROTOCOLS: Final = ("ds", "ss")
 FILE_KEYS: Final = (

@@ -42,8 +42,8 @@ from typing import Any, Final
 
 from uwblink.errors import ImportTableError
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.text_files import FileKey, TomlReader, heads, is_number
 from uwblink.ticks import TICKS_PER_SECOND
-from uwblink.toml import FileKey, TomlReader, heads, is_number
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")

@@ -20,7 +20,7 @@ from uwblink.importers.miluv_anchors import Anchors, find_anchors, read_tags, un
 from uwblink.importers.miluv_yaml import read_mapping
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
-from uwblink.toml import TomlReader
+from uwblink.text_files import TomlReader
 
 
 def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:

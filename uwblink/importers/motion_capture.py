@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from uwblink.arrays import Floats
-from uwblink.columns import few_words
+from uwblink.arrays import Floats, few_words
 from uwblink.errors import ImportTableError, RecordingExistsError
 from uwblink.importers.poses import read_poses
 from uwblink.importers.units import other_unit

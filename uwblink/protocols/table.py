@@ -3,53 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Final
 
+import numpy as np
+
+from uwblink.arrays import Floats
 from uwblink.errors import ArgumentError
 from uwblink.plugins import NAME, Registry
-from uwblink.protocols import formulas
-from uwblink.protocols.checks import check_formulas, check_messages
-from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
+from uwblink.protocols import rows
+from uwblink.protocols.rows import Intervals, ProtocolMessage, RangingProtocol
 
-_POLL = ProtocolMessage("initiator", "", "at once")
-
-_OWN: Final = (
-    RangingProtocol(
-        "ss",
-        "SS-TWR",
-        (_POLL, ProtocolMessage("target", "rx1", "scheduled")),
-        formulas.single_sided,
-        formulas.half_delays,
-    ),
-    RangingProtocol(
-        "ss-cfo",
-        "SS-TWR, corrected with the carrier integrator",
-        (_POLL, ProtocolMessage("target", "rx1", "scheduled")),
-        formulas.carrier_corrected,
-        formulas.carrier_delays,
-    ),
-    RangingProtocol(
-        "ds",
-        "DS-TWR, third message from the target",
-        (_POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("target", "tx2", "scheduled")),
-        formulas.double_sided,
-        formulas.double_sided_delays,
-    ),
-    RangingProtocol(
-        "ds-alt",
-        "DS-TWR, third message from the initiator",
-        (_POLL, ProtocolMessage("target", "rx1", "at once"), ProtocolMessage("initiator", "rx2", "scheduled")),
-        formulas.alternative,
-        formulas.alternative_delays,
-    ),
-    RangingProtocol(
-        "ds-sym",
-        "DS-TWR, third message from the initiator, equal replies",
-        (_POLL, ProtocolMessage("target", "rx1", "scheduled"), ProtocolMessage("initiator", "rx2", "scheduled")),
-        formulas.alternative,
-        formulas.alternative_delays,
-    ),
+_COURSE: Final = (
+    (("initiator", ""),),
+    (("target", "rx1"),),
+    (("target", "tx2"), ("initiator", "rx2")),
 )
+"""Who may send each message of an exchange, and after which stamp: that is what dt41 to dt64 are made of."""
+
+
+def _own_rows() -> tuple[RangingProtocol, ...]:
+    poll, reply = ProtocolMessage("initiator", "", "at once"), ProtocolMessage("target", "rx1", "at once")
+    delayed, last = replace(reply, timing="scheduled"), ProtocolMessage("initiator", "rx2", "scheduled")
+    from_target = ProtocolMessage("target", "tx2", "scheduled")
+    return (
+        RangingProtocol("ss", "SS-TWR", (poll, delayed), rows.single_sided, rows.half_delays),
+        RangingProtocol(
+            "ss-cfo",
+            "SS-TWR, corrected with the carrier integrator",
+            (poll, delayed),
+            rows.carrier_corrected,
+            rows.carrier_delays,
+        ),
+        RangingProtocol(
+            "ds",
+            "DS-TWR, third message from the target",
+            (poll, reply, from_target),
+            rows.double_sided,
+            rows.double_sided_delays,
+        ),
+        RangingProtocol(
+            "ds-alt",
+            "DS-TWR, third message from the initiator",
+            (poll, reply, last),
+            rows.alternative,
+            rows.alternative_delays,
+        ),
+        RangingProtocol(
+            "ds-sym",
+            "DS-TWR, third message from the initiator, equal replies",
+            (poll, delayed, last),
+            rows.alternative,
+            rows.alternative_delays,
+        ),
+    )
+
 
 ON_BOARDS: Final = ("ss", "ds")
 """The protocols that the boards' firmware executes."""
@@ -71,11 +79,69 @@ def check_protocol(row: RangingProtocol) -> None:
         raise ArgumentError(
             f"protocol {row.name!r}: messages: found {row.messages!r:.60}, expected a tuple of ProtocolMessage"
         )
-    check_messages(row)
-    check_formulas(row)
+    _check_messages(row)
+    _check_formulas(row)
 
 
-PROTOCOLS: Final[Registry[RangingProtocol]] = Registry("protocol", "uwbcal.protocols", _OWN, check_protocol)
+def _check_messages(row: RangingProtocol) -> None:
+    """Raise `ArgumentError` for messages that are not two or three, in the order that a recording has stamps for."""
+    where, messages = f"protocol {row.name!r}: messages", row.messages
+    if not 2 <= len(messages) <= 3:
+        raise ArgumentError(
+            f"{where}: found {len(messages)}, expected 2 or 3: an exchange is recorded with the six stamps of three "
+            "messages, and one message alone measures no round trip"
+        )
+    for number, (message, allowed) in enumerate(zip(messages, _COURSE, strict=False), start=1):
+        if (message.sender, message.after) not in allowed:
+            choices = " or ".join(f"from the {sender} after {after or 'nothing'}" for sender, after in allowed)
+            raise ArgumentError(
+                f"{where}: {number} is from the {message.sender} after {message.after or 'nothing'}, expected {choices}"
+            )
+        if message.timing not in ("at once", "scheduled"):
+            raise ArgumentError(f"{where}: {number}: timing: found {message.timing!r}, allowed: at once, scheduled")
+
+
+def _check_formulas(row: RangingProtocol) -> None:
+    """Raise `ArgumentError` for formulas that are not exact for exchanges without noise, or leave antenna delays in."""
+    where, tried = f"protocol {row.name!r}", np.array([1000.0, 4000.0])
+    for name in ("flight_ticks", "delay_weights"):
+        if not callable(getattr(row, name)):
+            raise ArgumentError(f"{where}: {name}: found {getattr(row, name)!r:.60}, expected a function of Intervals")
+    for delays in ((0.0, 0.0), (64.0, 0.0), (0.0, 64.0)):
+        spans = _tried(tried, row.third_sender, delays)
+        try:
+            flight = np.asarray(row.flight_ticks(spans), dtype=np.float64)
+            weights = np.asarray(row.delay_weights(spans), dtype=np.float64)
+        except Exception as error:
+            raise ArgumentError(f"{where}: its formulas fail on an exchange without noise: {error!r:.200}") from error
+        if flight.shape != tried.shape or weights.shape != (2, *tried.shape):
+            raise ArgumentError(
+                f"{where}: its formulas return shapes {flight.shape} and {weights.shape} for two exchanges, "
+                "expected (2,) and (2, 2)"
+            )
+        corrected = flight + weights[0] * delays[0] + weights[1] * delays[1]
+        # 1e-2 ticks is 0.05 mm; what second order leaves of the delay tried, in the project's own rows, is 2e-5.
+        if not np.allclose(corrected, tried, rtol=0, atol=1e-2):
+            culprit = "delay_weights leave" if any(delays) else "flight_ticks finds"
+            raise ArgumentError(
+                f"{where}: {culprit} {corrected[0]:.6g} ticks where an exchange without noise took "
+                f"{tried[0]:g}" + (f", with antenna delays of {delays[0]:g} and {delays[1]:g}" * any(delays))
+            )
+
+
+def _tried(flight: Floats, third: str | None, delays: tuple[float, float]) -> Intervals:
+    """Return the intervals of two exchanges between equal clocks, with the aggregate delay of each side in them."""
+    i, j = delays
+    reply, final = np.array([2e7, 9.8e7]), np.array([9.8e7, 3e7])
+    round_trip = 2 * flight + reply - i
+    if third == "initiator":
+        legs = final + i, 2 * flight + final - j
+    else:
+        legs = (final, final) if third else (np.zeros(2), np.zeros(2))
+    return Intervals(round_trip, reply + j, *legs, np.zeros(2))
+
+
+PROTOCOLS: Final[Registry[RangingProtocol]] = Registry("protocol", "uwbcal.protocols", _own_rows(), check_protocol)
 """Protocols by name: the project's, those of `register_protocol`, and those of installed distributions."""
 
 

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from uwblink.errors import PlanError
+from uwblink.text_files import FileKey, TomlReader, is_number
 from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
-from uwblink.toml import FileKey, TomlReader, is_number
 from uwblink.twr import LARGEST_ID
 
 REGISTER_MAX: Final = 65_535

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uwblink import __version__, columns
+from uwblink import __version__, arrays
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.display import as_html, as_text, excerpt, first_few, printable
 from uwblink.ticks import ANTENNA_DELAY_TICKS, REPORT_BITS, SPEED_OF_LIGHT, TICKS_PER_SECOND
@@ -147,13 +147,13 @@ class Poses:
         >>> poses.position_m[:, 2].tolist(), poses.quaternion[0].tolist()
         ([2.0, 1.0], [0.0, 0.0, 0.0, 1.0])
         """
-        count = columns.length("time_ns", time_ns)
-        time = columns.whole_numbers("time_ns", time_ns, count, -LATEST_NS, LATEST_NS)
-        attitude = columns.vectors("quaternion", (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion, count, 4)
+        count = arrays.length("time_ns", time_ns)
+        time = arrays.whole_numbers("time_ns", time_ns, count, -LATEST_NS, LATEST_NS)
+        attitude = arrays.vectors("quaternion", (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion, count, 4)
         norm = np.linalg.norm(attitude, axis=1)
-        columns.reject("quaternion", attitude, (norm < 0.9) | (norm > 1.1), "x y z w of length 1")
+        arrays.reject("quaternion", attitude, (norm < 0.9) | (norm > 1.1), "x y z w of length 1")
         poses = cls(
-            time, columns.words("body", body, count), columns.vectors("position_m", position_m, count, 3), attitude
+            time, arrays.words("body", body, count), arrays.vectors("position_m", position_m, count, 3), attitude
         )
         return replace(poses, quaternion=attitude / norm[:, None])[np.argsort(time, kind="stable")]
 

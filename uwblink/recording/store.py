@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from uwblink.columns import few_words
+from uwblink.arrays import few_words
 from uwblink.database import connect, duckdb, log_of
 from uwblink.errors import RecordingError, RecordingInUseError, first_line
 from uwblink.recording.intake import (

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from uwblink.errors import PlanError
 from uwblink.recording.schema import Tag
-from uwblink.toml import TomlReader, is_number
+from uwblink.text_files import TomlReader, is_number
 
 LARGEST_BOARD_ID: Final = 254
 PLAN_KEYS: Final = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "antenna_delays")

@@ -19,17 +19,14 @@ from http.client import HTTPException, parse_headers
 from typing import Final
 from urllib.parse import urlsplit
 
-from uwblink.streaming.addresses import LOOPBACK
+LOOPBACK: Final = "127.0.0.1"
+"""The address of this computer, where no other one can connect."""
 
 VIEWERS: Final = "foxglove.dev"
 """The domain of Foxglove's own pages (https://app.foxglove.dev)."""
 
-LONGEST_LINE: Final = 8192
 IDLE_S: Final = 10.0
 """A connection that sends no request for so long is closed: each has a thread."""
-
-PIECE_BYTES: Final = 65_536
-REFUSED: Final = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 def hidden_address() -> str:
@@ -94,9 +91,9 @@ class _Request(socketserver.StreamRequestHandler):
     server: Gate
 
     def handle(self) -> None:
-        line, head = self.rfile.readline(LONGEST_LINE), parse_headers(self.rfile)
+        line, head = self.rfile.readline(8192), parse_headers(self.rfile)
         if not is_viewer(head.get("Host", ""), head.get("Origin"), self.server.host):
-            self.connection.sendall(REFUSED)
+            self.connection.sendall(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
             return
         with socket.create_connection(self.server.inner) as inner:
             lines = (f"{name}: {value}\r\n".encode("latin-1") for name, value in head.items())
@@ -110,7 +107,7 @@ def _carry(one: socket.socket, other: socket.socket) -> None:
     to = {one: other, other: one}
     while True:
         for ready in select.select([one, other], [], [])[0]:
-            data = ready.recv(PIECE_BYTES)
+            data = ready.recv(65_536)
             if not data:
                 return
             to[ready].sendall(data)

@@ -1,14 +1,16 @@
-"""Where streams come from: boards that range now, or a recording played in its own time."""
+"""Ranges as they come, corrected: of boards that range now, or of a recording played in its own time."""
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any
 
 import numpy as np
 
@@ -29,14 +31,62 @@ from uwblink.boards.record import identify
 from uwblink.boards.recorder import Recorder
 from uwblink.errors import ArgumentError
 from uwblink.recording.file import Recording
-from uwblink.streaming.ranges import StreamedRange, streamed
 from uwblink.twr import Exchanges
 from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import RangeReport
 
-Stream = Generator[StreamedRange, None, None]
-AT_A_TIME: Final = 10_000
-"""Rows of a recording that are corrected and made into Python's numbers at once."""
+Stream = Generator["StreamedRange", None, None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamedRange:
+    """A range in metres, when its exchange began (host time, Unix epoch), and of whom.
+
+    `range_m` is as the board reported it. `corrected_m` and its standard deviation `sigma_m` are NaN without a
+    calibration, and for tags that it does not know; `more` is what else the correction says, such as `clamped`.
+
+    >>> import uwblink
+    >>> x = uwblink.Exchanges.from_arrays([1], [2], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    >>> uwblink.Contents(exchanges=x).save("mine.uwb")
+    >>> [round(one.range_m, 2) for one in uwblink.stream("mine.uwb", speed=100.0)]
+    [4.69]
+    """
+
+    time_ns: int
+    initiator: int
+    target: int
+    range_m: float
+    fpp1_dbm: float
+    fpp2_dbm: float
+    skew1_ppm: float
+    skew2_ppm: float
+    corrected_m: float = math.nan
+    sigma_m: float = math.nan
+    more: Mapping[str, float] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what is known, by name; numbers that are not finite are left out, because JSON has none."""
+        ends = {name: getattr(self, name) for name in ("time_ns", "initiator", "target")}
+        levels = {name: getattr(self, name) for name in ("range_m", "corrected_m", "sigma_m", *_LEVELS)}
+        return ends | {name: value for name, value in (levels | dict(self.more)).items() if math.isfinite(value)}
+
+    def to_json(self) -> str:
+        """Return the same as one line of JSON, without its end."""
+        return json.dumps(self.to_dict(), allow_nan=False)
+
+
+_LEVELS = ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
+
+
+def streamed(exchanges: Exchanges, correct: Correction | None) -> Iterator[StreamedRange]:
+    """Yield exchanges as ranges of a stream, corrected where there is a correction."""
+    names = ("time_ns", "initiator", "target", "range_m", *_LEVELS)
+    known = {name: column.tolist() for name, column in (correct(exchanges) if correct else {}).items()}
+    own = {name: known.pop(name) for name in ("corrected_m", "sigma_m") if name in known}
+    columns = {name: getattr(exchanges, name).tolist() for name in names} | own
+    for row in range(len(exchanges)):
+        more = {name: column[row] for name, column in known.items()}
+        yield StreamedRange(more=more, **{name: column[row] for name, column in columns.items()})
 
 
 def stream(
@@ -77,29 +127,36 @@ def stream(
     >>> all(abs(found - 3.0) < 1.0 for found in ranges)
     True
     """
-    _positive("duration_s", duration_s)
-    _positive("speed", speed)
+    for name, value in (("duration_s", duration_s), ("speed", speed)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+            raise ArgumentError(f"found {value!r:.40}, expected a number above 0", parameter=name)
     correct = _correction(calibration)
     if isinstance(source, str | os.PathLike):
         return _play(_exchanges(Path(source), correct), correct, duration_s, speed, stop)
     chosen, told, ports = plan or RangingPlan(), as_listeners(listeners), using or SerialPorts()
     found = identify(source, ports)
     turns = chosen.turns(sorted(found))
-
     ranges: deque[StreamedRange] = deque()
     told = [RangeListener(ranges.append, correct), DelayCheck(chosen.programmed(found)), *told]
     for listener in told:
         listener.on_start(turns)
-    return _live(lambda: Recorder(found, chosen, turns, told, ports=ports), ranges, duration_s, stop)
+
+    def live() -> Stream:
+        recorder = Recorder(found, chosen, turns, told, ports=ports)
+        try:
+            for _ in recorder.steps(duration_s, stop):
+                while ranges:
+                    yield ranges.popleft()
+            recorder.finish()
+            yield from ranges
+        finally:
+            recorder.close()
+
+    return live()
 
 
 def _correction(calibration: str | os.PathLike[str] | Correction | None) -> Correction | None:
     return load_correction(Path(calibration)) if isinstance(calibration, str | os.PathLike) else calibration
-
-
-def _positive(name: str, value: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        raise ArgumentError(f"found {value!r:.40}, expected a number above 0", parameter=name)
 
 
 class RangeListener(Listener):
@@ -154,20 +211,6 @@ class RangeListener(Listener):
                 self._callback(found)
 
 
-def _live(
-    begin: Callable[[], Recorder], found: deque[StreamedRange], duration_s: float, stop: Callable[[], bool]
-) -> Stream:
-    recorder = begin()
-    try:
-        for _ in recorder.steps(duration_s, stop):
-            while found:
-                yield found.popleft()
-        recorder.finish()
-        yield from found
-    finally:
-        recorder.close()
-
-
 def _exchanges(path: Path, correct: Correction | None) -> Exchanges:
     with Recording.open(path) as recording:
         if correct and "calibration" in recording.meta():
@@ -183,8 +226,9 @@ def _play(
 ) -> Stream:
     start_s = time.monotonic()
     first_ns = int(exchanges.time_ns[0]) if len(exchanges) else 0
-    for start in range(0, len(exchanges), AT_A_TIME):
-        for found in streamed(exchanges[start : start + AT_A_TIME], correct):
+    # Some at a time, because as numbers of Python they take ten times the memory.
+    for start in range(0, len(exchanges), 10_000):
+        for found in streamed(exchanges[start : start + 10_000], correct):
             since_s = (found.time_ns - first_ns) * 1e-9
             if since_s > duration_s or not wait_until(start_s + since_s / speed, stop):
                 return

@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.protocols.formulas import Intervals
-from uwblink.protocols.rows import ProtocolMessage, RangingProtocol
+from uwblink.protocols.rows import Intervals, ProtocolMessage, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
 from uwbsim.protocols.conditions import STATES, Conditions
 from uwbsim.random_streams import stream

@@ -14,8 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.protocols.formulas import Intervals
-from uwblink.protocols.rows import RangingProtocol
+from uwblink.protocols.rows import Intervals, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, chosen

@@ -15,8 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.text_files import read_text
-from uwblink.toml import FileKey
+from uwblink.text_files import FileKey, read_text
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.linked_files import Folders, check_linked

@@ -1,19 +1,70 @@
-"""Ranges on a WebSocket that Foxglove opens: a topic a pair, with the schema that exported recordings have, too."""
+"""Ways to send ranges on: JSON in UDP datagrams for PlotJuggler, and a WebSocket that Foxglove opens.
+
+Addresses are "HOST:PORT", "[::1]:PORT", or a port of this computer alone.
+"""
 
 from __future__ import annotations
 
 import json
+import socket
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Self
 
-from uwblink.errors import PortError
+from uwblink.errors import ArgumentError, PortError
 from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
-from uwblink.streaming.addresses import host_and_port
-from uwblink.streaming.gate import Gate, hidden_address
-from uwblink.streaming.ranges import StreamedRange
+from uwblink.streaming.gate import LOOPBACK, Gate, hidden_address
+from uwblink.streaming.sources import StreamedRange
 
-NEWS_KEPT: Final = 1024
-"""Messages that wait for a viewer; the oldest are dropped for one that is slower."""
+
+def host_and_port(text: str, parameter: str) -> tuple[str, int]:
+    """Return host and port; raises `ArgumentError` for what names none."""
+    host, _, port = str(text).rpartition(":")
+    if not port.isascii() or not port.isdecimal() or not 0 <= int(port) <= 65535:
+        raise ArgumentError(f"found {text!r:.60}, expected HOST:PORT or a port from 0 to 65535", parameter=parameter)
+    return host.strip("[]") or LOOPBACK, int(port)
+
+
+class UdpSender:
+    """Sends ranges to a host, whether anybody listens or not. A context manager: leaving it closes the socket.
+
+    A datagram is `{"timestamp": seconds, "ranges": {"10_20": {...}}}`: a plotter has one series a pair and name.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Prepare to send to "HOST:PORT", or to a port of this computer; raises `ArgumentError` and `PortError`."""
+        host, port = host_and_port(address, "udp")
+        if not port:
+            raise ArgumentError(f"found {address!r:.60}, expected a port from 1 to 65535", parameter="udp")
+        try:
+            family, kind, _, _, to = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._socket, self._to = socket.socket(family, kind), to
+        except (OSError, UnicodeError) as error:
+            raise PortError(f"udp {address}: no such host ({_reason(error)})") from error
+        self._address = address
+
+    def __enter__(self) -> Self:
+        """Return the sender."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def send(self, found: StreamedRange) -> None:
+        """Send a range; raises `PortError` where the network does not take it."""
+        pair = f"{found.initiator}_{found.target}"
+        row = {n: value for n, value in found.to_dict().items() if n not in ("time_ns", "initiator", "target")}
+        data = json.dumps({"timestamp": found.time_ns * 1e-9, "ranges": {pair: row}}).encode()
+        try:
+            self._socket.sendto(data, self._to)
+        except OSError as error:
+            raise PortError(f"udp {self._address}: cannot be sent there ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
 
 
 class FoxgloveServer:
@@ -36,10 +87,11 @@ class FoxgloveServer:
             raise PortError(
                 "serving Foxglove needs foxglove-sdk; pip install 'uwbcal[foxglove]'", parameter="foxglove"
             ) from error
+        # For a slow viewer the oldest of 1024 messages are dropped.
         self._context, behind = foxglove.Context(), hidden_address()
         try:
             self._server = foxglove.start_server(
-                name="uwblink", host=behind, port=0, context=self._context, message_backlog_size=NEWS_KEPT
+                name="uwblink", host=behind, port=0, context=self._context, message_backlog_size=1024
             )
         except (RuntimeError, OSError, ValueError) as error:
             raise PortError(f"foxglove {address}: cannot be served ({str(error).splitlines()[0]})") from error
