@@ -45,7 +45,6 @@ def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[Row]:
             parts.append(load_ranges(Path(folder) / f"{name}.uwb"))
     tests = concatenate(parts[1:])
     error = tests.raw_m - tests.truth_m
-    skewness = np.mean(((error - error.mean()) / error.std()) ** 3)
     found = evaluate(tests, fit(parts[0]).calibration)
     accepted = [group.accepted for group in found.pairs.values()]
     return [
@@ -55,7 +54,6 @@ def error_rows(train: Simulated, one: Simulated, two: Simulated) -> list[Row]:
             f"{100 * error.mean():.1f}, {100 * error.std():.1f}",
             TUNED,
         ),
-        ("its skewness", "positive", f"{skewness:+.1f}", PREDICTED),
         (
             "calibrated, after a chi-square test at 95 %: largest mean and std of a pair (cm)",
             "at most about 4 and 8",
@@ -94,14 +92,9 @@ def _std_cm(error: Floats) -> float:
     return 100 * float(np.std(error))
 
 
-def _skewness(error: Floats) -> float:
-    return float(np.mean(((error - error.mean()) / error.std()) ** 3))
-
-
 FIGURES: Final[tuple[tuple[str, Callable[[Floats], float], str], ...]] = (
     ("after rejection: mean by power, in six classes of as many samples (cm)", _mean_cm, TUNED),
     ("the same: standard deviation (cm)", _std_cm, TUNED),
-    ("the same: skewness", _skewness, PREDICTED),
 )
 
 
@@ -150,13 +143,7 @@ def dependence_rows(flight: Simulated) -> list[Row]:
             PREDICTED,
         ),
         (
-            "the same by pair: standard deviation over pairs, and by chance alone",
-            _shares(its_error, its_pair),
-            _shares(error, pair),
-            PREDICTED,
-        ),
-        (
-            "how much weaker their first paths are (dB)",
+            "how much weaker the first paths of these are (dB)",
             f"{trace_db(_above(its_error, its_pair), real.fpp1_dbm):.1f}",
             f"{trace_db(_above(error, pair), e.fpp1_dbm):.1f}",
             TUNED,
@@ -181,14 +168,6 @@ def _above(error: Floats, pair: Ints) -> Floats:
     for key in np.unique(pair):
         found[pair == key] -= np.median(found[pair == key])
     return found
-
-
-def _shares(error: Floats, pair: Ints) -> str:
-    above = _above(error, pair) > TAIL_M
-    counts = np.array([np.count_nonzero(pair == key) for key in np.unique(pair)])
-    shares = np.array([np.mean(above[pair == key]) for key in np.unique(pair)])
-    chance = np.sqrt(np.mean(np.mean(above) * (1 - np.mean(above)) / counts))
-    return f"{100 * np.std(shares):.1f} %, {100 * chance:.1f} %"
 
 
 def lag_one(error: Floats, pair: Ints) -> float:
