@@ -49,17 +49,31 @@ def test_no_such_port(tmp_path, words):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_board_cannot_do(ports, tmp_path):
-    port = ports[1]
-    refused(run("uwblink", "twr", port, 1), "own id")
-    refused(run("uwblink", "twr", port, 9), "COMMANDED TASK FAILED AFTER 5 ATTEMPTS")
-    refused(run("uwblink", "twr", port, 2, "--protocol", "tdoa"), "tdoa", "ss and ds")
-    for delay in ("279", "6501", "100000"):
-        refused(run("uwblink", "set-delay", port, delay), delay, "280 to 6500")
-    refused(run("uwblink", "passive", port, "maybe"), "maybe", "on or off")
-    refused(run("uwblink", "send", port, "x" * 58), "58 bytes", "at most 57", "one USB packet")
-    refused(run("uwblink", "cir", port, 2, "--plot", tmp_path / "c.xyz"), ".xyz", ".png")
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    ("line", "fragments"),
+    [
+        ("twr {one} 1", ["own id"]),
+        ("twr {one} 9", ["COMMANDED TASK FAILED AFTER 5 ATTEMPTS"]),
+        ("twr {one} 2 --protocol tdoa", ["tdoa", "ss and ds"]),
+        ("set-delay {one} 279", ["279", "280 to 6500"]),
+        ("set-delay {one} 100000", ["100000", "280 to 6500"]),
+        ("passive {one} maybe", ["maybe", "on or off"]),
+        ("send {one} " + "x" * 58, ["58 bytes", "at most 57", "one USB packet"]),
+        ("cir {one} 2 --plot {here}/c.xyz", [".xyz", ".png"]),
+        ("record {one} {two} -o {out} --plan {here}/plan.toml", ["names 9", "1, 2"]),
+        ("record {one} {two} -o {out}", ["--plan", "--pairs"]),
+        ("record {one} {two} -o {out} --pairs some", ["some"]),
+        ("record {one} {two} -o {out} --plan {here}/no.toml", ["no.toml"]),
+        ("record {one} -o {out} --pairs all", ["no two boards"]),
+        ("record {one} {two} -o {out} --pairs all -c {here}/no.json", ["--live"]),
+        ("record {one} {two} -o {out} --pairs all --live --calibration {here}/no.json", ["no.json"]),
+    ],
+)
+def test_what_a_board_or_a_recorder_cannot_do(ports, tmp_path, line, fragments):
+    (tmp_path / "plan.toml").write_text("pairs = [[1, 9]]")
+    names = {"one": ports[1], "two": ports[2], "here": tmp_path, "out": tmp_path / "f.uwb"}
+    refused(run("uwblink", *line.format(**names).split()), *fragments)
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 
 def test_a_port_that_is_not_a_board(ports, tmp_path):
@@ -72,22 +86,6 @@ def test_a_port_that_is_not_a_board(ports, tmp_path):
     assert "board 1" in done.stdout
     assert "no answer" in done.stdout
     silent.unplug()
-
-
-def test_recordings_that_cannot_begin(ports, tmp_path):
-    out = tmp_path / "f.uwb"
-    both = [ports[1], ports[2]]
-    plan = tmp_path / "plan.toml"
-    plan.write_text("pairs = [[1, 9]]")
-    refused(run("uwblink", "record", *both, "-o", out, "--plan", plan), "names 9", "1, 2")
-    refused(run("uwblink", "record", *both, "-o", out), "--plan", "--pairs")
-    refused(run("uwblink", "record", *both, "-o", out, "--pairs", "some"), "some")
-    refused(run("uwblink", "record", *both, "-o", out, "--plan", tmp_path / "no.toml"), "no.toml")
-    refused(run("uwblink", "record", ports[1], "-o", out, "--pairs", "all"), "no two boards")
-    nothing = tmp_path / "no.json"
-    refused(run("uwblink", "record", *both, "-o", out, "--pairs", "all", "--calibration", nothing), "--live")
-    refused(run("uwblink", "record", *both, "-o", out, "--pairs", "all", "--live", "--calibration", nothing), "no.json")
-    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
 
 def test_replays_of_what_has_no_bytes(tmp_path):

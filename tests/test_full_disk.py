@@ -100,7 +100,8 @@ SAME = {
     "calib report --figures": "calib compare --figures",
     "calib survey --report": "calib report --output",
     "calib survey --plot": "uwblink cir --plot",
-    # These are written as calibrations are, by `uwblink.output.write_text`.
+    "calib plan flight --output": "calib plan survey --output",
+    "calib plan flight --figures": "calib plan survey --figures",
     # The same function imports whatever form a source has.
     "uwblink import miluv --output": "uwblink import csv --output",
 }
@@ -137,7 +138,7 @@ def of_line(line):
     """Return the output that a line of the table writes."""
     words = line.split()
     flag = next(word for word in reversed(words) if word in ("-o", "--tum", "--figures"))
-    named = words[: 3 if words[1] == "import" else 2]
+    named = words[: 3 if words[1] in ("import", "plan") else 2]
     return f"{' '.join(named)} {'--output' if flag == '-o' else flag}"
 
 

@@ -117,8 +117,8 @@ def text_of(calibration: Calibration) -> str:
         "lift": calibration.lift,
         "alpha_dbm": calibration.alpha_dbm,
         "speed_of_light": calibration.speed_of_light,
-        "bias_curve": _curve_table(calibration.bias_curve),
-        "sigma_curve": _curve_table(calibration.sigma_curve),
+        "bias_curve": curve_table(calibration.bias_curve),
+        "sigma_curve": curve_table(calibration.sigma_curve),
         "provenance": calibration.provenance,
     }
     if calibration.power_at != "exchange":
@@ -127,8 +127,8 @@ def text_of(calibration: Calibration) -> str:
         document["groups"] = {
             name: {
                 "tags": list(group.tags),
-                "bias_curve": _curve_table(group.bias_curve),
-                "sigma_curve": _curve_table(group.sigma_curve),
+                "bias_curve": curve_table(group.bias_curve),
+                "sigma_curve": curve_table(group.sigma_curve),
             }
             for name, group in calibration.groups.items()
         }
@@ -150,7 +150,8 @@ def text_of(calibration: Calibration) -> str:
     return on_lines + "\n"
 
 
-def _curve_table(curve: Curve) -> dict[str, Any]:
+def curve_table(curve: Curve) -> dict[str, Any]:
+    """Return a curve as a table of a file."""
     return {
         "knots": list(curve.knots),
         "coefficients": list(curve.coefficients),

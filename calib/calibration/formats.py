@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import yaml
 
 from calib.calibration.c_header import c_header
-from calib.calibration.document import finite, is_tag
+from calib.calibration.document import curve_table, finite, is_tag
+from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.power_curves import ALPHA_DBM, Curve
 from calib.data.sources import antenna_delays_in
@@ -147,31 +149,30 @@ def _miluv(calibration: Calibration) -> str:
 
 
 def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
-    lines = ["uwb_calibration:", f"  alpha_dbm: {calibration.alpha_dbm}", f"  lift: {calibration.lift}"]
-    lines += [f"  power_at: {calibration.power_at}", "  tags:"]
     to_program = _on_top(calibration, base)
+    tags: dict[str, Any] = {}
     for tag, delay in sorted(calibration.delays_ns.items()):
-        lines += [f"    '{tag}':", f"      delay_ns: {delay!r}"]
+        tags[str(tag)] = {"delay_ns": delay}
         if tag in to_program:
-            lines += [f"      tx_antenna_delay: {to_program[tag].tx}", f"      rx_antenna_delay: {to_program[tag].rx}"]
-    for name, curve in (("bias_curve", calibration.bias_curve), ("sigma_curve", calibration.sigma_curve)):
-        lines += [
-            f"  {name}:",
-            f"    degree: {curve.degree}",
-            f"    knots: {json.dumps(list(curve.knots))}",
-            f"    coefficients: {json.dumps(list(curve.coefficients))}",
-            f"    range: {json.dumps(list(curve.range))}",
-        ]
-    return "\n".join([*lines, *_error_lines(calibration)]) + "\n"
+            registers = {"tx_antenna_delay": to_program[tag].tx, "rx_antenna_delay": to_program[tag].rx}
+            tags[str(tag)] |= registers
+    document: dict[str, Any] = {
+        "alpha_dbm": calibration.alpha_dbm,
+        "lift": calibration.lift,
+        "power_at": calibration.power_at,
+        "tags": tags,
+        "bias_curve": curve_table(calibration.bias_curve),
+        "sigma_curve": curve_table(calibration.sigma_curve),
+    }
+    if calibration.errors:
+        document["errors"] = _error_tables(calibration.errors)
+    text: str = yaml.safe_dump({"uwb_calibration": document}, sort_keys=False, default_flow_style=None, width=math.inf)
+    return text
 
 
-def _error_lines(calibration: Calibration) -> list[str]:
-    """Return what errors to expect, by pair and power, as tables to interpolate in; nothing where it is not known."""
-    model = calibration.errors
-    if model is None:
-        return []
-    lifted = np.array(model.lifted)
-    lines = ["  errors:", f"    lifted: {json.dumps(list(model.lifted))}", "    pairs:"]
+def _error_tables(model: ErrorModel) -> dict[str, Any]:
+    """Return what errors to expect, by pair and lifted power, as tables to interpolate in."""
+    lifted, pairs = np.array(model.lifted), {}
     for name in [*model.pairs, "other"]:
         ends = [0, 0] if name == "other" else [int(end) for end in name.split("-")]
         first, second = (np.full(len(lifted), end) for end in ends)
@@ -184,8 +185,8 @@ def _error_lines(calibration: Calibration) -> list[str]:
             "low95_m": low,
             "high95_m": high,
         }
-        lines += [f"      '{name}':", *(f"        {key}: {json.dumps(row.tolist())}" for key, row in rows.items())]
-    return lines
+        pairs[name] = {key: row.tolist() for key, row in rows.items()}
+    return {"lifted": list(model.lifted), "pairs": pairs}
 
 
 FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = {

@@ -81,14 +81,3 @@ def test_a_fit_given_for_its_calibration_is_told_so():
     with pytest.raises(calib.BadInputError) as caught:
         calib.evaluate(flight, result)
     assert str(caught.value) == "`calibration`: found FitResult, expected a Calibration; give its `.calibration`"
-
-
-@pytest.mark.parametrize(
-    ("parameter", "change"),
-    [("protocol", {"protocol": "zz"}), ("target", {"target": [2, 1]}), ("weights", {"weights": (0.5,)})],
-)
-def test_arrays_that_cannot_be_ranges_are_refused(parameter, change):
-    columns = {"initiator": 1, "target": [2, 3], "fpp1_dbm": -85.0} | change
-    with pytest.raises(calib.BadInputError) as caught:
-        calib.Ranges.from_arrays([3.1, 4.2], **columns)
-    assert caught.value.parameter == parameter

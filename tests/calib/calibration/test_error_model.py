@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from scipy.stats import exponnorm, norm
 
 import calib
@@ -25,61 +26,42 @@ MODEL = ErrorModel(
 COUNT = 400_000
 
 
-def drawn(lifted, first, second, seed=0):
-    """Draw errors of one kind of range, and which of them were reflected; straight from the definition."""
-    rng = np.random.default_rng(seed)
-    known = {first, second} == {1, 2}
-    noise = np.exp(np.interp(lifted, MODEL.lifted, np.log(MODEL.noise_m))) * (1.5 if known else 1)
-    odds = np.exp(np.interp(lifted, MODEL.lifted, [np.log(t / (1 - t)) for t in MODEL.tail_share]))
-    share = 1 / (1 + 1 / (odds * (3.0 if known else 1.0)))
-    kind = rng.random(COUNT)
-    error = rng.normal(0, noise, COUNT)
-    reflected = kind < 0.998 * share
-    error[reflected] += 0.05 + rng.exponential(0.3 * (0.5 if known else 1), np.count_nonzero(reflected))
-    wild = kind > 0.998
-    error[wild] = rng.normal(0, 0.9, np.count_nonzero(wild))
-    return error + 0.02, reflected, wild
-
-
 TWO_KINDS = replace(MODEL, long_share=0.4, long_factor=4.0)
 
 
-@pytest.mark.parametrize("pair", [(1, 2), (3, 7)])
-def test_two_kinds_of_detour_have_the_spread_and_the_quantiles_of_draws(pair):
-    rng, known = np.random.default_rng(3), pair == (1, 2)
-    error, reflected, wild = drawn(0.5, *pair)
-    shapes = TWO_KINDS.shapes(np.full(1, 0.5), *(np.full(1, tag) for tag in pair))
-    error = rng.normal(0, shapes.noise_m[0], COUNT)
-    mean = 0.3 * (0.5 if known else 1) / (0.6 + 0.4 * 4)
-    detour = 0.05 + rng.exponential(np.where(rng.random(COUNT) < 0.4, 4 * mean, mean))
-    error = 0.02 + np.where(wild, rng.normal(0, 0.9, COUNT), error + detour * reflected)
-    assert TWO_KINDS.mean_m(shapes)[0] == pytest.approx(error.mean(), abs=4 * error.std() / np.sqrt(COUNT))
-    assert TWO_KINDS.total_m(shapes)[0] == pytest.approx(error.std(), rel=0.015)
-    shares = [0.025, 0.5, 0.9, 0.975, 0.995]
-    found = TWO_KINDS.quantiles(shares, np.full(1, 0.5), *(np.full(1, tag) for tag in pair))[0]
-    np.testing.assert_allclose([np.mean(error < q) for q in found], shares, atol=0.002)
-    near = np.abs(error - 0.3) < 0.01
-    tail, _ = TWO_KINDS.tail_given(np.full(1, 0.3), shapes)
-    assert tail[0] == pytest.approx(np.mean(reflected[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near)))
+def drawn(model, lifted, known, seed=0):
+    """Draw errors of one kind of range, which were reflected, and which are outliers; straight from the definition."""
+    rng = np.random.default_rng(seed)
+    noise = np.exp(np.interp(lifted, MODEL.lifted, np.log(MODEL.noise_m))) * (1.5 if known else 1)
+    odds = np.exp(np.interp(lifted, MODEL.lifted, [np.log(t / (1 - t)) for t in MODEL.tail_share]))
+    share = 1 / (1 + 1 / (odds * (3.0 if known else 1.0)))
+    mean = 0.3 * (0.5 if known else 1) / (0.6 + 0.4 * 4 if model is TWO_KINDS else 1)
+    longer = np.where((rng.random(COUNT) < 0.4) & (model is TWO_KINDS), 4.0, 1.0)
+    kind, error = rng.random(COUNT), rng.normal(0, noise, COUNT)
+    reflected, wild = kind < 0.998 * share, kind > 0.998
+    error += reflected * (0.05 + rng.exponential(mean * longer))
+    error = np.where(wild, rng.normal(0, 0.9, COUNT), error)
+    return error + 0.02, reflected, wild
 
 
+@pytest.mark.parametrize("model", [MODEL, TWO_KINDS], ids=["one kind", "two kinds"])
 @pytest.mark.parametrize(("lifted", "first", "second"), [(0.1, 1, 2), (0.7, 2, 1), (0.7, 1, 3), (4.0, 7, 3)])
-def test_mean_spread_quantiles_and_shares_are_those_of_draws(lifted, first, second):
-    error, reflected, wild = drawn(lifted, first, second)
+def test_mean_spread_quantiles_and_shares_are_those_of_draws(model, lifted, first, second):
+    error, reflected, wild = drawn(model, lifted, {first, second} == {1, 2})
     ends = np.full(1, first), np.full(1, second)
-    shapes = MODEL.shapes(np.full(1, lifted), *ends)
+    shapes = model.shapes(np.full(1, lifted), *ends)
     # Four standard errors of each figure, from 400 000 draws.
-    assert MODEL.mean_m(shapes)[0] == pytest.approx(error.mean(), abs=4 * error.std() / np.sqrt(COUNT))
-    assert MODEL.total_m(shapes)[0] == pytest.approx(error.std(), rel=0.012)
+    assert model.mean_m(shapes)[0] == pytest.approx(error.mean(), abs=4 * error.std() / np.sqrt(COUNT))
+    assert model.total_m(shapes)[0] == pytest.approx(error.std(), rel=0.015)
     assert shapes.tail_share[0] == pytest.approx(np.mean(reflected) / 0.998, abs=0.003)
     shares = [0.01, 0.025, 0.3, 0.9, 0.975]
     if lifted == 0.1 or lifted > 1.5:
-        found = MODEL.quantiles(shares, np.full(1, lifted), *ends)[0]
+        found = model.quantiles(shares, np.full(1, lifted), *ends)[0]
         np.testing.assert_allclose([np.mean(error < q) for q in found], shares, atol=0.002)
     for value in (-0.1, 0.05, 0.15, 0.6):
-        assert MODEL.below(np.full(1, value), shapes)[0] == pytest.approx(np.mean(error < value), abs=0.0032)
+        assert model.below(np.full(1, value), shapes)[0] == pytest.approx(np.mean(error < value), abs=0.0032)
         near = np.abs(error - value) < 0.01
-        tail, outlier = MODEL.tail_given(np.full(1, value), shapes)
+        tail, outlier = model.tail_given(np.full(1, value), shapes)
         assert tail[0] == pytest.approx(np.mean(reflected[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near) + 1))
         assert outlier[0] == pytest.approx(np.mean(wild[near]), abs=0.02 + 3 / np.sqrt(np.count_nonzero(near) + 1))
 
@@ -160,15 +142,12 @@ def test_shares_that_are_none(fitted, shares):
 
 
 def test_the_yaml_has_tables_to_interpolate_in(fitted):
-    rows: dict[str, list[str]] = {}
-    for line in calib.export(fitted, "ros-yaml").splitlines():
-        name, _, values = line.strip().partition(": ")
-        rows.setdefault(name.rstrip(":"), []).append(values)
-    pairs = [*fitted.errors.pairs, "other"]
-    assert [name for name in rows if name.strip("'") in pairs] == [f"'{name}'" for name in pairs]
-    lifted = np.array(json.loads(rows["lifted"][0]))
+    errors = yaml.safe_load(calib.export(fitted, "ros-yaml"))["uwb_calibration"]["errors"]
+    assert set(errors["pairs"]) == {*fitted.errors.pairs, "other"}
+    lifted = np.array(errors["lifted"])
     ends = np.full(len(lifted), 2), np.full(len(lifted), 1)
-    shapes = fitted.errors.shapes(lifted, *ends)
-    np.testing.assert_allclose(json.loads(rows["sigma_total_m"][0]), fitted.errors.total_m(shapes))
+    np.testing.assert_allclose(
+        errors["pairs"]["1-2"]["sigma_total_m"], fitted.errors.total_m(fitted.errors.shapes(lifted, *ends))
+    )
     low = fitted.errors.quantiles([0.025], lifted, *ends)[:, 0]
-    np.testing.assert_allclose(json.loads(rows["low95_m"][0]), low)
+    np.testing.assert_allclose(errors["pairs"]["1-2"]["low95_m"], low)
