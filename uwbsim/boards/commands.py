@@ -31,7 +31,7 @@ import re
 import struct
 from collections.abc import Callable, Container, Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import simpy
@@ -96,18 +96,14 @@ def printed_float(value: float) -> bytes:
     return write_printed(single)
 
 
-NO_KEY: Final = b"No next key character found."
 NO_END: Final = b"Failed to detect USB command terminator char! Trying my best"
-
-_NUMBER: Final = re.compile(rb"\s*([+-]?)0*(\d+)")
-MOST_DIGITS: Final = 11
 
 
 def atoi(text: bytes) -> int:
     """Return the number at the start of a text, 0 where there is none, as C's function does; a larger one saturates."""
-    found = _NUMBER.match(text)
+    found = re.match(rb"\s*([+-]?)0*(\d+)", text)
     # Eleven digits are beyond the largest number already, and how many more there are does not matter.
-    return max(-LARGEST - 1, min(int(found[1] + found[2][:MOST_DIGITS]), LARGEST)) if found else 0
+    return max(-LARGEST - 1, min(int(found[1] + found[2][:11]), LARGEST)) if found else 0
 
 
 def _flag(text: bytes) -> bool:
@@ -115,13 +111,11 @@ def _flag(text: bytes) -> bool:
 
 
 _UNTIL_BAR: Final[dict[Kind, Callable[[bytes], Any]]] = {INT: atoi, ID: atoi, STAMP: atoi, BOOL: _flag, TEXT: bytes}
-_COUNTED: Final = (BYTES, BROADCAST)
-READABLE: Final = (*_UNTIL_BAR, *_COUNTED, RAW_FLOAT)
+READABLE: Final = (*_UNTIL_BAR, BYTES, BROADCAST, RAW_FLOAT)
 """The kinds of fields that a command can have."""
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """A command as the board understood it: which, and the values of its fields in their order."""
 
     kind: type[Message]
@@ -155,7 +149,8 @@ def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
             command, end = _command(buffer, at, known)
         except _Missing as missing:
             # What the firmware does next depends on link addresses; the boards seen survived with an empty buffer.
-            return Reading(tuple(commands), (NO_KEY,) * missing.fields + (NO_END,), b"", alive=True)
+            complaints = (*[b"No next key character found."] * missing.fields, NO_END)
+            return Reading(tuple(commands), complaints, b"", alive=True)
         except _Unended:
             return Reading(tuple(commands), (NO_END,), b"", alive=False)
         commands.append(command)
@@ -186,7 +181,7 @@ def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
         if len(raw) < 4:
             raise _Unended
         return struct.unpack("<f", raw)[0], at + 4
-    if field in _COUNTED:
+    if field in (BYTES, BROADCAST):
         length = int.from_bytes(buffer[at : at + 2], "little")
         if at + 2 + length > len(buffer):
             raise _Unended
@@ -196,14 +191,9 @@ def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
     return _UNTIL_BAR[field](buffer[at:end]), end
 
 
-BOOTLOADER_AFTER: Final = 103 * MS
 ANSWER: Final = 195 * US
 """From the poll of the USB buffer that found a command to its answer on the bus."""
 
-TO_SENT: Final = 930 * US
-"""From the start of a broadcast's frame to its answer on the bus."""
-
-TOO_LONG: Final = b"ERROR: Requested to send message over UWB that is too long."
 
 Attempt = Generator[simpy.Event, Any, bool]
 """What takes time: yields SimPy events of the bench, in nanoseconds, and returns whether the command is done."""
@@ -229,14 +219,6 @@ def register_command(kind: type[Message], execute: Executor) -> None:
     EXECUTORS[kind.KEY] = execute
 
 
-def _set_idle(_board: VirtualBoard) -> Message:
-    return IdleSet()
-
-
-def _get_id(board: VirtualBoard) -> Message:
-    return IdReport(board.id)
-
-
 def _reset(board: VirtualBoard) -> Message:
     if not board.radio.sending:
         board.radio.listen()
@@ -253,10 +235,6 @@ def _set_passive(board: VirtualBoard, on: bool) -> Message:
     return PassiveSet()
 
 
-def _max_frame(_board: VirtualBoard) -> Message:
-    return MaxFrameReport(100)
-
-
 def _set_delay(board: VirtualBoard, delay_uus: int) -> Message:
     board.delay_uus = delay_uus % 65_536
     return ResponseDelaySet()
@@ -264,40 +242,37 @@ def _set_delay(board: VirtualBoard, delay_uus: int) -> Message:
 
 def _bootloader(board: VirtualBoard) -> Attempt:
     yield from board.answer(EnteringBootloader())
-    board.sleep(BOOTLOADER_AFTER).callbacks.append(lambda _: board.power_off())
-    yield board.sleep(2 * BOOTLOADER_AFTER)
+    boots_after = 103 * MS
+    board.sleep(boots_after).callbacks.append(lambda _: board.power_off())
+    yield board.sleep(2 * boots_after)
     return True
 
 
 def _broadcast(board: VirtualBoard, data: bytes) -> Attempt:
     if len(data) > LONGEST_BROADCAST:
-        board.say(TOO_LONG, ANSWER)
+        board.say(b"ERROR: Requested to send message over UWB that is too long.", ANSWER)
         yield board.sleep(MS)
         return False
     board.radio.off()
     yield board.sleep(TO_AIR - board.bench.air.before_marker)
     board.radio.send(None, DataPayload(data), board.radio.first_stamp())
-    yield board.sleep(TO_SENT)
+    yield board.sleep(930 * US)
     board.say(BroadcastSent())
     return True
-
-
-def _range(board: VirtualBoard, target: int, target_reports: bool, double_sided: bool, get_cir: bool) -> Attempt:
-    return initiate(board, target % 256, target_reports, double_sided, get_cir)
 
 
 EXECUTORS: Final[dict[bytes, Executor]] = {}
 """What each command does, by its key; `register_command` adds to it."""
 
 for _kind, _execute in (
-    (SetIdle, _set_idle),
-    (GetId, _get_id),
+    (SetIdle, lambda board: IdleSet()),
+    (GetId, lambda board: IdReport(board.id)),
     (Reset, _reset),
     (DoTests, _do_tests),
     (SetPassive, _set_passive),
-    (RangeCommand, _range),
+    (RangeCommand, lambda board, target, *wishes: initiate(board, target % 256, *wishes)),
     (Broadcast, _broadcast),
-    (GetMaxFrame, _max_frame),
+    (GetMaxFrame, lambda board: MaxFrameReport(100)),
     (SetResponseDelay, _set_delay),
     (Bootloader, _bootloader),
 ):

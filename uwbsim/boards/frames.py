@@ -16,7 +16,7 @@ import numpy as np
 import simpy
 
 from uwblink.arrays import Bools, Floats, Ints
-from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, REPORT_BITS, TICK_S, UUS_TICKS
+from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, TICK_S, UUS_TICKS
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import (
@@ -32,10 +32,6 @@ from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import SampledWorld, World
-
-MASK: Final = (1 << REPORT_BITS) - 1
-DATA_BYTES: Final = 8
-"""A broadcast's frame besides its payload (firmware wire format, 2.1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +69,8 @@ class DataPayload:
 
     @property
     def length(self) -> int:
-        """Return the length of the frame in bytes."""
-        return DATA_BYTES + len(self.data)
+        """Return the length of the frame in bytes: 8 besides its payload (firmware wire format, 2.1)."""
+        return 8 + len(self.data)
 
 
 Payload = PollPayload | ResponsePayload | FinalPayload | DataPayload
@@ -223,8 +219,6 @@ NS_PER_S: Final = 1_000_000_000
 PREAMBLE_TIMEOUT: Final = 6_521 * US
 """How long a board waits for a preamble (firmware wire format, 3.1)."""
 
-KEPT: Final = 20 * MS
-"""For how long a frame that is over may still matter to one that is not."""
 
 Wait = Generator[simpy.Event, Any, "Received | None"]
 
@@ -251,7 +245,8 @@ class BoardAir:
         marker = frame.departure * NS_PER_S // SUBTICKS_PER_SECOND
         frame.start = marker - self.before_marker
         frame.end = marker + _ns(after_marker_s(frame.payload.length))
-        oldest = int(self.env.now) - KEPT
+        # A frame that is over for 20 ms matters to none any more.
+        oldest = int(self.env.now) - 20 * MS
         self._frames = [f for f in self._frames if f.end > oldest and not f.cancelled]
         self._frames.append(frame)
         over = self.env.timeout(max(frame.end - int(self.env.now), 0))

@@ -18,7 +18,6 @@ from uwblink.twr import Exchanges, board_range
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import BroadcastReceived, Cir, Overheard, OverheardNothing, RangeReport, TargetRangeReport
 from uwbsim.boards.frames import (
-    MASK,
     MS,
     PREAMBLE_TIMEOUT,
     US,
@@ -30,6 +29,7 @@ from uwbsim.boards.frames import (
     Received,
     ResponsePayload,
 )
+from uwbsim.simulation.reporting import MASK
 from uwbsim.world.impulse_response import impulse_response, in_transfers
 
 if TYPE_CHECKING:
@@ -45,17 +45,6 @@ TO_FINAL: Final = 136 * US
 TO_REPORT: Final = 474 * US
 """From the end of the last frame to the report on the bus: read-out, arithmetic, printing."""
 
-TO_CIR: Final = (3_800 * US, 6_000 * US)
-"""From a report to the first piece of its impulse response: read-out over SPI, and 1016 magnitudes."""
-
-SINGLE_SIDED_DELAY_UUS: Final = 1500
-"""The reply of a single-sided exchange is not settable on the boards (firmware wire format, 0.5)."""
-
-SHORTEST_WORKING_DELAY_UUS: Final = 265
-"""Below this many the delayed transmission would start in the past (firmware wire format, 3.6)."""
-
-LONGEST_ACCEPTED_DELAY_UUS: Final = 32_767
-OWN_ID: Final = b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n"
 
 Steps = Generator[simpy.Event, Any, None]
 Attempt = Generator[simpy.Event, Any, bool]
@@ -73,7 +62,7 @@ def is_expected(received: Received | None, payload: type[Payload], sender: int, 
 def initiate(board: VirtualBoard, target: int, target_reports: bool, double_sided: bool, get_cir: bool) -> Attempt:
     """Range with a target, one try (C05)."""
     if target == board.id:
-        return (yield from board.answer(OWN_ID))
+        return (yield from board.answer(b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n"))
     radio = board.radio
     radio.off()
     board.ranging = radio.masked = True
@@ -127,12 +116,14 @@ def answer(board: VirtualBoard, received: Received) -> Steps:
     if wish.double_sided:
         first = radios.reply_stamp(board.id, received.stamp)
         yield radio.over(radio.send(initiator, ResponsePayload(), first, excess))
-        if not SHORTEST_WORKING_DELAY_UUS <= board.delay_uus <= LONGEST_ACCEPTED_DELAY_UUS:
+        # A shorter delayed transmission would start in the past (firmware wire format, 3.6).
+        if not 265 <= board.delay_uus <= 32_767:
             return
         last, told = radios.scheduled_stamps(board.id, first, board.delay_uus)
         sent = first, told
     else:
-        last, told = radios.scheduled_stamps(board.id, received.stamp, SINGLE_SIDED_DELAY_UUS)
+        # That of a single-sided exchange is not settable on the boards (firmware wire format, 0.5).
+        last, told = radios.scheduled_stamps(board.id, received.stamp, 1500)
         first, sent = last, (told, told)
     payload = FinalPayload(_of_target(received.stamp, *sent, wish), received.power_dbm, received.skew_ppm)
     radio.send(initiator, payload, last, excess)
@@ -204,7 +195,8 @@ def range_report(neighbour: int, stamps: dict[str, int], powers: tuple[float, fl
 
 def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) -> Steps:
     """Print the impulse response of the last frame received, a piece a millisecond; other tasks run between them."""
-    yield board.sleep(int(board.chance.integers(*TO_CIR)))
+    # Read-out over SPI, and 1016 magnitudes.
+    yield board.sleep(int(board.chance.integers(3_800 * US, 6_000 * US)))
     board.release()
     frame = last.frame
     paths = board.bench.radios.paths(frame, board.id)
@@ -217,9 +209,6 @@ def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) 
 TO_LINE: Final = 90 * US
 """From the end of a frame to a line that needs no arithmetic."""
 
-TO_OVERHEARD: Final = 525 * US
-WARNING_B: Final = b"WARNING 0xB: TWR message is firing an interrupt when it shouldn't be.\r\n"
-WARNING_C: Final = b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n"
 
 Expected = tuple[type[Payload], int, int, int | None]
 """A frame that a listener waits for: its payload, its two boards, and for how long."""
@@ -238,7 +227,8 @@ def received_by(board: VirtualBoard, received: Received | None) -> Steps | None:
     elif isinstance(payload, DataPayload):
         board.say(BroadcastReceived(payload.data), TO_LINE)
     else:
-        board.say(WARNING_B if isinstance(payload, ResponsePayload) else WARNING_C, TO_LINE)
+        number = b"B" if isinstance(payload, ResponsePayload) else b"C"
+        board.say(b"WARNING 0x" + number + b": TWR message is firing an interrupt when it shouldn't be.\r\n", TO_LINE)
     board.radio.listen()
     return None
 
@@ -262,7 +252,7 @@ def overhear(board: VirtualBoard, poll: Received) -> Steps:
                 board.say(OverheardNothing(initiator, target), TO_LINE)
             return
         heard.append(came)
-    yield board.sleep(TO_OVERHEARD)
+    yield board.sleep(525 * US)
     if wish.get_cir:
         yield from print_cir(board, initiator, target, heard[-1])
     board.say(_overheard(initiator, target, wish, heard))

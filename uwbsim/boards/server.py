@@ -14,7 +14,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -51,9 +50,6 @@ def stays_s(scenario: Scenario) -> list[tuple[float, float]]:
     return [*found, (since, math.inf)] if carried else []
 
 
-HEADER: Final = "time_ns,body,x,y,z,qx,qy,qz,qw\n"
-
-
 class LivePoses:
     """Writes what motion capture sees, with its rate, noise, latency and gaps, as `uwblink poses` reads it.
 
@@ -66,7 +62,7 @@ class LivePoses:
         self._eyes = {name: _Eye(world, name) for name in world.trajectories}
         self._next = 0
         self._file = new_file(path, force=True)
-        self._file.write(HEADER)
+        self._file.write("time_ns,body,x,y,z,qx,qy,qz,qw\n")
         self._file.flush()
 
     def write_until(self, time_ns: int) -> None:
@@ -124,17 +120,12 @@ class _Eye:
         return time_s >= self._blind_from_s
 
 
-LONGEST_WAIT_S: Final = 0.1
-POSES_EVERY: Final = 100 * MS
-
-
-PREPARED_S: Final = 7200.0
-"""For how long bodies go on moving when nobody says for how long to serve; then they hold their place."""
-
-
 def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
-    """Return a scenario that lasts as long as it is to be served."""
-    longer = max(scenario.run.duration_s, duration_s or PREPARED_S)
+    """Return a scenario that lasts as long as it is to be served; two hours where nobody says for how long.
+
+    Then bodies hold their place.
+    """
+    longer = max(scenario.run.duration_s, duration_s or 7200.0)
     return scenario.model_copy(
         update={"run": scenario.run.model_copy(update={"duration_s": min(longer, LONGEST_RUN_S)})}
     )
@@ -219,7 +210,7 @@ class Server:
     def step(self) -> None:
         """Wait for bytes or for what is due next, and do it."""
         due = min(self.bench.next_ns(), self._timed[0][0] if self._timed else float("inf"))
-        wait_s = min(max((due - self._now_ns()) / NS_PER_S / self._speed, 0.0), LONGEST_WAIT_S)
+        wait_s = min(max((due - self._now_ns()) / NS_PER_S / self._speed, 0.0), 0.1)
         for key, _ in self._selector.select(wait_s):
             tag: int = key.data
             data = self._terminals[tag].read()
@@ -253,7 +244,7 @@ class Server:
         except OSError as error:
             self._tell(f"the poses end here: {error.strerror or error}")
             return
-        self._at(now + POSES_EVERY, self._append_poses)
+        self._at(now + 100 * MS, self._append_poses)
 
     def _crashed(self, board: VirtualBoard, error: Exception) -> None:
         self._tell(f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}")

@@ -23,9 +23,9 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 
 PACKET_BYTES: Final = 64
+"""Of full-speed USB; a packet takes 55 us on the bus (fitted to transcripts, as all times here)."""
+
 PACKET_GAP: Final = 55 * US
-INBOUND: Final = 100 * US
-LONGEST_QUEUE: Final = 8
 FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 
 
@@ -57,7 +57,7 @@ class UsbLink:
             piece = data[at : at + PACKET_BYTES]
             # The firmware drops packets of one byte; "~" alone is one of them.
             if len(piece) > 1:
-                self._after(INBOUND + number * PACKET_GAP, partial(self._arrive, piece))
+                self._after(100 * US + number * PACKET_GAP, partial(self._arrive, piece))
 
     def read(self) -> bytes:
         """Return what has come, which empties the queue."""
@@ -77,7 +77,7 @@ class UsbLink:
         self._env.timeout(delay).callbacks.append(lambda _: work() if self._open else None)
 
     def _arrive(self, piece: bytes) -> None:
-        if len(self._packets) >= LONGEST_QUEUE:
+        if len(self._packets) >= 8:
             self._transfer(FULL)
             return
         self._packets.append(piece)
@@ -96,11 +96,7 @@ class UsbLink:
 
 
 POLL_PERIOD: Final = MS
-LONGEST_BUFFER: Final = 8000
-COMPLAINT: Final = 118 * US
-LAST_RETRY: Final = 5
-DEFAULT_DELAY_UUS: Final = 1500
-FAILED: Final = b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n"
+"""How often the firmware looks at its USB buffer (firmware wire format, 1.3)."""
 
 Steps = Generator[simpy.Event, Any, None]
 Sender = Callable[[int, int, bytes], None]
@@ -159,7 +155,7 @@ class VirtualBoard:
         env = self.bench.env
         self.powered, self.alive = True, True
         self.passive = False
-        self.delay_uus = DEFAULT_DELAY_UUS
+        self.delay_uus = 1500  # UWB microseconds, until C08 sets it
         self.ranging = False
         self._buffer = b""
         self._task = _Task()
@@ -265,15 +261,16 @@ class VirtualBoard:
         if not self.usb.waiting:
             return
         self._buffer += self.usb.read()
-        if len(self._buffer) > LONGEST_BUFFER:
+        longest = 8000
+        if len(self._buffer) > longest:
             self.say(FULL)
-            self._buffer = self._buffer[:LONGEST_BUFFER]
+            self._buffer = self._buffer[:longest]
         reading = read_commands(self._buffer, EXECUTORS)
         self._buffer = reading.rest
         for number, complaint in enumerate(reading.complaints):
             if number:
                 yield self.sleep(MS)
-            self.say(complaint, COMPLAINT)
+            self.say(complaint, 118 * US)
         if not reading.alive:
             self.hang()
         elif reading.commands:
@@ -281,8 +278,8 @@ class VirtualBoard:
             self._task.command = reading.commands[-1]
 
     def _try(self, command: Command) -> Steps:
-        if self._task.tries > LAST_RETRY:
-            self.say(FAILED, ANSWER)
+        if self._task.tries > 5:
+            self.say(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", ANSWER)
             self._task = _Task()
             return
         answer = EXECUTORS[command.kind.KEY](self, *command.values)

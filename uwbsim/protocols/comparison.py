@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -28,14 +28,6 @@ from uwbsim.scenario.ranging import (
     frame_s,
     message_bytes,
 )
-
-MOST: Final = 50_000_000
-"""Ranges a protocol of which quantiles are taken exactly: 400 MB of errors."""
-
-SAMPLE: Final = 200_000
-"""Errors of each protocol that are kept."""
-
-WINNER_DELAYS_US: Final = (300, 600, 1000, 1500, 2000, 3000, 5000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,8 +139,9 @@ def compare(
     (10000,)
     """
     scenario, rows = as_scenario(scenario), chosen(protocols)
-    if not 1 <= count <= MOST:
-        raise ParameterError(f"found {count}, expected 1 to {MOST}", parameter="count")
+    most = 50_000_000  # of which quantiles are taken exactly: 400 MB of errors a protocol
+    if not 1 <= count <= most:
+        raise ParameterError(f"found {count}, expected 1 to {most}", parameter="count")
     conditions = conditions_of(scenario)
     outcomes, samples = [], {}
     for number, protocol in enumerate(rows):
@@ -159,7 +152,7 @@ def compare(
 
         errors = range_errors_m(protocol, conditions, scenario.run.seed, count, report)
         outcomes.append(_outcome(scenario, protocol, conditions, errors))
-        samples[protocol.name] = errors[:SAMPLE].copy()
+        samples[protocol.name] = errors[:200_000].copy()
     return Comparison(scenario=scenario, protocols=tuple(rows), outcomes=outcomes, samples=samples)
 
 
@@ -218,7 +211,7 @@ def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[di
     """
     world = calibrated(conditions_of(scenario, 2048))
     rows = []
-    for delay_us in WINNER_DELAYS_US:
+    for delay_us in (300, 600, 1000, 1500, 2000, 3000, 5000):
         here = world.with_columns(scheduled=delay_us * 1e-6)
         rmse, score = {}, {}
         for protocol in protocols:
@@ -296,13 +289,6 @@ def paper_bias_m(skew_ppm: float, reply_s: float) -> float:
     return 0.5 * SPEED_OF_LIGHT * skew_ppm * 1e-6 * reply_s
 
 
-SHORTEST_S: Final = 287e-6
-"""280 UWB microseconds, below which the boards miss the time to send (firmware wire format)."""
-
-LONGEST_S: Final = 6.6e-3
-POINTS: Final = 121
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Optimum:
     """The best delay, and the curve: delays in seconds, mean squared error of a range and of a second of them in m^2.
@@ -366,7 +352,8 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
     world = calibrated(conditions_of(scenario, 2048))
     # The grid of delayed transmissions would show as teeth of 8 ns on the curve.
     world = replace(world, quantize=False)
-    delays = np.geomspace(SHORTEST_S, LONGEST_S, POINTS)
+    # From 280 UWB microseconds on, below which boards miss the time to send (firmware wire format), to their longest.
+    delays = np.geomspace(287e-6, 6.6e-3, 121)
 
     def duration(delay: float) -> float:
         return costs(scenario, protocol, delay)["duration_s"] + TURNAROUND_S + overhead_s
@@ -378,7 +365,7 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
 
     one, second = np.array([errors(float(delay)) for delay in delays]).T
     best = int(np.argmin(second))
-    low, high = delays[max(best - 1, 0)], delays[min(best + 1, POINTS - 1)]
+    low, high = delays[max(best - 1, 0)], delays[min(best + 1, len(delays) - 1)]
     refined = minimize_scalar(lambda d: errors(d)[1], bounds=(low, high), method="bounded", options={"xatol": 1e-8})
     delay = min((float(refined.x), float(delays[best])), key=lambda d: errors(d)[1])
     one_m2, second_m2 = errors(delay)
@@ -388,7 +375,7 @@ def optimum(scenario: Scenario | Source, protocol: str | RangingProtocol = "ds",
         rms_m=math.sqrt(one_m2),
         duration_s=duration(delay),
         second_rms_m=math.sqrt(second_m2),
-        on_edge=best in (0, POINTS - 1),
+        on_edge=best in (0, len(delays) - 1),
         delays_s=delays,
         range_m2=one,
         second_m2=second,

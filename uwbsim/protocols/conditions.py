@@ -27,9 +27,6 @@ from uwbsim.world.world import World
 STATES: Final = 16_384
 """So many states of the world are sampled; it is also the length of the pieces that fit into a core's cache."""
 
-STEP_S: Final = 1e-3
-"""Over this time the speed along the line between two tags is measured."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Conditions:
@@ -141,7 +138,8 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     start, i, j = plan.start[rows] + marker, plan.initiator[rows], plan.target[rows]
     world, clocks, radio = World.of(scenario), Clocks.of(scenario), scenario.radio
     link = world.link(i, j, start)
-    later = world.link(i, j, start + round(STEP_S * SUBTICKS_PER_SECOND))
+    step_s = 1e-3  # over which the speed along the line between two tags is measured
+    later = world.link(i, j, start + round(step_s * SUBTICKS_PER_SECOND))
     arrivals, back = [arrive(radio, link)], link
     if any(tag.tx_power_db for tag in scenario.tags):
         back = world.link(j, i, start)
@@ -153,7 +151,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
     return Conditions(
         flight=link.distance_m / SPEED_OF_LIGHT,
         excess=link.excess_m / SPEED_OF_LIGHT,
-        flight_rate=(later.distance_m - link.distance_m) / STEP_S / SPEED_OF_LIGHT,
+        flight_rate=(later.distance_m - link.distance_m) / step_s / SPEED_OF_LIGHT,
         rate_initiator=clocks.exchange_rate(i, start),
         rate_target=clocks.exchange_rate(j, start),
         drift_initiator=nothing,

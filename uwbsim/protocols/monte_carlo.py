@@ -15,13 +15,12 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import Intervals, ProtocolMessage, RangingProtocol
-from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, TICK_S
 from uwbsim.protocols.conditions import STATES, Conditions
 from uwbsim.random_streams import stream
 from uwbsim.units import PPM_PER_ONE
 from uwbsim.world.clocks import RATE_SPAN_S
 
-METRES: Final = TICK_S * SPEED_OF_LIGHT
 SIDES: Final = ("initiator", "target")
 
 
@@ -192,7 +191,7 @@ def _execute(protocol: RangingProtocol, c: _Ticks, draws: _Draws) -> Floats:
         flights.append(flight)
     spans = _intervals(protocol, stamps, c, draws, carrier_noise)
     truth = (flights[0] + flights[1]) / 2
-    return np.asarray((protocol.flight_ticks(spans) - truth) * METRES)
+    return np.asarray((protocol.flight_ticks(spans) - truth) * METRES_PER_TICK)
 
 
 def _transmission(message: ProtocolMessage, stamps: dict[str, Floats], c: _Ticks, draws: _Draws) -> Floats:

@@ -9,31 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import Intervals, RangingProtocol
-from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, SPEED_OF_LIGHT, TICK_S
+from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, chosen
-from uwbsim.units import PPM_PER_ONE, PS, PS_PER_S, US
+from uwbsim.scenario.devices import TX_SHARE
+from uwbsim.units import NS, PPM_PER_ONE, PS, PS_PER_S, US
 from uwbsim.world.clocks import RATE_SPAN_S
-
-METRES: Final = TICK_S * SPEED_OF_LIGHT
-STEP: Final = 16.0
-"""Ticks by which an interval is changed to see what it does; the formulas are smooth over thousands."""
-
-# Which stamps an interval is made of, with their signs: errors of stamps enter intervals so.
-FROM_TARGET: Final = {
-    "dt41": {"rx2": 1, "tx1": -1}, "dt32": {"tx2": 1, "rx1": -1},
-    "dt53": {"tx3": 1, "tx2": -1}, "dt64": {"rx3": 1, "rx2": -1},
-}  # fmt: skip
-FROM_INITIATOR: Final = {
-    "dt41": {"rx2": 1, "tx1": -1}, "dt32": {"tx2": 1, "rx1": -1},
-    "dt53": {"tx3": 1, "rx2": -1}, "dt64": {"rx3": 1, "tx2": -1},
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,11 +66,11 @@ def predict(protocol: RangingProtocol, c: Conditions) -> PredictedErrors:
     p, detour = c.multipath, c.detour_s * SPEED_OF_LIGHT
     flight = protocol.flight_ticks(spans) - truth
     return PredictedErrors(
-        mean_m=np.asarray(flight * METRES + p * detour),
+        mean_m=np.asarray(flight * METRES_PER_TICK + p * detour),
         transmit_m2=np.asarray(squares["tx"] * (c.tx_std * SPEED_OF_LIGHT) ** 2),
         receive_m2=np.asarray(squares["rx"] * (c.rx_std * SPEED_OF_LIGHT) ** 2),
-        quantization_m2=np.asarray(squares["rx"] * METRES**2 / 12 * c.quantize),
-        carrier_m2=np.asarray((slopes["carrier_ppm"] * c.carrier_std_ppm * METRES) ** 2),
+        quantization_m2=np.asarray(squares["rx"] * METRES_PER_TICK**2 / 12 * c.quantize),
+        carrier_m2=np.asarray((slopes["carrier_ppm"] * c.carrier_std_ppm * METRES_PER_TICK) ** 2),
         clock_m2=_white_clocks(protocol, slopes, stamps, leave, arrive, c) * SPEED_OF_LIGHT**2,
         multipath_m2=np.full(len(c), p * (2 - p) * detour**2),
     )
@@ -146,7 +133,8 @@ def _reply_s(protocol: RangingProtocol, k: int, c: Conditions) -> Floats:
 def _slopes(protocol: RangingProtocol, spans: Intervals) -> Iterator[tuple[str, Floats]]:
     """Yield the derivative of the flight by each interval, and by the carrier's ppm."""
     for name in ("dt41", "dt32", "dt53", "dt64", "carrier_ppm"):
-        step = STEP if name != "carrier_ppm" else 1.0
+        # The formulas are smooth over thousands of ticks, and over ppm.
+        step = 16.0 if name != "carrier_ppm" else 1.0
         value = getattr(spans, name)
         up, down = (protocol.flight_ticks(replace(spans, **{name: value + s})) for s in (step, -step))
         yield name, np.asarray((up - down) / (2 * step))
@@ -154,13 +142,15 @@ def _slopes(protocol: RangingProtocol, spans: Intervals) -> Iterator[tuple[str, 
 
 def _by_stamp(protocol: RangingProtocol, slopes: dict[str, Floats]) -> dict[str, Floats]:
     """Return the derivative of the flight by the error of each stamp."""
-    third = len(protocol.messages) == 3
-    signs = FROM_INITIATOR if third and protocol.messages[2].sender == "initiator" else FROM_TARGET
+    # Which stamps an interval is made of, the later first: their errors enter so.
+    parts = {"dt41": ("rx2", "tx1"), "dt32": ("tx2", "rx1")}
+    if len(protocol.messages) == 3:
+        from_target = protocol.messages[2].sender == "target"
+        parts |= {"dt53": ("tx3", "tx2" if from_target else "rx2"), "dt64": ("rx3", "rx2" if from_target else "tx2")}
     found: dict[str, Floats] = {}
-    for interval, parts in signs.items():
-        if third or interval in ("dt41", "dt32"):
-            for stamp, sign in parts.items():
-                found[stamp] = found.get(stamp, 0.0) + sign * slopes[interval]
+    for interval, (later, earlier) in parts.items():
+        found[later] = found.get(later, 0.0) + slopes[interval]
+        found[earlier] = found.get(earlier, 0.0) - slopes[interval]
     return found
 
 
@@ -197,14 +187,6 @@ def _sum_of_squares(stamps: dict[str, Floats], kind: str) -> Floats:
     return np.asarray(sum(slope**2 for name, slope in stamps.items() if name.startswith(kind)))
 
 
-LARGEST: Final = 1e9
-FINAL_DELAY_US: Final = 1538.7
-"""What the boards' firmware waits by default: 1500 of its own microseconds (512/499.2 us), and a step of its clock."""
-
-SHORTEST_US: Final = 1.0
-"""A third message that follows at once leaves nothing to tell the clocks' rates from."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
     """One state of the world to predict ranges in; `protocol` is a name or a row of `PROTOCOLS`.
@@ -235,22 +217,19 @@ class State:
     whole_ticks: bool = False
 
 
-NOT_NEGATIVE: Final = ("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm")
-
-
 def _check(q: State) -> None:
+    not_negative = ("reply_delay_us", "distance_m", "tx_noise_ps", "rx_noise_ps", "carrier_noise_ppm")
     for field in fields(q):
         value = getattr(q, field.name)
         if field.name in ("protocol", "whole_ticks") or value is None:
             continue
-        if not isinstance(value, int | float) or not abs(value) < LARGEST:
-            raise ParameterError(f"found {value}, expected a number below {LARGEST:g}", parameter=field.name)
-        if field.name in NOT_NEGATIVE and value < 0:
+        if not isinstance(value, int | float) or not abs(value) < 1e9:
+            raise ParameterError(f"found {value}, expected a number below 1e+09", parameter=field.name)
+        if field.name in not_negative and value < 0:
             raise ParameterError(f"found {value:g}, expected 0 or more", parameter=field.name)
-    if q.final_delay_us is not None and q.final_delay_us < SHORTEST_US:
-        raise ParameterError(
-            f"found {q.final_delay_us:g}, expected at least {SHORTEST_US:g}", parameter="final_delay_us"
-        )
+    # A third message that follows at once leaves nothing to tell the clocks' rates from.
+    if q.final_delay_us is not None and q.final_delay_us < 1.0:
+        raise ParameterError(f"found {q.final_delay_us:g}, expected at least 1", parameter="final_delay_us")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -313,7 +292,8 @@ def predict_state(q: State) -> Prediction:
         what = "has no third message" if len(timings) < 3 else "waits as long with its third message as with its reply"
         text = f"{protocol.name} {what}; leave it out, and give that of the reply"
         raise ParameterError(text, parameter="final_delay_us")
-    final_us = FINAL_DELAY_US if q.final_delay_us is None else q.final_delay_us
+    # The boards' firmware waits by default 1500 of its own microseconds (512/499.2 us), and a step of its clock.
+    final_us = 1538.7 if q.final_delay_us is None else q.final_delay_us
     scheduled = q.reply_delay_us if target_waits else final_us
     at_once = final_us if final_at_once else q.reply_delay_us
     conditions = Conditions.single(
@@ -325,10 +305,10 @@ def predict_state(q: State) -> Prediction:
         drift_target=-q.drift_ppm_per_s * 0.5e-6,
         tx_std=q.tx_noise_ps * PS,
         rx_std=q.rx_noise_ps * PS,
-        tx_delay_initiator=0.44e-9 * q.delay_initiator_ns,
-        rx_delay_initiator=-0.56e-9 * q.delay_initiator_ns,
-        tx_delay_target=0.44e-9 * q.delay_target_ns,
-        rx_delay_target=-0.56e-9 * q.delay_target_ns,
+        tx_delay_initiator=TX_SHARE * NS * q.delay_initiator_ns,
+        rx_delay_initiator=(TX_SHARE - 1) * NS * q.delay_initiator_ns,
+        tx_delay_target=TX_SHARE * NS * q.delay_target_ns,
+        rx_delay_target=(TX_SHARE - 1) * NS * q.delay_target_ns,
         at_once=at_once * US,
         scheduled=scheduled * US,
         carrier_bias_ppm=q.carrier_bias_ppm,

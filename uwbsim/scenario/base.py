@@ -42,20 +42,24 @@ BY_UNIT: Final = {
     "_ms": Limit(1e9, "time is simulated for 36 hours"),
     "_c": Limit(1e3, "boards melt before"),
     "_v": Limit(1e3, "boards take 3.6 V"),
+    "": Limit(1e6, "no setting has sense so far out"),
 }
-OTHERWISE: Final = Limit(1e6, "no setting has sense so far out")
+"""By the unit at a key's end: what physics and the chip leave sense in."""
 
 
 def limit_of(key: str) -> Limit:
     """Return the limit of a key by the unit that it ends with."""
     fitting = [unit for unit in BY_UNIT if key.endswith(unit)]
-    return BY_UNIT[max(fitting, key=len)] if fitting else OTHERWISE
+    return BY_UNIT[max(fitting, key=len)]
 
 
 def check_limits(key: str, value: Any) -> None:
     """Raise `ValueError` for a number beyond the limit of its key, alone or in tuples; anything else passes."""
     if isinstance(value, tuple):
-        if not value or not _is_number(_first_leaf(value)):
+        leaf: Any = value
+        while isinstance(leaf, tuple) and leaf:
+            leaf = leaf[0]
+        if not _is_number(leaf):
             return
         try:
             found = float(np.max(np.abs(np.asarray(value, dtype=np.float64))))
@@ -69,21 +73,12 @@ def check_limits(key: str, value: Any) -> None:
         return
     limit = limit_of(key)
     if found > limit.most:
-        raise ValueError(f"{key}: found {_shown(found)}, at most {limit.most:g} can be ({limit.reason})")
+        shown = f"{found:g}" if found < 1e300 else "a number of hundreds of digits"
+        raise ValueError(f"{key}: found {shown}, at most {limit.most:g} can be ({limit.reason})")
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _first_leaf(value: Any) -> Any:
-    while isinstance(value, tuple) and value:
-        value = value[0]
-    return value
-
-
-def _shown(found: float) -> str:
-    return f"{found:g}" if found < 1e300 else "a number of hundreds of digits"
 
 
 Positive = Annotated[float, Field(gt=0)]
@@ -93,14 +88,10 @@ Vector = tuple[float, float, float]
 TagId = Annotated[int, Field(ge=0, le=254)]
 
 
-UNLIMITED: Final = ("seed",)
-"""Keys whose numbers measure nothing."""
-
-
 def _limits_in_schema(schema: dict[str, Any]) -> None:
     """Put the limits of units beside those that a key has of its own."""
     for key, described in schema.get("properties", {}).items():
-        if key in UNLIMITED:
+        if key == "seed":  # which measures nothing
             continue
         for choice in (described, *described.get("anyOf", ())):
             if choice.get("type") in ("number", "integer"):
@@ -119,6 +110,6 @@ class Section(BaseModel):
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
         for key in type(self).model_fields:
-            if key not in UNLIMITED:
+            if key != "seed":
                 check_limits(key, getattr(self, key))
         return self

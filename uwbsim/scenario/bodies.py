@@ -115,9 +115,6 @@ class Recorded(Section):
 Motion = Annotated[RandomFlight | Waypoints | Figure | Static | Carried | Recorded, Field(discriminator="model")]
 
 
-DEGREE: Final = math.pi / 180
-
-
 class Errors(NamedTuple):
     """Of a gyroscope or accelerometer, in SI units: a constant bias, its walk in a second, noise a root of Hz."""
 
@@ -125,6 +122,9 @@ class Errors(NamedTuple):
     wander: float
     noise: float
 
+
+DEGREE: Final = math.pi / 180
+"""In radians."""
 
 GRADES: Final = {
     "consumer": {"gyro": Errors(0.5 * DEGREE, 0.01 * DEGREE, 0.01 * DEGREE), "force": Errors(0.1, 2e-3, 3e-3)},

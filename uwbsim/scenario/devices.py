@@ -176,10 +176,6 @@ TX_SHARE: Final = 0.44
 """Share of an aggregate antenna delay that belongs to transmissions, the rest to receptions (Decawave APS014)."""
 
 Register = Annotated[int, Field(ge=0, le=REGISTER_MAX)]
-PATTERN_SIZES: Final = (0, 1, 4, 9, 16, 25)
-
-
-"""How many spherical harmonics there are up to a degree."""
 
 
 class Body(Section):
@@ -297,9 +293,8 @@ class Tag(Section):
         parts = (self.tx_delay_ns is not None, self.rx_delay_ns is not None)
         if parts[0] != parts[1] or (parts[0] and self.delay_ns is not None):
             raise ValueError("delay_ns: give it alone, or both tx_delay_ns and rx_delay_ns instead")
-        if len(self.pattern_db) not in PATTERN_SIZES:
-            allowed = ", ".join(map(str, PATTERN_SIZES[1:]))
-            raise ValueError(f"pattern_db: found {len(self.pattern_db)} coefficients, expected {allowed} or none")
+        if len(self.pattern_db) not in (0, 1, 4, 9, 16, 25):
+            raise ValueError(f"pattern_db: found {len(self.pattern_db)} coefficients, expected 1, 4, 9, 16, 25 or none")
         return self
 
     @property

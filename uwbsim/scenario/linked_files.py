@@ -9,8 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -29,9 +28,17 @@ MOST_BYTES: Final = 64_000_000
 MOST_ROWS: Final = 1_000_000
 """Of a linked table: nearly three hours of slots at 100 Hz; in memory they take 0.2 GB."""
 
+MODELS: Final = {
+    "antenna": None,
+    "plan": None,
+    "group_delay": "table",
+    "motion": "recorded",
+    "temperature_c": "table",
+    "supply_v": "table",
+}
+"""Keys whose tables can name a file, and of which model these tables are then."""
+
 Folders = Iterable[str | os.PathLike[str]]
-Find = Callable[[str, Any], Path]
-"""Returns the file that a key of a scenario names."""
 
 
 def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> None:
@@ -39,26 +46,32 @@ def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> Non
 
     Files lie in the scenario's folder, in one of `folders`, or below one of these.
     """
-    find = partial(_found, scenario, tuple(folders))
-    radio = table.get("radio")
-    if isinstance(radio, dict) and isinstance(radio.get("antenna"), dict) and "file" in radio["antenna"]:
-        radio["antenna"] = _antenna(find("radio.antenna.file", radio["antenna"]["file"]))
-    _fill_in_group_delay(find, "radio", radio)
-    ranging = table.get("ranging")
-    if isinstance(ranging, dict) and isinstance(ranging.get("plan"), dict) and "file" in ranging["plan"]:
-        plan = ranging["plan"]
-        plan["slots"] = _plan(find("ranging.plan.file", plan["file"]))
-    bodies = table.get("bodies")
-    for k, body in enumerate(bodies if isinstance(bodies, list) else []):
-        motion = body.get("motion") if isinstance(body, dict) else None
-        if isinstance(motion, dict) and motion.get("model") == "recorded" and "file" in motion:
-            path = find(f"bodies[{k}].motion.file", motion["file"])
-            motion |= _trajectory(path, motion.get("body"), _duration(table))
-    for name in ("bodies", "tags"):
-        listed = table.get(name)
-        for k, one in enumerate(listed if isinstance(listed, list) else []):
-            _fill_in_profiles(find, f"{name}[{k}]", one)
-            _fill_in_group_delay(find, f"{name}[{k}]", one)
+    folders = tuple(folders)
+    for name in ("radio", "ranging", "bodies", "tags"):
+        section = table.get(name)
+        tables: list[tuple[int, Any]] = [*enumerate(section)] if isinstance(section, list) else [(-1, section)]
+        for k, one in tables:
+            for key, named in [*one.items()] if isinstance(one, dict) else ():
+                if key not in MODELS or not isinstance(named, dict) or "file" not in named:
+                    continue
+                if named.get("model") != MODELS[key]:
+                    continue
+                where = f"{scenario}: {name}{f'[{k}]' if k >= 0 else ''}.{key}.file"
+                if not isinstance(named["file"], str):
+                    raise ScenarioError(f"{where}: found {named['file']!r}, expected the name of a file")
+                path = scenario.parent / named["file"]
+                path = check_linked(path, f"{where}: found {named['file']!r}", scenario.parent, folders)
+                if key == "antenna":
+                    one[key] = _grid(path, "gain_db")
+                elif key == "group_delay":
+                    named |= _grid(path, "delay_cm")
+                elif key == "plan":
+                    named["slots"] = _plan(path)
+                elif key == "motion":
+                    named |= _trajectory(path, named.get("body"), _duration(table))
+                else:
+                    rows = _rows(path, ("time_s", key))
+                    named |= {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
 
 
 def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path:
@@ -81,27 +94,6 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
     if place.suffix != SUFFIX and (size := place.stat().st_size) > MOST_BYTES:
         raise ScenarioError(f"{where}, which has {size} bytes; at most {MOST_BYTES} are read")
     return path
-
-
-def _fill_in_profiles(find: Find, where: str, one: Any) -> None:
-    """Read what the temperature and the supply voltage of a body or tag name."""
-    for key in ("temperature_c", "supply_v"):
-        profile = one.get(key) if isinstance(one, dict) else None
-        if isinstance(profile, dict) and profile.get("model") == "table" and "file" in profile:
-            rows = _rows(find(f"{where}.{key}.file", profile["file"]), ("time_s", key))
-            profile |= {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
-
-
-def _fill_in_group_delay(find: Find, where: str, one: Any) -> None:
-    delay = one.get("group_delay") if isinstance(one, dict) else None
-    if isinstance(delay, dict) and delay.get("model") == "table" and "file" in delay:
-        delay |= _grid(find(f"{where}.group_delay.file", delay["file"]), "delay_cm")
-
-
-def _found(scenario: Path, folders: tuple[str | os.PathLike[str], ...], key: str, name: Any) -> Path:
-    if not isinstance(name, str):
-        raise ScenarioError(f"{scenario}: {key}: found {name!r}, expected the name of a file")
-    return check_linked(scenario.parent / name, f"{scenario}: {key}: found {name!r}", scenario.parent, folders)
 
 
 def _duration(table: dict[str, Any]) -> float:
@@ -134,11 +126,6 @@ def _number(path: Path, line: int, column: str, cell: str | None) -> float:
     if not math.isfinite(value):
         raise ScenarioError(f"{path}: row {line}: column {column!r}: found {cell!r}, expected a number")
     return value
-
-
-def _antenna(path: Path) -> dict[str, Any]:
-    """Read azimuth_deg, elevation_deg, gain_db rows into a full grid."""
-    return _grid(path, "gain_db")
 
 
 def _grid(path: Path, name: str) -> dict[str, Any]:

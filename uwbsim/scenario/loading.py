@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from pathlib import Path
-from types import MappingProxyType, UnionType
-from typing import Any, Final, Union, get_args, get_origin
+from types import MappingProxyType
+from typing import Any, Final, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -22,7 +22,6 @@ from uwbsim.scenario.linked_files import Folders, fill_in
 from uwbsim.scenario.model import Scenario
 
 SUFFIX: Final = ".toml"
-LINKED: Final = re.compile(r'file\s*=\s*"([^"\n]+)"')
 
 
 def shipped_scenarios() -> Mapping[str, Path]:
@@ -90,7 +89,10 @@ def copy_scenarios(names: Iterable[str], folder: Path, *, force: bool = False) -
     """
     top = _folder().resolve()
     chosen = _chosen(list(names)).values()
-    files = dict.fromkeys([*(path.resolve() for path in chosen), *(one for path in chosen for one in _linked(path))])
+    files = dict.fromkeys(path.resolve() for path in chosen)
+    for path in chosen:
+        linked = re.findall(r'file\s*=\s*"([^"\n]+)"', path.read_text(encoding="utf-8"))
+        files |= dict.fromkeys((path.parent / name).resolve() for name in linked)
     places = {path: folder / path.relative_to(top) for path in files}
     with ExitStack() as every:
         for path, place in places.items():
@@ -109,15 +111,6 @@ def _chosen(names: list[str]) -> Mapping[str, Path]:
             raise ScenarioError(f"{name}: no such scenario; known are {', '.join(known)}")
         chosen |= some
     return chosen if names else known
-
-
-def _linked(path: Path) -> list[Path]:
-    names = LINKED.findall(path.read_text(encoding="utf-8"))
-    return [(path.parent / name).resolve() for name in names]
-
-
-NO_FILE: Final = Path("scenario")
-"""What messages name where a scenario has no file."""
 
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
@@ -173,10 +166,11 @@ def as_scenario(source: Scenario | Source) -> Scenario:
 
 def _table(source: Source) -> tuple[dict[str, Any], Path]:
     """Return a table of its own, and the file that it is of (for messages, and for what lies beside it)."""
+    nowhere = Path("scenario")
     if isinstance(source, Mapping):
-        return deepcopy(dict(source)), NO_FILE
+        return deepcopy(dict(source)), nowhere
     if isinstance(source, str) and "\n" in source:
-        return parse_toml(source, NO_FILE), NO_FILE
+        return parse_toml(source, nowhere), nowhere
     if not isinstance(source, str | os.PathLike):
         seen = type(source).__name__
         raise ParameterError(
@@ -243,12 +237,12 @@ def _mistake(path: Path, error: ValidationError) -> ScenarioError:
     # An unknown key explains a missing one better than the other way round.
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     if first["type"] == "extra_forbidden":
-        return UnknownKeyError(f"{path}: {_key_path(first['loc'])}: unknown key{_suggestion(first['loc'])}")
+        return UnknownKeyError(f"{path}: {_key_path(first)}: unknown key{_suggestion(first['loc'])}")
     return ScenarioError(f"{path}: {_explain(first)}")
 
 
 def _explain(first: Mapping[str, Any]) -> str:
-    where = _key_path(first["loc"])
+    where = _key_path(first)
     if first["type"] == "missing":
         return f"{where}: missing, and it must be given"
     message = str(first["msg"]).removeprefix("Value error, ")
@@ -261,43 +255,24 @@ def _explain(first: Mapping[str, Any]) -> str:
     return f"{where}: found {found}, {message[0].lower()}{message[1:]}"
 
 
-def _key_path(loc: Iterable[int | str]) -> str:
-    path = ""
-    for part in _real_keys(loc):
-        path += f"[{part}]" if isinstance(part, int) else f".{part}"
-    return path.lstrip(".")
-
-
-def _real_keys(loc: Iterable[int | str]) -> list[int | str]:
-    """Drop what pydantic adds to a path: the names of the members of a union."""
-    keys: list[int | str] = []
+def _key_path(first: Mapping[str, Any]) -> str:
+    """Return the path of a mistake as a user writes it: without the names of union members that pydantic adds."""
+    path, unknown = "", first["type"] == "extra_forbidden"
     models: list[type[BaseModel]] = [Scenario]
-    for part in loc:
+    for k, part in enumerate(first["loc"]):
+        children = [f.annotation for m in models if (f := m.model_fields.get(str(part)))]
+        models = [m for child in children for m in _models_in(child)] or models
         if isinstance(part, int):
-            keys.append(part)
-            continue
-        children = [f.annotation for m in models if (f := m.model_fields.get(part))]
-        if children:
-            models = [m for child in children for m in _models_in(child)]
-            keys.append(part)
-        elif not _is_union_label(part, models):
-            keys.append(part)
-    return keys
-
-
-def _is_union_label(part: str, models: list[type[BaseModel]]) -> bool:
-    labels = {str(a) for m in models if (f := m.model_fields.get("model")) for a in get_args(f.annotation)}
-    return part in labels or "[" in part
+            path += f"[{part}]"
+        elif children or (unknown and k == len(first["loc"]) - 1):
+            path += f".{part}"
+    return path.lstrip(".")
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    if get_origin(annotation) is None and not isinstance(annotation, UnionType):
-        return []
-    if get_origin(annotation) in (Union, UnionType, tuple) or get_args(annotation):
-        return [m for a in get_args(annotation) for m in _models_in(a)]
-    return []
+    return [m for a in get_args(annotation) for m in _models_in(a)]
 
 
 def _suggestion(loc: tuple[int | str, ...]) -> str:

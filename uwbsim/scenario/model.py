@@ -80,15 +80,10 @@ class Scenario(Section):
                 raise ValueError(f"tags[{k}].id: found a second {tag.id}, ids must differ")
             if tag.body not in names:
                 raise ValueError(f"tags[{k}].body: found {tag.body!r}, the bodies are {', '.join(names)}")
-        for pair in self.ranging.pairs if self.ranging.pairs != "between-bodies" else ():
-            for tag_id in pair:
-                if tag_id not in ids:
-                    known = ", ".join(map(str, ids))
-                    raise ValueError(f"ranging.pairs: found tag {tag_id}, the tags are {known}")
-        self._check_reflections(ids)
+        self._check_tags(ids)
         self._check_geometric()
         self._check_places()
-        self._check_plan(ids)
+        self._check_plan()
         fastest = self.ranging.fastest_hz(self.radio.preamble_symbols)
         if self.ranging.plan != "aloha" and self.ranging.rate_hz > fastest:
             raise ValueError(
@@ -99,14 +94,18 @@ class Scenario(Section):
             raise ValueError("ranging.pairs: no two tags sit on different bodies, so nobody ranges")
         return self
 
-    def _check_reflections(self, ids: list[int]) -> None:
-        """Pairs whose reflections are known must be pairs of tags."""
-        model = self.radio.multipath
-        for k, known in enumerate(model.pairs if isinstance(model, TwoStateMultipath) else ()):
-            for tag_id in known.tags:
+    def _check_tags(self, ids: list[int]) -> None:
+        """Raise `ValueError` where pairs, or slots of a plan, name a tag that is not there."""
+        named = [("ranging.pairs: found", pair) for pair in self.ranging.pairs if not isinstance(pair, str)]
+        model, plan = self.radio.multipath, self.ranging.plan
+        if isinstance(model, TwoStateMultipath):
+            named += [(f"radio.multipath.pairs[{k}].tags: found", pair.tags) for k, pair in enumerate(model.pairs)]
+        if not isinstance(plan, str):
+            named += [(f"ranging.plan: slot {k + 1} names", slot[1:]) for k, slot in enumerate(plan.slots)]
+        for where, pair in named:
+            for tag_id in pair:
                 if tag_id not in ids:
-                    there = ", ".join(map(str, ids))
-                    raise ValueError(f"radio.multipath.pairs[{k}].tags: found tag {tag_id}, the tags are {there}")
+                    raise ValueError(f"{where} tag {tag_id}, the tags are {', '.join(map(str, ids))}")
 
     def _check_geometric(self) -> None:
         """The geometric model takes reflections from materials, and needs a room to put things into."""
@@ -143,14 +142,10 @@ class Scenario(Section):
                     f"apart, closer than a wavelength ({100 * WAVELENGTH_M:.1f} cm)"
                 )
 
-    def _check_plan(self, ids: list[int]) -> None:
+    def _check_plan(self) -> None:
         if isinstance(self.ranging.plan, str):
             return
         for k, (time_s, initiator, target) in enumerate(self.ranging.plan.slots):
-            for tag_id in (initiator, target):
-                if tag_id not in ids:
-                    known = ", ".join(map(str, ids))
-                    raise ValueError(f"ranging.plan: slot {k + 1} names tag {tag_id}, the tags are {known}")
             if initiator == target:
                 raise ValueError(f"ranging.plan: slot {k + 1} is of tag {initiator} with itself")
             if not time_s >= 0:

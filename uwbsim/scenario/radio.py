@@ -37,20 +37,18 @@ BIAS: Final[dict[str, dict[str, Any] | None]] = {
 }  # fmt: skip
 """Bias of a range in metres."""
 
-REPLY_RATIO: Final = 0.2
-"""dt32/dt53 of the boards in the flights behind the curves: 305 us to 1539 us."""
 
 SIGMA: Final[dict[str, dict[str, Any] | None]] = {
     "none": None,
     "icra2023": {
         "knots": _AUGUST,
         "coefficients": [0.07418352595325353, 0.11438036048184572, 0.04769635492702895, 0.06499148440853658],
-        "reply_ratio": REPLY_RATIO,
+        "reply_ratio": 0.2,
     },
     "icra2023-july": {
         "knots": _JULY,
         "coefficients": [0.20866472194861246, 0.08108610512201572, 0.06722711440695964, 0.07144904233331333],
-        "reply_ratio": REPLY_RATIO,
+        "reply_ratio": 0.2,
     },
     "miluv": {
         "knots": [0.01] * 5 + [1.8] * 5,
@@ -58,10 +56,13 @@ SIGMA: Final[dict[str, dict[str, Any] | None]] = {
             0.18973127701786333, 0.1401417272865022, 0.3951126347143982, -0.11438027911679073, 0.12874371852672592,
         ],
         "degree": 4,
-        "reply_ratio": REPLY_RATIO,
+        "reply_ratio": 0.2,
     },
 }  # fmt: skip
-"""Standard deviation of a double-sided range in metres, as those were from which the curves come."""
+"""Standard deviation of a double-sided range in metres, as those were from which the curves come.
+
+The boards of these flights had dt32/dt53 of 305 us to 1539 us.
+"""
 
 
 class IndependentMultipath(Section):

@@ -15,10 +15,10 @@ from uwbsim.scenario.base import NotNegative, Positive, Section, TagId
 from uwbsim.units import MS, US
 
 PREAMBLE_SYMBOL_S: Final = 508 / 499.2e6
-HEADER_SYMBOL_S: Final = 512 / 499.2e6
-DATA_SYMBOL_S: Final = 64 / 499.2e6
-SFD_SYMBOLS: Final = 8
-HEADER_SYMBOLS: Final = 21
+"""Of a preamble at a pulse repetition frequency of 64 MHz (DW1000 User Manual, section 10)."""
+
+UUS_S: Final = 512 / 499.2e6
+"""A UWB microsecond, which is also a symbol of a frame's header."""
 
 TURNAROUND_S: Final = 1e-3
 """From the end of an exchange until its initiator sends the next poll: report over USB, next command, start-up.
@@ -35,14 +35,17 @@ FINAL_BYTES: Final = 28
 
 
 def before_marker_s(preamble_symbols: int) -> float:
-    """Return the time from the start of a frame to its ranging marker, which all stamps refer to."""
-    return (preamble_symbols + SFD_SYMBOLS) * PREAMBLE_SYMBOL_S
+    """Return the time from the start of a frame to its ranging marker, which all stamps refer to.
+
+    That is its preamble and a start-of-frame delimiter of 8 symbols.
+    """
+    return (preamble_symbols + 8) * PREAMBLE_SYMBOL_S
 
 
 def after_marker_s(length_bytes: int) -> float:
     """Return the time from the ranging marker to the end of a frame at 6.8 Mb/s, with its Reed-Solomon parity."""
     bits = 8 * length_bytes
-    return HEADER_SYMBOLS * HEADER_SYMBOL_S + (bits + 48 * math.ceil(bits / 330)) * DATA_SYMBOL_S
+    return 21 * UUS_S + (bits + 48 * math.ceil(bits / 330)) * (64 / 499.2e6)
 
 
 def frame_s(length_bytes: int, preamble_symbols: int) -> float:
@@ -70,16 +73,7 @@ def exchange_s(protocol: RangingProtocol, preamble_symbols: int, scheduled_s: fl
 ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
 
 
-MEDIAN_REPLY_S: Final = 305e-6
-
-
-"""Of boards that reply at once, the median measured (firmware wire format, 3.4)."""
-
-
 PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
-
-
-UUS_S: Final = 512 / 499.2e6
 
 
 class BoardReply(Section):
@@ -198,7 +192,8 @@ class Ranging(Section):
         """Return the median latency of a reply at once, in seconds."""
         if self.reply.model == "fixed":
             return self.reply.delay_s
-        return float(self.reply.at_s(np.array(0.5))) if self.reply.model == "quantiles" else MEDIAN_REPLY_S
+        median_s = 305e-6  # of boards (firmware wire format, 3.4)
+        return float(self.reply.at_s(np.array(0.5))) if self.reply.model == "quantiles" else median_s
 
     def fastest_hz(self, preamble_symbols: int) -> float:
         """Return how many exchanges a second one after the other allow."""

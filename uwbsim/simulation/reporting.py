@@ -42,9 +42,8 @@ def reported_exchanges(run: Run, kept: Ints, planned: int, rows: Begun, stamped:
     """Return the reports of the `kept` exchanges (n,), of all `planned`: stamps wrapped, ranges as printed."""
     initiator, target = rows.initiator, rows.target
     ids = np.array([tag.id for tag in run.scenario.tags], dtype=np.int64)
-    mask = (1 << REPORT_BITS) - 1
     none = np.zeros(len(kept), dtype=np.int64)
-    stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & mask for name in STAMPS}
+    stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & MASK for name in STAMPS}
     fpp1, skew1 = _readings(run, 1, kept, planned, stamped)
     fpp2, skew2 = _readings(run, 2, kept, planned, stamped)
     nan = np.full(len(kept), np.nan)
@@ -116,7 +115,7 @@ def provenance(scenario: Scenario) -> dict[str, Any]:
 
 
 MASK: Final = (1 << REPORT_BITS) - 1
-CARRIED: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
+"""Bits of a stamp that boards report."""
 
 
 def overhear(medium: Medium, stamped: Stamped, exchanges: Exchanges) -> dict[str, NDArray[Any]]:
@@ -169,7 +168,7 @@ def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: 
         columns[f"fpp{name}_dbm"], columns[f"skew{name}_ppm"] = medium.readings(frames, power, noise[2], noise[3])
     columns |= {"time_ns": exchanges.time_ns[rows], "listener": np.full(count, tag.id)}
     columns |= {name: getattr(exchanges, name)[rows] for name in ("initiator", "target")}
-    columns |= {f"{name}_n": getattr(exchanges, name)[rows] for name in CARRIED}
+    columns |= {f"{name}_n": getattr(exchanges, name)[rows] for name in STAMPS}
     for name in ("fpp1", "fpp2"):
         columns[f"{name}_n_dbm"] = getattr(exchanges, f"{name}_dbm")[rows]
     for name in ("skew1", "skew2"):

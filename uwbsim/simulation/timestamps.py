@@ -7,7 +7,6 @@ arrive, and which integers do the two boards write down.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -24,8 +23,6 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.units import US
 from uwbsim.world.clocks import SUBTICKS
 from uwbsim.world.reception import Frames, Medium
-
-GRID: Final = DELAYED_TX_GRID
 
 
 @dataclass(slots=True)
@@ -140,10 +137,10 @@ def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, de
     if message.timing == "scheduled":
         due = reference + delay_uus * UUS_TICKS
         # The chip ignores the low nine bits of the time at which it is told to send.
-        return due // GRID * GRID
+        return due // DELAYED_TX_GRID * DELAYED_TX_GRID
     latency = np.rint(reply_s / TICK_S).astype(np.int64)
     return _next_grid(reference + latency - ANTENNA_DELAY_TICKS)
 
 
 def _next_grid(ticks: Ints) -> Ints:
-    return -(-ticks // GRID) * GRID
+    return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID
