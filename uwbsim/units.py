@@ -15,5 +15,5 @@ CM: Final = 1e-2
 PPM: Final = 1e-6
 
 PS_PER_S: Final = 1e12
-NS_PER_S: Final = 1e9
+NS_PER_S: Final = 1_000_000_000
 PPM_PER_ONE: Final = 1e6

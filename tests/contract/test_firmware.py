@@ -5,28 +5,28 @@ from collections import Counter
 import pytest
 
 from tests.boards import bench_scenario
-from uwbsim.boards.frames import MS, US, FinalPayload, PollPayload, Received
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, FinalPayload, PollPayload, Received
 from uwbsim.boards.virtual_port import VirtualPorts
 from uwbsim.scenario.model import Scenario
 
-EVERY = 70 * MS
+EVERY = 70 * NS_PER_MS
 """Six failing tries take 43 ms."""
 
 
 def said(ports, tag, start=b""):
     """What a board printed that begins so: (ms, bytes)."""
-    return [(t / MS, data) for t, who, data in ports.transfers if who == tag and data.startswith(start)]
+    return [(t / NS_PER_MS, data) for t, who, data in ports.transfers if who == tag and data.startswith(start)]
 
 
 def range_often(ports, command, count, listening=()):
     bench = ports.bench
     for tag in listening:
         bench.boards[tag].write(b"C04|1\r")
-    bench.advance(5 * MS)
+    bench.advance(5 * NS_PER_MS)
     for k in range(count):
-        bench.advance(10 * MS + k * EVERY)
+        bench.advance(10 * NS_PER_MS + k * EVERY)
         bench.boards[1].write(command)
-    bench.advance(10 * MS + count * EVERY)
+    bench.advance(10 * NS_PER_MS + count * EVERY)
 
 
 def test_the_initiator_s_final_can_be_lost_too():
@@ -44,9 +44,9 @@ def test_the_initiator_s_final_can_be_lost_too():
 def test_the_delays_that_work_are_those_of_the_firmware(delay, works):
     ports = VirtualPorts(bench_scenario())
     ports.bench.boards[2].write(b"C08|%d\r" % delay)
-    ports.bench.advance(5 * MS)
+    ports.bench.advance(5 * NS_PER_MS)
     ports.bench.boards[1].write(b"C05|2|1|1|0\r")
-    ports.bench.advance(90 * MS)
+    ports.bench.advance(90 * NS_PER_MS)
     assert len(said(ports, 1, b"R05")) == len(said(ports, 2, b"S05")) == works
     assert len(said(ports, 1, b"COMMANDED")) == (not works)
 
@@ -54,9 +54,9 @@ def test_the_delays_that_work_are_those_of_the_firmware(delay, works):
 def test_a_target_answers_its_host_after_the_exchange():
     ports = VirtualPorts(bench_scenario())
     ports.bench.boards[1].write(b"C05|2|1|1|0\r")
-    ports.bench.advance(2 * MS)  # between poll and finals
+    ports.bench.advance(2 * NS_PER_MS)  # between poll and finals
     ports.bench.boards[2].write(b"C01\r")
-    ports.bench.advance(20 * MS)
+    ports.bench.advance(20 * NS_PER_MS)
     kinds = [data[:3] for _, data in said(ports, 2)]
     assert kinds == [b"S05", b"R01"]
     assert [data[:3] for _, data in said(ports, 1)] == [b"R05"]
@@ -79,26 +79,26 @@ def test_a_target_that_is_told_to_range_itself_never_sends_its_delayed_reply():
     ports = VirtualPorts(bench_scenario())
     bench, frames = ports.bench, sent_frames(ports)
     bench.boards[2].write(b"C08|6000\r")
-    bench.advance(5 * MS)
+    bench.advance(5 * NS_PER_MS)
     bench.boards[1].write(b"C05|2|0|1|0\r")
-    bench.advance(int(7.5 * MS))
+    bench.advance(int(7.5 * NS_PER_MS))
     bench.boards[2].write(b"C05|3|0|1|0\r")
-    bench.advance(80 * MS)  # both try in vain for a while, each in the other's way
+    bench.advance(80 * NS_PER_MS)  # both try in vain for a while, each in the other's way
     replies = [f for f in frames if (f.sender, f.receiver) == (2, 1) and isinstance(f.payload, FinalPayload)]
     assert replies
     assert replies[0].cancelled
     assert said(ports, 1, b"R05") == []
     bench.boards[1].write(b"C05|2|0|1|0\r")
-    bench.advance(100 * MS)
+    bench.advance(100 * NS_PER_MS)
     assert len(said(ports, 1, b"R05")) == 1
 
 
 def test_a_report_is_lost_while_the_bus_is_busy():
     ports = VirtualPorts(bench_scenario())
     board = ports.bench.boards[1]
-    for delay in (1 * US, 50 * US, 200 * US):
+    for delay in (1 * NS_PER_US, 50 * NS_PER_US, 200 * NS_PER_US):
         board.usb.say(b"%d" % delay + bytes(100), delay)
-    ports.bench.advance(MS)
+    ports.bench.advance(NS_PER_MS)
     # Two packets of 64 bytes take 110 us; what comes 50 us after the first finds the bus busy.
     assert [data.rstrip(b"\0") for _, data in said(ports, 1)] == [b"1000", b"200000"]
     assert board.usb.lost == 1
@@ -132,7 +132,7 @@ def test_failed_tries_make_bystanders_warn():
     """The delay is too short: the target answers with its response, six times, and never sends its final."""
     ports = VirtualPorts(bench_scenario())
     ports.bench.boards[2].write(b"C08|200\r")
-    ports.bench.advance(5 * MS)
+    ports.bench.advance(5 * NS_PER_MS)
     range_often(ports, b"C05|2|0|1|0\r", 1)
     assert Counter(data[:11] for _, data in said(ports, 3)) == {b"WARNING 0xB": 6}
 
@@ -148,15 +148,15 @@ def test_a_listener_that_misses_the_last_frame_is_deaf_until_another_comes():
 
     setattr(bench.air, "announce", losing)  # noqa: B010 - mypy minds an assignment
     bench.boards[3].write(b"C04|1\r")
-    bench.advance(5 * MS)
+    bench.advance(5 * NS_PER_MS)
     bench.boards[1].write(b"C05|2|1|1|0\r")
-    bench.advance(15 * MS)
+    bench.advance(15 * NS_PER_MS)
     bench.boards[3].write(b"C01\r")
-    bench.advance(300 * MS)
+    bench.advance(300 * NS_PER_MS)
     assert len(said(ports, 2, b"S05")) == 1
     assert [data[:3] for _, data in said(ports, 3)] == [b"R04"], "the air is silent, and the board waits for a frame"
     bench.boards[1].write(b"C06|\x01\x00x\r")
-    bench.advance(310 * MS)
+    bench.advance(310 * NS_PER_MS)
     assert [data[:3] for _, data in said(ports, 3)] == [b"R04", b"R01"], "which it does not take for a broadcast"
 
 
@@ -167,17 +167,17 @@ def test_passive_boards_answer_late_where_frames_are_lost():
         ports = VirtualPorts(bench_scenario(seed), lost_share=0.4)
         bench = ports.bench
         bench.boards[3].write(b"C04|1\r")
-        bench.advance(5 * MS)
+        bench.advance(5 * NS_PER_MS)
         for k in range(4):
-            bench.advance((10 + 60 * k) * MS)
+            bench.advance((10 + 60 * k) * NS_PER_MS)
             bench.boards[1].write(b"C05|2|1|1|0\r")
-        bench.advance(int(bench.env.now) + 45 * MS)
-        asked = int(bench.env.now) / MS
+        bench.advance(int(bench.env.now) + 45 * NS_PER_MS)
+        asked = int(bench.env.now) / NS_PER_MS
         bench.boards[3].write(b"C01\r")
         for k in range(4, 7):
-            bench.advance((10 + 60 * k) * MS)
+            bench.advance((10 + 60 * k) * NS_PER_MS)
             bench.boards[1].write(b"C05|2|1|1|0\r")
-        bench.advance(600 * MS)
+        bench.advance(600 * NS_PER_MS)
         waits += [t - asked for t, _ in said(ports, 3, b"R01")]
     late = sum(wait > 10 for wait in waits)
     assert len(waits) > 50
@@ -218,14 +218,14 @@ def test_of_two_frames_at_once_the_first_is_received_where_it_is_stronger_by_the
     bench = ports.bench
     came: list[Received | None] = []
     bench.boards[2].radio._interrupt = came.append
-    starts = {1: 0, 3: lag_us * US}
-    bench.advance(MS)
+    starts = {1: 0, 3: lag_us * NS_PER_US}
+    bench.advance(NS_PER_MS)
     for board in sorted(starts, key=lambda b: starts[b]):
-        bench.advance(2 * MS + starts[board])
+        bench.advance(2 * NS_PER_MS + starts[board])
         bench.boards[board].radio.send(
             board + 1, PollPayload(False, True, False), bench.boards[board].radio.first_stamp()
         )
-    bench.advance(3 * MS)
+    bench.advance(3 * NS_PER_MS)
     assert next(r.frame.sender if r else None for r in came) == received
 
 
@@ -235,10 +235,10 @@ def test_two_exchanges_at_once_disturb_each_other_near_by_and_not_far_away():
         ports = VirtualPorts(places([0.0, 2.0, distance_m, distance_m + 2.0]))
         bench, frames = ports.bench, sent_frames(ports)
         for k in range(50):
-            bench.advance(10 * MS + k * EVERY)
+            bench.advance(10 * NS_PER_MS + k * EVERY)
             for board in (1, 3):
                 bench.boards[board].write(b"C05|%d|0|1|0\r" % (board + 1))
-        bench.advance(10 * MS + 50 * EVERY)
+        bench.advance(10 * NS_PER_MS + 50 * EVERY)
         good = sum(len(said(ports, board, b"R05")) for board in (1, 3))
         shares[distance_m] = good / sum(isinstance(f.payload, PollPayload) for f in frames)
     assert shares[900.0] == 1

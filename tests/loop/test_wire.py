@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import uwbsim
 from tests import processes
 from tests.boards import served
 from uwblink.boards.listeners import Progress
@@ -13,7 +14,6 @@ from uwblink.boards.record import record
 from uwblink.importers.motion_capture import add_poses
 from uwblink.recording.file import Recording
 from uwblink.recording.tags import load_tags
-from uwbsim.boards.server import extended
 from uwbsim.scenario.loading import load
 
 ROOT = Path(__file__).parents[2]
@@ -43,7 +43,7 @@ def test_served_boards_calibrate_like_simulated_ones(tmp_path):
     scenario = load(TRAIN, ["run.duration_s=25"])
     tags = load_tags(TRAIN)
     counts = Progress()
-    with served(extended(scenario, 300.0)) as server:
+    with served(uwbsim.Server.extended(scenario, 300.0)) as server:
         server.write_poses(tmp_path / "poses.csv")
         # As many exchanges as 22 s give at this rate, however long a busy machine takes for them.
         record(

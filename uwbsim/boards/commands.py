@@ -71,7 +71,7 @@ from uwblink.wire.messages import (
     SetPassive,
     SetResponseDelay,
 )
-from uwbsim.boards.frames import MS, US, DataPayload
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, DataPayload
 from uwbsim.boards.ranging import TO_AIR, initiate
 from uwbsim.errors import UwbsimError
 
@@ -191,7 +191,7 @@ def _value(field: Kind, buffer: bytes, at: int) -> tuple[Any, int]:
     return _UNTIL_BAR[field](buffer[at:end]), end
 
 
-ANSWER: Final = 195 * US
+ANSWER: Final = 195 * NS_PER_US
 """From the poll of the USB buffer that found a command to its answer on the bus."""
 
 
@@ -242,7 +242,7 @@ def _set_delay(board: VirtualBoard, delay_uus: int) -> Message:
 
 def _bootloader(board: VirtualBoard) -> Attempt:
     yield from board.answer(EnteringBootloader())
-    boots_after = 103 * MS
+    boots_after = 103 * NS_PER_MS
     board.sleep(boots_after).callbacks.append(lambda _: board.power_off())
     yield board.sleep(2 * boots_after)
     return True
@@ -251,12 +251,12 @@ def _bootloader(board: VirtualBoard) -> Attempt:
 def _broadcast(board: VirtualBoard, data: bytes) -> Attempt:
     if len(data) > LONGEST_BROADCAST:
         board.say(b"ERROR: Requested to send message over UWB that is too long.", ANSWER)
-        yield board.sleep(MS)
+        yield board.sleep(NS_PER_MS)
         return False
     board.radio.off()
     yield board.sleep(TO_AIR - board.bench.air.before_marker)
     board.radio.send(None, DataPayload(data), board.radio.first_stamp())
-    yield board.sleep(930 * US)
+    yield board.sleep(930 * NS_PER_US)
     board.say(BroadcastSent())
     return True
 

@@ -28,6 +28,7 @@ from uwbsim.scenario.ranging import (
     before_marker_s,
 )
 from uwbsim.simulation.timestamps import draw_reply_s
+from uwbsim.units import NS_PER_S
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
@@ -213,10 +214,9 @@ def _on_grid(ticks: int) -> int:
     return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID
 
 
-US: Final = 1_000
-MS: Final = 1_000_000
-NS_PER_S: Final = 1_000_000_000
-PREAMBLE_TIMEOUT: Final = 6_521 * US
+NS_PER_US: Final = 1_000
+NS_PER_MS: Final = 1_000_000
+PREAMBLE_TIMEOUT: Final = 6_521 * NS_PER_US
 """How long a board waits for a preamble (firmware wire format, 3.1)."""
 
 
@@ -246,7 +246,7 @@ class BoardAir:
         frame.start = marker - self.before_marker
         frame.end = marker + _ns(after_marker_s(frame.payload.length))
         # A frame that is over for 20 ms matters to none any more.
-        oldest = int(self.env.now) - 20 * MS
+        oldest = int(self.env.now) - 20 * NS_PER_MS
         self._frames = [f for f in self._frames if f.end > oldest and not f.cancelled]
         self._frames.append(frame)
         over = self.env.timeout(max(frame.end - int(self.env.now), 0))

@@ -18,9 +18,9 @@ from uwblink.twr import Exchanges, board_range
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import BroadcastReceived, Cir, Overheard, OverheardNothing, RangeReport, TargetRangeReport
 from uwbsim.boards.frames import (
-    MS,
+    NS_PER_MS,
+    NS_PER_US,
     PREAMBLE_TIMEOUT,
-    US,
     DataPayload,
     FinalPayload,
     Frame,
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from uwbsim.boards.virtual_board import VirtualBoard
 
 
-TO_AIR: Final = 330 * US
+TO_AIR: Final = 330 * NS_PER_US
 """From the poll of the USB buffer that found a command to the time stamp of its frame: set-up and half a preamble."""
 
-TO_FINAL: Final = 136 * US
+TO_FINAL: Final = 136 * NS_PER_US
 """From the end of the target's last frame to the start of the initiator's final."""
 
-TO_REPORT: Final = 474 * US
+TO_REPORT: Final = 474 * NS_PER_US
 """From the end of the last frame to the report on the bus: read-out, arithmetic, printing."""
 
 
@@ -196,17 +196,17 @@ def range_report(neighbour: int, stamps: dict[str, int], powers: tuple[float, fl
 def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) -> Steps:
     """Print the impulse response of the last frame received, a piece a millisecond; other tasks run between them."""
     # Read-out over SPI, and 1016 magnitudes.
-    yield board.sleep(int(board.chance.integers(3_800 * US, 6_000 * US)))
+    yield board.sleep(int(board.chance.integers(3_800 * NS_PER_US, 6_000 * NS_PER_US)))
     board.release()
     frame = last.frame
     paths = board.bench.radios.paths(frame, board.id)
     index, taps = impulse_response(board.chance, last.stamp & MASK, paths)
     for piece in in_transfers(encode(Cir(initiator, target, index, taps))):
         board.say(piece)
-        yield board.sleep(MS + int(board.chance.integers(0, 120 * US)))
+        yield board.sleep(NS_PER_MS + int(board.chance.integers(0, 120 * NS_PER_US)))
 
 
-TO_LINE: Final = 90 * US
+TO_LINE: Final = 90 * NS_PER_US
 """From the end of a frame to a line that needs no arithmetic."""
 
 
@@ -252,7 +252,7 @@ def overhear(board: VirtualBoard, poll: Received) -> Steps:
                 board.say(OverheardNothing(initiator, target), TO_LINE)
             return
         heard.append(came)
-    yield board.sleep(525 * US)
+    yield board.sleep(525 * NS_PER_US)
     if wish.get_cir:
         yield from print_cir(board, initiator, target, heard[-1])
     board.say(_overheard(initiator, target, wish, heard))

@@ -21,12 +21,13 @@ from scipy.spatial.transform import Rotation
 from uwblink.arrays import Floats
 from uwblink.boards.ports import Terminal
 from uwblink.output import new_file
-from uwbsim.boards.frames import MS, NS_PER_S
+from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.virtual_board import Bench, VirtualBoard
 from uwbsim.random_streams import stream
 from uwbsim.scenario.bodies import Carried
 from uwbsim.scenario.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
 from uwbsim.scenario.model import Scenario
+from uwbsim.units import NS_PER_S
 from uwbsim.world.clocks import LONGEST_RUN_S
 from uwbsim.world.world import World
 
@@ -120,17 +121,6 @@ class _Eye:
         return time_s >= self._blind_from_s
 
 
-def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
-    """Return a scenario that lasts as long as it is to be served; two hours where nobody says for how long.
-
-    Then bodies hold their place.
-    """
-    longer = max(scenario.run.duration_s, duration_s or 7200.0)
-    return scenario.model_copy(
-        update={"run": scenario.run.model_copy(update={"duration_s": min(longer, LONGEST_RUN_S)})}
-    )
-
-
 class Server:
     """Serves the boards of a scenario. `names` maps tags to what clients open.
 
@@ -196,6 +186,17 @@ class Server:
         for fault in self._faults.faults:
             self._arrange(fault)
 
+    @staticmethod
+    def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
+        """Return a scenario that lasts as long as it is to be served; two hours where nobody says for how long.
+
+        Then bodies hold their place.
+        """
+        longer = max(scenario.run.duration_s, duration_s or 7200.0)
+        return scenario.model_copy(
+            update={"run": scenario.run.model_copy(update={"duration_s": min(longer, LONGEST_RUN_S)})}
+        )
+
     @property
     def lost_bytes(self) -> int:
         """Bytes that found no reader."""
@@ -244,7 +245,7 @@ class Server:
         except OSError as error:
             self._tell(f"the poses end here: {error.strerror or error}")
             return
-        self._at(now + 100 * MS, self._append_poses)
+        self._at(now + 100 * NS_PER_MS, self._append_poses)
 
     def _crashed(self, board: VirtualBoard, error: Exception) -> None:
         self._tell(f"board {board.id} hangs: its program failed with {type(error).__name__}: {error}")
@@ -309,11 +310,11 @@ class Server:
             if isinstance(fault, Bytes):
                 data = self._damaged(fault, data)
             elif isinstance(fault, LateReplies) and self._chance.random() < fault.share:
-                self._at(time_ns + int(fault.delay_ms * MS), partial(terminal.write, data))
+                self._at(time_ns + int(fault.delay_ms * NS_PER_MS), partial(terminal.write, data))
                 return
             elif isinstance(fault, SplitWrites) and len(data) > 1 and self._chance.random() < fault.share:
                 cut = int(self._chance.integers(1, len(data)))
-                self._at(time_ns + int(fault.gap_ms * MS), partial(terminal.write, data[cut:]))
+                self._at(time_ns + int(fault.gap_ms * NS_PER_MS), partial(terminal.write, data[cut:]))
                 data = data[:cut]
         terminal.write(data)
 

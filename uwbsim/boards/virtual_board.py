@@ -17,7 +17,7 @@ import simpy
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import Message
 from uwbsim.boards.commands import ANSWER, EXECUTORS, Attempt, Command, read_commands
-from uwbsim.boards.frames import MS, US, BoardAir, Radio, Radios, Received
+from uwbsim.boards.frames import NS_PER_MS, NS_PER_US, BoardAir, Radio, Radios, Received
 from uwbsim.boards.ranging import received_by
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
@@ -25,7 +25,7 @@ from uwbsim.scenario.model import Scenario
 PACKET_BYTES: Final = 64
 """Of full-speed USB; a packet takes 55 us on the bus (fitted to transcripts, as all times here)."""
 
-PACKET_GAP: Final = 55 * US
+PACKET_GAP: Final = 55 * NS_PER_US
 FULL: Final = b"USB Buffer full! Message rejected to prevent overflow."
 
 
@@ -57,7 +57,7 @@ class UsbLink:
             piece = data[at : at + PACKET_BYTES]
             # The firmware drops packets of one byte; "~" alone is one of them.
             if len(piece) > 1:
-                self._after(100 * US + number * PACKET_GAP, partial(self._arrive, piece))
+                self._after(100 * NS_PER_US + number * PACKET_GAP, partial(self._arrive, piece))
 
     def read(self) -> bytes:
         """Return what has come, which empties the queue."""
@@ -95,7 +95,7 @@ class UsbLink:
         self._send(data)
 
 
-POLL_PERIOD: Final = MS
+POLL_PERIOD: Final = NS_PER_MS
 """How often the firmware looks at its USB buffer (firmware wire format, 1.3)."""
 
 Steps = Generator[simpy.Event, Any, None]
@@ -269,8 +269,8 @@ class VirtualBoard:
         self._buffer = reading.rest
         for number, complaint in enumerate(reading.complaints):
             if number:
-                yield self.sleep(MS)
-            self.say(complaint, 118 * US)
+                yield self.sleep(NS_PER_MS)
+            self.say(complaint, 118 * NS_PER_US)
         if not reading.alive:
             self.hang()
         elif reading.commands:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,7 +16,6 @@ from uwbsim.cli.arguments import AllowFiles, AsJson, Force, Overrides, ScenarioF
 if TYPE_CHECKING:
     from uwbsim import Scenario
 
-PANEL: Final = "Scenarios"
 AntennaDelays = Annotated[
     Path | None, typer.Option(help="What is programmed into the tags, as calib export wrote it (.toml).")
 ]
@@ -36,7 +35,7 @@ def add_to(app: typer.Typer) -> None:
         (validate, "uwbsim validate scenario.toml"),
         (schema, "uwbsim schema > scenario.schema.json"),
     ):
-        add(app, command, *examples, panel=PANEL)
+        add(app, command, *examples, panel="Scenarios")
 
 
 def run(
@@ -128,13 +127,14 @@ def serve(
     """Have the boards of a scenario answer on pseudo-terminals, as powered boards do on serial ports."""
     import uwbsim
     from uwblink.output import check_output
-    from uwbsim.boards import extended
 
     if poses:
         check_output(poses, force=force)
     loaded = _programmed(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()), antenna_delays)
     wrong = uwbsim.load_faults(faults, [tag.id for tag in loaded.tags]) if faults else None
-    server = uwbsim.Server(extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True))
+    server = uwbsim.Server(
+        uwbsim.Server.extended(loaded, duration), link_dir, wrong, tell=lambda text: typer.echo(text, err=True)
+    )
     try:
         for tag, name in server.names.items():
             typer.echo(f"tag {tag:3d}  {name}")

@@ -21,10 +21,6 @@ if TYPE_CHECKING:
     from uwbsim.twins import Compared
 
 
-WHOLE: Final = 116
-"""Columns of a terminal from which the table of protocols has room for all of its own."""
-
-PANEL: Final = "Protocols and studies"
 TIMING: Final = "Timing"
 TRUTH: Final = "Tags"
 NOISE: Final = "Noise of stamps"
@@ -49,7 +45,7 @@ def add_to(app: typer.Typer) -> None:
         (optimum, "uwbsim optimum scenario.toml --protocols ds,ds-alt"),
         (sweep, "uwbsim sweep plan.toml -o results", "uwbsim sweep plan.toml -o results --resume"),
     ):
-        add(app, command, *examples, panel=PANEL)
+        add(app, command, *examples, panel="Protocols and studies")
     add(app, twin, "uwbsim twin flight.uwb -c calibration.json -o twin.toml", panel="From measurements")
 
 
@@ -98,7 +94,7 @@ def _print_outcomes(found: uwbsim.Comparison) -> None:
     console = Console(width=None if sys.stdout.isatty() else 140)
     cells = [[show(outcome) for show in COLUMNS.values()] for outcome in found.outcomes]
     heads = [name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors") for name in COLUMNS]
-    narrow = console.width < WHOLE
+    narrow = console.width < 116  # what all columns of the table take
     if narrow:
         # A narrow terminal has no room for all columns: then each protocol is one.
         heads, *cells = ([name, *row] for name, row in zip(COLUMNS, zip(*cells, strict=True), strict=True))

@@ -19,7 +19,7 @@ from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation.air import schedule
 from uwbsim.simulation.timestamps import draw_reply_s
 from uwbsim.world.antenna_delays import AntennaDelays
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import SUBTICKS_PER_SECOND, WALK_STEP_S, Clocks
 from uwbsim.world.radio import carrier_bias_ppm
 from uwbsim.world.reception import arrive
 from uwbsim.world.world import World
@@ -152,8 +152,8 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         flight=link.distance_m / SPEED_OF_LIGHT,
         excess=link.excess_m / SPEED_OF_LIGHT,
         flight_rate=(later.distance_m - link.distance_m) / step_s / SPEED_OF_LIGHT,
-        rate_initiator=clocks.exchange_rate(i, start),
-        rate_target=clocks.exchange_rate(j, start),
+        rate_initiator=clocks.rate(i, start, WALK_STEP_S),
+        rate_target=clocks.rate(j, start, WALK_STEP_S),
         drift_initiator=nothing,
         drift_target=nothing,
         white_initiator=white[i],

@@ -22,8 +22,6 @@ from uwblink.recording.schema import SUFFIX, Poses
 from uwbsim.errors import ScenarioError
 
 MOST_POSES: Final = 200_000
-MOST_BYTES: Final = 64_000_000
-"""Of a linked file of text: twice what `MOST_POSES` take, at eight numbers of twenty digits."""
 
 MOST_ROWS: Final = 1_000_000
 """Of a linked table: nearly three hours of slots at 100 Hz; in memory they take 0.2 GB."""
@@ -91,8 +89,10 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
         raise ScenarioError(f"{where}, but there is no such file beside the scenario")
     if not place.is_file():
         raise ScenarioError(f"{where}, which is no regular file")
-    if place.suffix != SUFFIX and (size := place.stat().st_size) > MOST_BYTES:
-        raise ScenarioError(f"{where}, which has {size} bytes; at most {MOST_BYTES} are read")
+    # Twice what `MOST_POSES` take as text, at eight numbers of twenty digits.
+    most = 64_000_000
+    if place.suffix != SUFFIX and (size := place.stat().st_size) > most:
+        raise ScenarioError(f"{where}, which has {size} bytes; at most {most} are read")
     return path
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -28,30 +28,20 @@ from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import World
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """Everything a run needs at hand, made once from the scenario."""
-
-    scenario: Scenario
-    protocol: RangingProtocol
-    world: World
-    medium: Medium
-
-
-def reported_exchanges(run: Run, kept: Ints, planned: int, rows: Begun, stamped: Stamped) -> Exchanges:
+def reported_exchanges(medium: Medium, kept: Ints, planned: int, rows: Begun, stamped: Stamped) -> Exchanges:
     """Return the reports of the `kept` exchanges (n,), of all `planned`: stamps wrapped, ranges as printed."""
     initiator, target = rows.initiator, rows.target
-    ids = np.array([tag.id for tag in run.scenario.tags], dtype=np.int64)
+    ids = np.array([tag.id for tag in medium.scenario.tags], dtype=np.int64)
     none = np.zeros(len(kept), dtype=np.int64)
     stamps: dict[str, Ints] = {name: stamped.stamps.get(name, none) & MASK for name in STAMPS}
-    fpp1, skew1 = _readings(run, 1, kept, planned, stamped)
-    fpp2, skew2 = _readings(run, 2, kept, planned, stamped)
+    fpp1, skew1 = _readings(medium, 1, kept, planned, stamped)
+    fpp2, skew2 = _readings(medium, 2, kept, planned, stamped)
     nan = np.full(len(kept), np.nan)
     found = Exchanges(
         time_ns=np.rint(stamped.frames[0].departure * (NS_PER_S / SUBTICKS_PER_SECOND)).astype(np.int64),
         initiator=ids[initiator],
         target=ids[target],
-        protocol=np.full(len(kept), run.protocol.name),
+        protocol=np.full(len(kept), medium.scenario.ranging.protocol),
         reporter=ids[initiator],
         range_m=nan,
         fpp1_dbm=fpp1,
@@ -62,21 +52,21 @@ def reported_exchanges(run: Run, kept: Ints, planned: int, rows: Begun, stamped:
         bits=REPORT_BITS,
         **stamps,
     )
-    printed = board_range if run.scenario.radio.quantize else raw_range
+    printed = board_range if medium.scenario.radio.quantize else raw_range
     return replace(found, range_m=printed(found))
 
 
-def _readings(run: Run, number: int, kept: Ints, planned: int, stamped: Stamped) -> tuple[Floats, Floats]:
+def _readings(medium: Medium, number: int, kept: Ints, planned: int, stamped: Stamped) -> tuple[Floats, Floats]:
     """What the receiver of message `number` prints: first-path power and relative skew."""
-    seed = run.scenario.run.seed
+    seed = medium.scenario.run.seed
     power_noise = stream(seed, "power reading", number).normal(size=planned)[kept]
     skew_noise = stream(seed, "skew reading", number).normal(size=planned)[kept]
-    return run.medium.readings(stamped.frames[number - 1], stamped.power_dbm[number - 1], power_noise, skew_noise)
+    return medium.readings(stamped.frames[number - 1], stamped.power_dbm[number - 1], power_noise, skew_noise)
 
 
-def reported_faults(run: Run, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
+def reported_faults(scenario: Scenario, begun: Ints, plan: Schedule, outcomes: air.Outcomes) -> list[Fault]:
     """Return what became of the exchanges that failed, each under its initiator's name."""
-    ids = [tag.id for tag in run.scenario.tags]
+    ids = [tag.id for tag in scenario.tags]
     found = []
     for k in np.flatnonzero(np.array(outcomes.lost) >= 0):
         a, b = ids[plan.initiator[k]], ids[plan.target[k]]

@@ -38,13 +38,13 @@ SUBTICKS: Final = 1024
 SUBTICKS_PER_SECOND: Final = SUBTICKS * TICKS_PER_SECOND
 
 
-SHORTEST: Final = 30
+SHORTEST_OCTAVE: Final = 30
 """The shortest tents are 2^30 sub-ticks or 16 us long: a second difference over 1 ms misses 0.4 % of its variance."""
 
-GRID: Final = 42
+GRID_OCTAVE: Final = 42
 """Tents longer than 2^42 sub-ticks, 67 ms, are added up once on a grid of this step."""
 
-LONGEST: Final = 59
+LONGEST_OCTAVE: Final = 59
 """The longest tents are 2^59 sub-ticks, 8810 s: flicker ends below that frequency, white noise goes on."""
 
 PIECE: Final = 2048
@@ -81,36 +81,38 @@ class ClockNoise:
         if not any(tag.white_ppm_sqrt_s or tag.flicker_ppm for tag in tags):
             return None
         drawn = [stream(seed, "clock noise", tag.id) for tag in tags]
-        octaves = np.arange(SHORTEST, LONGEST + 1)
+        octaves = np.arange(SHORTEST_OCTAVE, LONGEST_OCTAVE + 1)
         keys = np.stack([rng.integers(0, 1 << 63, len(octaves), dtype=np.uint64) for rng in drawn], axis=1)
         # A whole number of steps, so that the grid begins at time zero; less than 2^62, so that no run overflows.
-        steps = np.array([rng.integers(0, 1 << (62 - GRID), dtype=np.uint64) for rng in drawn])
-        count = int(duration_s * SUBTICKS_PER_SECOND / 2**GRID) + 64
+        steps = np.array([rng.integers(0, 1 << (62 - GRID_OCTAVE), dtype=np.uint64) for rng in drawn])
+        count = int(duration_s * SUBTICKS_PER_SECOND / 2**GRID_OCTAVE) + 64
         peaks = np.stack([_peaks(tag, octaves) for tag in tags], axis=1)
         knots = np.zeros((len(tags), count))
-        noise = cls(keys, peaks, steps << np.uint64(GRID), knots)
-        time = np.arange(count, dtype=np.int64) << GRID
+        noise = cls(keys, peaks, steps << np.uint64(GRID_OCTAVE), knots)
+        time = np.arange(count, dtype=np.int64) << GRID_OCTAVE
         for place, (tag, rng) in enumerate(zip(tags, drawn, strict=True)):
             which = np.full(count, place)
-            coarse = noise._tents(which, time, slice(GRID + 1 - SHORTEST, None)) + noise._trend(place, tag, rng, time)
+            coarse = noise._tents(which, time, slice(GRID_OCTAVE + 1 - SHORTEST_OCTAVE, None)) + noise._trend(
+                place, tag, rng, time
+            )
             knots[place] = coarse - coarse[0]
         return noise
 
     def phase(self, tag: Ints, time: Ints) -> Floats:
         """Return by how many sub-ticks the clocks of tags (n,) are ahead for their noise at true times (n,)."""
-        cell = np.clip(time >> GRID, 0, self.knots.shape[1] - 2)
-        into = (time - (cell << GRID)) * 2.0**-GRID
+        cell = np.clip(time >> GRID_OCTAVE, 0, self.knots.shape[1] - 2)
+        into = (time - (cell << GRID_OCTAVE)) * 2.0**-GRID_OCTAVE
         low = self.knots[tag, cell]
         return np.asarray(low + into * (self.knots[tag, cell + 1] - low) + self._fine(tag, time))
 
     def _fine(self, tag: Ints, time: Ints) -> Floats:
         """Add up the octaves below the grid, piece by piece."""
-        octaves, cuts = slice(0, GRID + 1 - SHORTEST), range(0, max(len(time), 1), PIECE)
+        octaves, cuts = slice(0, GRID_OCTAVE + 1 - SHORTEST_OCTAVE), range(0, max(len(time), 1), PIECE)
         return np.concatenate([self._tents(tag[k : k + PIECE], time[k : k + PIECE], octaves) for k in cuts])
 
     def _tents(self, tag: Ints, time: Ints, octaves: slice) -> Floats:
         """Add up the tents of some octaves, (n,), from the shortest to the longest."""
-        exponents = np.arange(SHORTEST, LONGEST + 1, dtype=np.uint64)[octaves]
+        exponents = np.arange(SHORTEST_OCTAVE, LONGEST_OCTAVE + 1, dtype=np.uint64)[octaves]
         at = time.astype(np.uint64) + self.shift[tag]
         index = at >> exponents[:, None]
         into = (at - (index << exponents[:, None])).astype(np.float64) * np.exp2(-exponents.astype(np.float64))[:, None]
@@ -119,9 +121,9 @@ class ClockNoise:
 
     def _trend(self, place: int, tag: Tag, rng: np.random.Generator, time: Ints) -> Floats:
         """Return the random walk of white noise from one of the longest intervals to the next, linear in between."""
-        at = (time.astype(np.uint64) + self.shift[place]).astype(np.float64) * 2.0**-LONGEST
-        step = tag.white_sqrt_s * np.sqrt(2.0**LONGEST * SUBTICKS_PER_SECOND)
-        walk = np.cumsum(rng.normal(0, 1, 1 << (64 - LONGEST))) * step
+        at = (time.astype(np.uint64) + self.shift[place]).astype(np.float64) * 2.0**-LONGEST_OCTAVE
+        step = tag.white_sqrt_s * np.sqrt(2.0**LONGEST_OCTAVE * SUBTICKS_PER_SECOND)
+        walk = np.cumsum(rng.normal(0, 1, 1 << (64 - LONGEST_OCTAVE))) * step
         return np.asarray(np.interp(at, np.arange(len(walk)), walk))
 
 
@@ -201,26 +203,17 @@ class Clocks:
             time = bare - self._deviation(tag, time)
         return time
 
-    def rate(self, tag: Ints, time: Ints) -> Floats:
-        """Return how much faster than true time the clocks run, as a fraction, shape (n,).
+    def rate(self, tag: Ints, time: Ints, span_s: float = RATE_SPAN_S) -> Floats:
+        """Return how much faster than true time the clocks run, as a fraction, (n,).
 
-        Noise has no rate at an instant; its share is the mean over the `RATE_SPAN_S` before, as of a preamble that the
-        carrier integrator follows.
+        Noise has no rate at an instant; its share is the mean over the `span_s` before: by default that of a preamble,
+        which the carrier integrator follows.
         """
-        return np.asarray(self._smooth_rate(tag, time) + self._noise_rate(tag, time, RATE_SPAN_S))
-
-    def exchange_rate(self, tag: Ints, time: Ints) -> Floats:
-        """Return the rate without the noise that averages out within a tenth of a second, shape (n,)."""
-        return np.asarray(self._smooth_rate(tag, time) + self._noise_rate(tag, time, WALK_STEP_S))
-
-    def _smooth_rate(self, tag: Ints, time: Ints) -> Floats:
-        return np.asarray(self.skew[tag] + self.walk_rate[tag, self._step(time)[0]])
-
-    def _noise_rate(self, tag: Ints, time: Ints, span_s: float) -> Floats | float:
+        rate = self.skew[tag] + self.walk_rate[tag, self._step(time)[0]]
         if self.noise is None:
-            return 0.0
+            return np.asarray(rate)
         span = round(span_s * SUBTICKS_PER_SECOND)
-        return (self.noise.phase(tag, time) - self.noise.phase(tag, time - span)) / span
+        return np.asarray(rate + (self.noise.phase(tag, time) - self.noise.phase(tag, time - span)) / span)
 
     def _step(self, time: Ints) -> tuple[Ints, Floats]:
         step = int(WALK_STEP_S * SUBTICKS_PER_SECOND)

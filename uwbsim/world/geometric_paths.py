@@ -31,7 +31,7 @@ from uwbsim.world.diffraction import (
     planes,
     roughness_factor,
 )
-from uwbsim.world.radio import antenna_gain_db, path_gain_db
+from uwbsim.world.radio import NEAREST_PATH_M, antenna_gain_db, path_gain_db
 
 CELLS: Final = 128
 """A side of the table of an antenna's gains: directions are known to a degree."""
@@ -97,10 +97,6 @@ def _directions() -> Floats:
     y = np.where(z < 0, np.copysign(1 - np.abs(u), v), v)
     points = np.column_stack([x, y, z])
     return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
-
-
-SHORTEST_M: Final = 0.05
-"""Shorter paths count as this long; path gain has no sense nearer to an antenna."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,7 +231,7 @@ def field_after(scenario: Scenario, length: Floats) -> Floats:
     """Amplitude after a way without antennas: its square is the power in mW."""
     radio = scenario.radio
     if radio.path_loss_exponent == 2.0:
-        return np.asarray(10 ** (radio.first_path_at_1m_dbm / 20) / np.maximum(length, SHORTEST_M))
+        return np.asarray(10 ** (radio.first_path_at_1m_dbm / 20) / np.maximum(length, NEAREST_PATH_M))
     return np.asarray(10 ** (path_gain_db(radio, length) / 20))
 
 
@@ -279,7 +275,7 @@ def legs_to_scatterers(around: Surroundings, ends: Placed, bodies: Sequence[Plac
     own = [
         ends.rotation[:, :, k] @ spots.T - np.einsum("mj,mj->m", ends.rotation[:, :, k], a)[:, None] for k in range(3)
     ]
-    length = np.maximum(np.sqrt(own[0] ** 2 + own[1] ** 2 + own[2] ** 2), SHORTEST_M)
+    length = np.maximum(np.sqrt(own[0] ** 2 + own[1] ** 2 + own[2] ** 2), NEAREST_PATH_M)
     gain = around.patterns.gain(ends.tag, own)
     gain = gain * in_the_way(around, ends, bodies, instant, spots, length)
     return Legs(length_m=length, gain=gain)
@@ -364,7 +360,7 @@ def _mirrored(
     way = np.repeat((b - a).T[:, :, None], len(axis), axis=2)
     across = 2 * plane - a[:, axis] - b[:, axis]
     way[axis, :, columns] = across.T
-    length = np.maximum(np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2), SHORTEST_M)
+    length = np.maximum(np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2), NEAREST_PATH_M)
     share = np.clip((plane - a[:, axis]) / np.where(np.abs(across) < 1e-12, 1e-12, across), 0, 1)
     point = np.moveaxis(a.T[:, :, None] + share * way, 0, 2)
     cosine = across / length
@@ -374,7 +370,7 @@ def _mirrored(
     back[axis, :, columns] *= -1
     for end, leaving, legs in zip(ends, (way, back), (share, 1 - share), strict=True):
         own = [np.einsum("jnm,nj->nm", leaving, end.rotation[:, :, k]) for k in range(3)]
-        leg = np.maximum(legs * length, SHORTEST_M)
+        leg = np.maximum(legs * length, NEAREST_PATH_M)
         field = field * around.patterns.gain(end.tag, own) * in_the_way(around, end, bodies, at, point, leg)
     axes = (antenna_axes(scenario, ends[0]), antenna_axes(scenario, ends[1]))
     reflected = coupling(mirrors, axes, way / length, cosine)

@@ -30,8 +30,6 @@ CHUNK: Final = 2048
 """So many links at once: fewer take longer each, more do not fit into a core's cache."""
 
 COLUMNS: Final = ("excess_m", "power_dbm", "total_dbm", "noise_s")
-MOST_KEPT: Final = 2_000_000
-"""So many responses' figures are kept: 80 MB."""
 
 
 @dataclass(slots=True)
@@ -67,7 +65,8 @@ class GeometricResponses:
         """Compute responses that will be asked for; those of many pairs at once share what they have in common."""
         keys = self._key(places, self._step(time_s))
         missing = self._missing(keys)
-        if len(missing) and len(self.keys) + len(missing) > MOST_KEPT:
+        # Two million responses' figures are kept at most: 80 MB.
+        if len(missing) and len(self.keys) + len(missing) > 2_000_000:
             kept = np.isin(self.keys, keys)
             self.keys, self.columns = self.keys[kept], self.columns[:, kept]
         self._add(missing)

@@ -25,6 +25,9 @@ ALPHA_DBM: Final = -82.0
 FPP_OFFSET_DB: Final = 121.74
 """DW1000 User Manual, section 4.7.1, for a pulse repetition frequency of 64 MHz."""
 
+NEAREST_PATH_M: Final = 0.05
+"""Shorter paths count as this long: path gain has no sense nearer to an antenna."""
+
 SHADOW_ORDERS: Final = np.arange(1, 4)
 """Harmonics of azimuth that the shadow of a tag's body is made of: smooth over some 60 degrees."""
 
@@ -129,7 +132,7 @@ def _group_delay_cm(model: GroupDelay, direction: Floats) -> Floats:
 
 def path_gain_db(radio: Radio, distance_m: Floats) -> Floats:
     """Return first-path power over distance without antennas, in dBm, (n,)."""
-    nearest = np.maximum(distance_m, 0.05)
+    nearest = np.maximum(distance_m, NEAREST_PATH_M)
     return radio.first_path_at_1m_dbm - 10 * radio.path_loss_exponent * np.log10(nearest)
 
 

@@ -10,7 +10,7 @@ from uwblink.errors import RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.fields import INT, PRINTED, TEXT
 from uwbsim.boards.commands import EXECUTORS, atoi, printed_float, read_commands, register_command
-from uwbsim.boards.frames import MS
+from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.virtual_port import VirtualPorts
 from uwbsim.errors import UwbsimError
 
@@ -52,7 +52,7 @@ def test_a_new_command_is_one_message_class_and_one_executor(voltage):
 def test_an_executor_may_take_its_time_and_may_fail(voltage):
     def slowly(board, factor, name):
         tries.append(int(board.bench.env.now))
-        yield board.bench.env.timeout(3 * MS)
+        yield board.bench.env.timeout(3 * NS_PER_MS)
         if len(tries) <= factor:
             return False
         yield from board.answer(Voltage(board.id, 1.0, name.decode()))
@@ -63,7 +63,7 @@ def test_an_executor_may_take_its_time_and_may_fail(voltage):
     tries: list[int] = []
     assert board.request(GetVoltage(2, "slow")) == Voltage(1, 1.0, "slow")
     # Tried at the polls of the USB buffer, one each millisecond.
-    assert [(b - a) / MS for a, b in pairwise(tries)] == [4.0, 4.0]
+    assert [(b - a) / NS_PER_MS for a, b in pairwise(tries)] == [4.0, 4.0]
     tries.clear()
     assert board.request(GetVoltage(5, "last")) == Voltage(1, 1.0, "last")
 
@@ -154,6 +154,6 @@ def test_floats_that_are_none_are_printed_as_the_processor_prints_them(value, pr
 def test_a_number_that_is_none_does_not_stop_the_bench(raw):
     ports = VirtualPorts(bench_scenario())
     ports.bench.boards[1].write(b"C03|1|a|1|" + raw + b"|\x01\x00x\r")
-    ports.bench.advance(5 * MS)
+    ports.bench.advance(5 * NS_PER_MS)
     assert ports.transfers[0][2].startswith(b"R03|0|1|a|1|")
     assert Board(ports.port(2)).id == 2

@@ -6,7 +6,7 @@ import struct
 from tests.boards import bench_scenario
 from uwblink.boards.board import Board
 from uwblink.wire import messages as m
-from uwbsim.boards.frames import MS
+from uwbsim.boards.frames import NS_PER_MS
 from uwbsim.boards.virtual_port import VirtualPorts
 
 COMMANDS = 100_000
@@ -80,7 +80,7 @@ def test_no_byte_ends_the_bench_or_another_board():
         kind = rng.random()
         data = rng.randbytes(rng.randrange(1, 90)) if kind < RANDOM_SHARE else command(rng)
         victim.write(mangled(rng, data) if kind > 1 - MANGLED_SHARE else data)
-        bench.advance(int(bench.env.now) + rng.choice((MS // 10, MS, MS, 2 * MS)))
+        bench.advance(int(bench.env.now) + rng.choice((NS_PER_MS // 10, NS_PER_MS, NS_PER_MS, 2 * NS_PER_MS)))
         if not (victim.alive and victim.powered):
             deaths += 1
             victim.power_cycle()

@@ -5,11 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.uwbsim.simulation.test_protocols import bench
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.ticks import TICK_S, elapsed
+from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import load
-from uwbsim.scenario.ranging import before_marker_s, exchange_air_s, frame_s
+from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.ranging import after_marker_s, before_marker_s, exchange_air_s, frame_s
 from uwbsim.simulation import air
 from uwbsim.simulation.run import simulate
+from uwbsim.simulation.timestamps import draw, draw_reply_s
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 US = SUBTICKS_PER_SECOND // 1_000_000
@@ -47,65 +52,158 @@ def played(hosts, powers=None, capture_db=6.0):
     return air.run(DS, slots, numbers, 8, lambda sender, _time: table[sender], rules)
 
 
-def test_alone_every_exchange_succeeds_and_starts_when_it_should():
-    outcome = played([[slot(0, 0, 0, 1), slot(1, 5000, 1, 2)]])
-    assert outcome.lost == [-1, -1]
-    assert np.diff(outcome.start)[0] / US == pytest.approx(5000, abs=1)
+def with_powers(*changes, everywhere=-80.0):
+    """Powers by sender and receiver, all the same but for some."""
+    powers = np.full((8, 8), everywhere)
+    for sender, receiver, power_dbm in changes:
+        powers[sender, receiver] = power_dbm
+    return powers
 
 
-def test_a_missing_message_costs_the_preamble_timeout():
-    outcome = played([[slot(0, 0, 0, 1, (True, False, True)), slot(1, 100, 0, 1)]])
-    assert (outcome.lost, outcome.reason) == ([1, -1], [air.WEAK, ""])
-    # From marker to marker: the rest of the poll, the receiver going on, the wait, the next command, its preamble.
-    assert np.diff(outcome.start)[0] / US == pytest.approx(39 + 40 + 6521 + 1000 + 138.4, abs=2)
+WEAKER = with_powers((2, slice(None), -95.0), (2, 3, -80.0))
+"""The second initiator is 15 dB weaker everywhere but at its own target."""
+
+APART = with_powers(([[0], [1]], [2, 3], -120.0), ([[2], [3]], [0, 1], -120.0))
+CHAIN = with_powers(([[0], [1], [2]], [0, 1, 2], -80.0), everywhere=-120.0)
+TWO = [[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]
+"""A second exchange that begins 50 us after the first."""
 
 
-def test_two_polls_at_once_collide_at_equal_power():
-    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]])
-    assert set(outcome.reason) == {air.COLLIDED}
-    assert outcome.lost == [0, 0]
+@pytest.mark.parametrize(
+    ("hosts", "powers", "reasons"),
+    [
+        pytest.param([[slot(0, 0, 0, 1), slot(1, 5000, 1, 2)]], None, ["", ""], id="alone"),
+        pytest.param(TWO, None, [air.COLLIDED] * 2, id="two polls at equal power"),
+        pytest.param(TWO, WEAKER, ["", air.COLLIDED], id="stronger and earlier"),
+        # The receiver is locked on the other.
+        pytest.param([[slot(0, 50, 0, 1)], [slot(1, 0, 2, 3)]], WEAKER, [air.COLLIDED, None], id="stronger but later"),
+        pytest.param(TWO, APART, ["", ""], id="too far away"),
+        pytest.param([[slot(0, 0, 0, 1)], [slot(1, 900, 2, 1)]], None, [None, air.BUSY], id="target in an exchange"),
+        pytest.param(
+            [[slot(0, 0, 0, 1, (True, False, True))], [slot(1, 900, 2, 1)]],
+            None,
+            [air.WEAK, air.BUSY],
+            id="a target keeps to its exchange though nobody hears its answer",
+        ),
+        pytest.param([[slot(0, 0, 0, 1, final_us=6900)]], None, [air.LATE], id="a final after the preamble timeout"),
+        # The second poll is over before the first exchange begins to wait for anything.
+        pytest.param(
+            [[slot(0, 1000, 0, 1)], [slot(1, 0, 2, 3, (False, True, True))]], None, ["", air.WEAK], id="ended before"
+        ),
+        pytest.param([[slot(0, 0, 0, 1)], [slot(1, 50, 1, 2)]], CHAIN, [air.BUSY, None], id="who sends hears nothing"),
+        pytest.param(
+            [[slot(0, 0, 0, 1)], [slot(1, 40, 2, 3)], [slot(2, 60, 4, 5)]],
+            with_powers((2, 1, -120.0)),
+            [air.COLLIDED, None, None],
+            id="behind one that is too weak another collides",
+        ),
+        # The second poll falls between the first exchange's response and its final.
+        pytest.param([[slot(0, 0, 0, 1)], [slot(1, 800, 2, 3)]], None, [air.FOREIGN, None], id="the first that comes"),
+        pytest.param(TWO, with_powers(([[2], [3]], [0, 1], -86.0)), ["", None], id="captured from 6 dB on"),
+        pytest.param(TWO, with_powers(([[2], [3]], [0, 1], -85.99)), [air.COLLIDED, None], id="not captured below"),
+        pytest.param(
+            TWO, with_powers(([0, 1], [1, 0], -97.0), everywhere=-100.0), [air.COLLIDED, None], id="at the sensitivity"
+        ),
+        pytest.param(TWO, with_powers(([0, 1], [1, 0], -97.0), everywhere=-100.01), ["", None], id="below it"),
+    ],
+)
+def test_what_becomes_of_exchanges_that_meet(hosts, powers, reasons):
+    outcome = played(hosts, powers)
+    named = [found if reason is not None else None for found, reason in zip(outcome.reason, reasons, strict=True)]
+    assert named == reasons
+    assert [bool(reason) for reason in outcome.reason] == [lost >= 0 for lost in outcome.lost]
 
 
-def test_the_stronger_and_earlier_frame_is_captured():
-    powers = np.full((8, 8), -80.0)
-    powers[2, :] = -95.0  # the second initiator is 15 dB weaker everywhere ...
-    powers[2, 3] = -80.0  # ... except at its own target
-    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]], powers)
-    assert outcome.reason[0] == ""
-    assert outcome.reason[1] == air.COLLIDED
-    late = played([[slot(0, 50, 0, 1)], [slot(1, 0, 2, 3)]], powers)
-    assert late.reason[0] == air.COLLIDED, "stronger, but later: the receiver is locked on the other"
+def test_the_message_that_is_lost_is_named():
+    assert played([[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]]).lost == [0, 0]
+    assert played([[slot(0, 0, 0, 1)], [slot(1, 800, 2, 3)]]).lost[0] == 2
 
 
-def test_who_is_too_far_away_does_not_disturb():
-    powers = np.full((8, 8), -80.0)
-    powers[np.ix_([0, 1], [2, 3])] = powers[np.ix_([2, 3], [0, 1])] = -120.0
-    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 50, 2, 3)]], powers)
-    assert outcome.lost == [-1, -1]
+FINAL_US = 305 + 1538 + after_marker_s(28) * 1e6 + before_marker_s(128) * 1e6
+"""From the marker of a poll to that of the next, right after the final has ended."""
 
 
-def test_a_target_in_another_exchange_does_not_hear_a_poll():
-    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 900, 2, 1)]])
-    assert outcome.reason[1] == air.BUSY
+@pytest.mark.parametrize(
+    ("hosts", "between_us"),
+    [
+        ([[slot(0, 0, 0, 1), slot(1, 5000, 1, 2)]], 5000),
+        # The rest of the poll, the receiver going on, the wait, the next command, its preamble.
+        ([[slot(0, 0, 0, 1, (True, False, True)), slot(1, 100, 0, 1)]], 39 + 40 + 6521 + 1000 + 138.4),
+        ([[slot(0, 0, 0, 1), slot(1, 5000, 0, 1, pause_us=250)]], 5250),
+        ([[slot(0, 0, 0, 1), slot(1, 10, 0, 1)]], FINAL_US + 1000),
+        # An initiator that is being ranged with waits until it is free.
+        ([[slot(0, 0, 0, 1)], [slot(1, 600, 1, 2)]], FINAL_US),
+        ([[slot(0, 50_000, 0, 1)], [slot(1, 50_600, 1, 2)]], FINAL_US),
+    ],
+)
+def test_exchanges_start_when_they_should(hosts, between_us):
+    outcome = played(hosts)
+    assert outcome.lost[1] == -1
+    assert np.diff(outcome.start)[0] / US == pytest.approx(between_us, abs=2)
 
 
-def test_a_board_that_waits_takes_the_first_frame_that_comes():
-    # The second poll falls between the first exchange's response and its final.
-    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 800, 2, 3)]])
-    assert outcome.lost[0] == 2
-    assert outcome.reason[0] == air.FOREIGN
+def test_progress_is_told_for_every_500th_slot_as_a_share_of_all_hosts():
+    told: list[float] = []
+    hosts = [[slot(k, 3000 * k, 0, 1) for k in range(501)], [slot(501, 0, 4, 5)]]
+    powers = np.full((8, 8), -120.0)
+    powers[:2, :2] = powers[4:6, 4:6] = -80.0
+    rules = air.Rules(sensitivity_dbm=-100.0, capture_db=6.0, preamble_symbols=128)
+    slots, numbers = columns(hosts)
+    outcome = air.run(DS, slots, numbers, 8, lambda sender, _: powers[sender], rules, told.append)
+    assert set(outcome.lost) == {-1}
+    assert told == [0.0, 0.0, 500 / 502]
 
 
-def test_a_final_later_than_the_preamble_timeout_is_too_late():
-    outcome = played([[slot(0, 0, 0, 1, final_us=6900)]])
-    assert (outcome.lost[0], outcome.reason[0]) == (2, air.LATE)
+def with_replies(reply):
+    document = bench().model_dump(mode="json")
+    document["ranging"]["reply"] = reply
+    return Scenario.model_validate(document)
 
 
-def test_an_initiator_that_is_being_ranged_with_waits_until_it_is_free():
-    powers = np.full((8, 8), -80.0)
-    outcome = played([[slot(0, 0, 0, 1)], [slot(1, 600, 1, 2)]], powers)
-    assert outcome.lost == [-1, -1]
-    assert outcome.start[1] / US > 305 + 1538
+def test_replies_are_drawn_from_two_modes_a_shoulder_and_a_tail():
+    micro = draw_reply_s(with_replies({"model": "boards"}), stream(1, "reply"), 400_000) * 1e6
+    # 400 000 draws know a share to 0.0008.
+    for below_us, share in ((304.1, 0.207), (305.9, 0.635), (308.3, 0.885), (310.0, 0.9096), (348.25, 0.955)):
+        assert np.mean(micro < below_us) == pytest.approx(share, abs=0.003), below_us
+    assert micro.min() == pytest.approx(303.4, abs=1e-6)
+    assert 386.0 < micro.max() < 386.5
+    assert np.std(micro[(micro > 303.5) & (micro < 304.7)]) == pytest.approx(0.28, abs=0.03)
+    shoulder = micro[(micro > 308.5) & (micro < 310.0)]
+    assert len(shoulder) / len(micro) == pytest.approx(0.05 * 0.38, abs=0.002)
+
+
+def test_detours_have_the_share_and_the_mean_of_the_scenario_and_noise_is_standard():
+    scenario = bench(multipath={"probability": 0.2, "mean_excess_m": 0.5})
+    drawn = draw(scenario, 100_000, 3)
+    hit = drawn.excess_m > 0
+    assert hit.mean() == pytest.approx(0.2, abs=0.005)
+    assert drawn.excess_m[hit].mean() == pytest.approx(0.5, rel=0.03)
+    for noise in (drawn.transmit, drawn.receive):
+        assert noise.shape == (3, 100_000)
+        assert abs(noise.mean()) < 0.01
+        assert noise.std() == pytest.approx(1.0, rel=0.01)
+        assert abs(np.corrcoef(noise)[0, 1]) < 0.015
+    some = drawn[np.array([5, 7])]
+    np.testing.assert_array_equal(some.reply_s, drawn.reply_s[[5, 7]])
+    np.testing.assert_array_equal(some.transmit, drawn.transmit[:, [5, 7]])
+    assert SUBTICKS_PER_SECOND == 1024 * 63_897_600_000
+    quiet = draw(bench(), 100, 3)
+    assert not quiet.excess_m.any()
+    assert set(quiet.reply_s.tolist()) == {305e-6}
+
+
+def test_an_answer_leaves_at_the_first_grid_point_after_its_latency():
+    e = simulate(bench("ds", reply_us=305.0)).exchanges
+    late = elapsed(e.tx2, e.rx1) - round(305e-6 / TICK_S)
+    assert late.min() >= 0
+    assert late.max() < 512
+
+
+def test_replies_by_quantiles_have_those_quantiles():
+    scenario = with_replies({"model": "quantiles", "delays_us": [300.0, 310.0, 400.0]})
+    found = draw_reply_s(scenario, stream(1, "reply"), 100_000) * 1e6
+    for share, us in ((0.25, 305.0), (0.5, 310.0), (0.75, 355.0)):
+        assert np.quantile(found, share) == pytest.approx(us, abs=0.5)
 
 
 @pytest.mark.parametrize(
