@@ -31,8 +31,8 @@ CONFINED = {
             "uwbsim/twins/fitting.py",
         }
     ),
-    "yaml": lambda path: path in {"uwblink/importers/miluv_yaml.py", "calib/calibration/formats.py"},
-    "mcap": lambda path: path in {"uwblink/importers/json_mcap.py", "uwblink/exporters/mcap.py"},
+    "yaml": lambda path: path in {"uwblink/importers/miluv.py", "calib/calibration/formats.py"},
+    "mcap": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/mcap.py"},
     "rosbags": lambda path: path in {"uwblink/importers/bags.py", "uwblink/exporters/rosbag2.py"},
     "foxglove": lambda path: path == "uwblink/streaming/senders.py",
     "distributed": lambda path: path == "uwbsim/sweep/executors.py",

@@ -14,7 +14,7 @@ import numpy as np
 
 with atheris.instrument_imports(include=["uwblink.importers"]):
     from uwblink.errors import UwblinkError
-    from uwblink.importers.exchange_tables import read_table
+    from uwblink.importers import read_table
     from uwblink.importers.guess import guess_map
     from uwblink.importers.poses import read_poses
 

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers.exchange_bags import SUFFIXES as BAGS
-from uwblink.importers.exchange_bags import open_exchange_bag, read_exchange_bag
-from uwblink.importers.exchange_tables import SUFFIXES, open_tables, read_table, read_tables
+from uwblink.importers.bags import BAG_SUFFIXES, open_exchange_bag
+from uwblink.importers.exchange_tables import SUFFIXES, open_tables
 from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.motion_capture import add_poses
-from uwblink.importers.staged_tables import Watch
+from uwblink.importers.staging import Watch
 from uwblink.output import check_output
 from uwblink.plugins import NAME, Registry
 from uwblink.recording.contents import Contents
@@ -83,6 +82,22 @@ def check_importer(row: Any) -> None:
             raise ArgumentError(f"{where}: {name}: found {getattr(row, name)!r:.60}, expected a line of text")
 
 
+def read_tables(sources: Sequence[Path], map_file: Path | None = None) -> Contents:
+    """Return the exchanges of several files with the same columns as one table; raises `ImportTableError`."""
+    with open_tables(sources, map_file) as found:
+        return found.contents()
+
+
+def read_table(source: Path, map_file: Path | None = None) -> Contents:
+    """Return the exchanges of a table, or of all tables in a folder as one; raises `ImportTableError`."""
+    return read_tables([source], map_file)
+
+
+def _read_bag(source: Path, map_file: Path | None = None) -> Contents:
+    with open_exchange_bag([source], map_file) as found:
+        return found.contents()
+
+
 _OWN: Final = (
     Importer(
         "csv",
@@ -95,8 +110,8 @@ _OWN: Final = (
     ),
     Importer(
         "bag",
-        BAGS,
-        read_exchange_bag,
+        BAG_SUFFIXES,
+        _read_bag,
         "Import exchanges from messages in a bag of ROS 1, ROS 2 or MCAP.",
         map_help="Topics, names of fields, units and constants (.toml).",
         open_all=open_exchange_bag,

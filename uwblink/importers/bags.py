@@ -1,58 +1,59 @@
-"""Bags of ROS 1 and ROS 2 and MCAP files: the one place where they are opened."""
+"""Bags of ROS 1, ROS 2 and MCAP: their messages, and exchanges in them by a map of the messages' fields.
+
+A message becomes a row of a table whose columns are its fields, as `header.frame_id`; a time (`header.stamp`) is in
+whole nanoseconds, and the numbers of an array are `stamps.0`, `stamps.1` ... `topic` and `log_time` are columns, too.
+From there on a bag is a table of JSON lines. The project's own MCAP files need no map: all ranges in them are taken.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from tempfile import TemporaryDirectory
+from typing import Any, Final
 
-from uwblink.errors import ImportTableError
-from uwblink.importers.json_mcap import JsonBag, has_json
+import numpy as np
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from uwblink.errors import ImportTableError, first_line
+from uwblink.importers.column_map import ColumnMap, load_map
+from uwblink.importers.exchange_tables import TableImport, plan
+from uwblink.importers.staging import Watch, staged
 from uwblink.text_files import require_regular
 
+BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
+MAX_RECORD_BYTES: Final = 2**28
+"""Of a record, and of what a compressed chunk unpacks to: both are held in memory. Writers make chunks of some MB."""
 
-class Bag(Protocol):
-    """An open bag: its topics with the kinds of their messages, and the messages."""
+MAX_COLUMNS_OF_ARRAY: Final = 16
+"""Numbers of an array that become columns; longer ones are images and the like."""
+
+OWN_RANGE: Final = "uwb.Range"
+"""What the project calls its ranges in MCAP files."""
+
+OWN_COLUMNS: Final = {
+    "from_id": "initiator", "to_id": "target", "range_m": "range_m", "gt_range_m": "truth_m",
+    "fpp1": "fpp1_dbm", "fpp2": "fpp2_dbm", "skew1": "skew1_ppm", "skew2": "skew2_ppm",
+}  # fmt: skip
+"""What is in these ranges, by the names of a map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bag:
+    """An open bag: what kind of message each topic has, as `geometry_msgs/msg/PoseStamped`, and its messages.
+
+    `messages(topics)` yields topic, kind, time in nanoseconds by the recorder, and message; it raises
+    `ImportTableError`.
+    """
 
     path: Path
-
-    @property
-    def kinds(self) -> Mapping[str, str]:
-        """What kind of message each topic has, as `geometry_msgs/msg/PoseStamped`."""
-
-    def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
-        """Yield topic, kind, time in nanoseconds by the recorder, and message; raises `ImportTableError`."""
-
-
-class RosBag:
-    """A bag with the messages of ROS, whatever it is stored as."""
-
-    def __init__(self, path: Path, reader: Any) -> None:
-        """Wrap an open reader."""
-        self.path, self._reader = path, reader
-
-    @property
-    def kinds(self) -> Mapping[str, str]:
-        """What kind of message each topic has, as `geometry_msgs/msg/PoseStamped`."""
-        return {connection.topic: connection.msgtype for connection in self._reader.connections}
-
-    def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
-        """Yield topic, kind, time in nanoseconds by the recorder, and message; raises `ImportTableError`.
-
-        A kind that is none of the standard ones must be defined in the bag, as it is in all but those of ROS 2 before
-        Iron that are stored in SQLite.
-        """
-        wanted = set(topics)
-        used = [connection for connection in self._reader.connections if connection.topic in wanted]
-        for connection in used:
-            if connection.msgtype not in self._reader.typestore.types:
-                raise ImportTableError(
-                    f"{self.path}: does not say what a {connection.msgtype} is; convert it to MCAP in ROS, which does"
-                )
-        for connection, time_ns, raw in self._reader.messages(connections=used):
-            message = self._reader.deserialize(raw, connection.msgtype)
-            yield connection.topic, connection.msgtype, int(time_ns), message
+    kinds: Mapping[str, str]
+    messages: Callable[[Iterable[str]], Iterator[tuple[str, str, int, Any]]]
 
 
 @contextmanager
@@ -65,21 +66,198 @@ def opened(path: Path) -> Iterator[Bag]:
     for part in path.iterdir() if path.is_dir() else ():
         require_regular(part, ImportTableError, "part of a bag", folders=True)
     try:
-        json_bag = JsonBag(path) if has_json(path) else None
-    except OSError as error:
+        if path.is_file() and _is_json(path):
+            yield _json_bag(path)
+            return
+        try:
+            from rosbags.highlevel import AnyReader, AnyReaderError
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            raise ImportTableError(f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'") from error
+        try:
+            with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+                yield _ros_bag(path, reader)
+        except AnyReaderError as error:
+            raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
+    except ImportTableError:
+        raise
+    except (OSError, ValueError) as error:
         raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
-    if json_bag is not None:
-        yield json_bag
-        return
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportTableError(f"{path}: reading bags needs rosbags; pip install 'uwbcal[bags]'") from error
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            yield RosBag(path, reader)
-    except (AnyReaderError, OSError, ValueError) as error:
-        if isinstance(error, ImportTableError):
+
+
+def _ros_bag(path: Path, reader: Any) -> Bag:
+    """Return a bag with the messages of ROS, whatever it is stored as."""
+
+    def messages(topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
+        wanted = set(topics)
+        used = [connection for connection in reader.connections if connection.topic in wanted]
+        for connection in used:
+            # All bags define the kinds that are no standard ones, but those of ROS 2 before Iron stored in SQLite.
+            if connection.msgtype not in reader.typestore.types:
+                raise ImportTableError(
+                    f"{path}: does not say what a {connection.msgtype} is; convert it to MCAP in ROS, which does"
+                )
+        for connection, time_ns, raw in reader.messages(connections=used):
+            yield connection.topic, connection.msgtype, int(time_ns), reader.deserialize(raw, connection.msgtype)
+
+    return Bag(path, {connection.topic: connection.msgtype for connection in reader.connections}, messages)
+
+
+def _is_json(path: Path) -> bool:
+    """Whether a file is MCAP whose first topic is one of JSON messages."""
+    with path.open("rb") as file:
+        if file.read(8) != b"\x89MCAP0\r\n":
+            return False
+    return next((encoding == "json" for *_, encoding in _channels(path)), False)
+
+
+def _json_bag(path: Path) -> Bag:
+    """Return an MCAP file of JSON messages, as `uwblink export --to mcap` and Foxglove's libraries write them."""
+    channels = {number: (topic, kind) for number, topic, kind, encoding in _channels(path) if encoding == "json"}
+
+    def messages(topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
+        wanted = set(topics)
+        for record in _records(path):
+            topic, kind = channels.get(record.channel_id, ("", "")) if isinstance(record, Message) else ("", "")
+            if isinstance(record, Message) and topic in wanted:
+                try:
+                    message = json.loads(record.data)
+                except (ValueError, RecursionError) as error:
+                    raise ImportTableError(f"{path}: a message of {topic[:80]!r} is not JSON") from error
+                if not isinstance(message, dict):
+                    raise ImportTableError(f"{path}: a message of {topic[:80]!r} is not an object of JSON")
+                yield topic, kind, record.log_time, message
+
+    return Bag(path, dict(channels.values()), messages)
+
+
+def _channels(path: Path) -> Iterator[tuple[int, str, str, str]]:
+    """Yield number, topic, schema and encoding of every channel."""
+    schemas: dict[int, str] = {}
+    for record in _records(path):
+        if isinstance(record, Schema):
+            schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            yield record.id, record.topic, schemas.get(record.schema_id, ""), record.message_encoding
+
+
+def _records(path: Path) -> Iterator[McapRecord]:
+    """Yield the records of a file, and of its chunks; raises `ImportTableError` for a file that is damaged."""
+    with path.open("rb") as file:
+        try:
+            for record in StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records:
+                if not isinstance(record, Chunk):
+                    yield record
+                elif record.uncompressed_size <= MAX_RECORD_BYTES:
+                    yield from breakup_chunk(record)
+                else:
+                    size = record.uncompressed_size
+                    raise ImportTableError(
+                        f"{path}: a chunk unpacks to {size} bytes, at most {MAX_RECORD_BYTES} are read"
+                    )
+        except ImportTableError:
             raise
-        raise ImportTableError(f"{path}: cannot be read as a bag ({error})") from error
+        except Exception as error:  # the library passes on whatever its decompressors raise of damaged data
+            raise ImportTableError(
+                f"{path}: is cut off or damaged ({first_line(error)}); was it written to the end?"
+            ) from error
+
+
+@contextmanager
+def open_exchange_bag(
+    sources: Sequence[Path], map_file: Path | None = None, watch: Watch | None = None
+) -> Iterator[TableImport]:
+    """Yield the exchanges of one bag; `map_file` says which topics and fields they are in.
+
+    Raises `ImportTableError`.
+    """
+    (source,) = sources
+    if watch:
+        watch("reading", 0.0)
+    with TemporaryDirectory(prefix="uwblink-") as place:
+        table = Path(place) / f"{source.name}.jsonl"
+        column_map = _to_json_lines(source, load_map(map_file) if map_file else ColumnMap(), table)
+        with staged([table], column_map, watch) as staging:
+            yield plan(staging, "import bag", source.name, watch)
+
+
+def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMap:
+    """Write the messages of a bag as JSON lines; returns the map of these."""
+    first: dict[str, Any] | None = None
+    with opened(source) as bag:
+        column_map = _with_topics(bag, column_map)
+        try:
+            with table.open("w", encoding="utf-8") as file:
+                for row in _rows(bag, column_map):
+                    first = first or row
+                    file.write(json.dumps(row, allow_nan=False) + "\n")
+        except RecursionError as error:
+            raise ImportTableError(f"{source}: a message is nested too deeply") from error
+        except OSError as error:
+            reason = error.strerror or error
+            raise ImportTableError(
+                f"{source.name}: cannot be turned into a table in {table.parent} ({reason})"
+            ) from error
+    if first is None:
+        raise ImportTableError(f"{source}: no message on the topics of the map")
+    # A time is in nanoseconds where nobody says otherwise.
+    column_map = replace(column_map, time_unit=column_map.time_unit or "ns")
+    if "time_s" in column_map.columns or "time_s" in column_map.constants:
+        return column_map
+    stamped = isinstance(first.get("header"), dict) and "stamp" in first["header"]
+    return replace(column_map, columns=column_map.columns | {"time_s": "header.stamp" if stamped else "log_time"})
+
+
+def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
+    """Return a map that names topics: its own, those of the project's own ranges, or the only one there is."""
+    own = [topic for topic, kind in bag.kinds.items() if kind == OWN_RANGE]
+    listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:400] or "none"
+    for topic in column_map.topics:
+        if topic not in bag.kinds:
+            raise ImportTableError(f"{bag.path}: no topic {topic[:80]!r}; there are {listed}")
+    if column_map.topics:
+        return column_map
+    if not own and len(bag.kinds) != 1:
+        raise ImportTableError(
+            f'{bag.path}: a `map_file` must say which topics, as [topics."/name"]; there are {listed}'
+        )
+    topics: dict[str, dict[str, float | str]] = {topic: {} for topic in own or bag.kinds}
+    if not own:
+        return replace(column_map, topics=topics)
+    columns, unit = OWN_COLUMNS | column_map.columns, column_map.distance_unit or "m"
+    return replace(column_map, topics=topics, columns=columns, distance_unit=unit)
+
+
+def _rows(bag: Bag, column_map: ColumnMap) -> Iterator[dict[str, Any]]:
+    """Yield a row a message, or one for each element of the list in it that the map names."""
+    each = column_map.each
+    for topic, kind, time_ns, message in bag.messages(column_map.topics):
+        # What is not known is left out of the project's own messages.
+        fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == OWN_RANGE else {}) | _plain(message)
+        row = {**fields, "topic": topic, "log_time": time_ns, **column_map.topics[topic]}
+        if each is None:
+            yield row
+        elif isinstance(row.get(each), list):
+            yield from (row | {each: one} for one in row[each])
+        else:
+            raise ImportTableError(f"{bag.path}: each: a message of {topic} has no list {each[:60]!r}")
+
+
+def _plain(value: Any) -> Any:
+    """Return a message as JSON has it; what JSON has no word for is None."""
+    fields = getattr(value, "__dataclass_fields__", None)
+    if fields is not None:
+        value = {n: getattr(value, n) for n in fields if not n.isupper() and n != "__msgtype__"}
+    if isinstance(value, dict):
+        whole = [part for part in value.values() if isinstance(part, int)]
+        if tuple(value) in (("sec", "nsec"), ("sec", "nanosec")) and len(whole) == len(value):
+            return int(whole[0]) * 1_000_000_000 + int(whole[1])
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, np.ndarray):
+        short = value.size <= MAX_COLUMNS_OF_ARRAY
+        return {str(k): _plain(one) for k, one in enumerate(value.tolist())} if short else None
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, bool | int | str) else None

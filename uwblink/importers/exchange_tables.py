@@ -1,174 +1,160 @@
 """Tables of exchanges, of messages or of plain ranges, as CSV, Parquet or JSON lines, one file or several.
 
-What cannot be used is kept as a fault with its row; a table of which that is half or more is refused. `range_m` is what
-the device reported, or else the range by the stamps. `gt_range_m`, or the distance between the two antenna positions
-(`from_x_m` ... `to_z_m`), is stored beside the exchange as its measured truth; antennas of which the table has
-positions are bodies with poses.
+A table is staged (`staging`), rows of one exchange are brought together (`long_tables`), rows that cannot be used go to
+the faults (`usable_rows`); then the exchanges are written some rows at a time. A table of which half of the rows or
+more cannot be used is refused. `range_m` is what the device reported, or else the range by the stamps. `gt_range_m`, or
+the distance between the two antenna positions (`from_x_m` ... `to_z_m`), is stored beside the exchange as its measured
+truth; antennas of which the table has positions are bodies with poses.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCES, IDS, LEVELS, ColumnMap, load_map
-from uwblink.importers.exchange_rows import optional
+from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
 from uwblink.importers.long_tables import exchanges_of_long
-from uwblink.importers.repeated import likely_repeated
-from uwblink.importers.staged_tables import StagedTables, Watch
-from uwblink.importers.stamps import stamps_of
-from uwblink.importers.table_import import TableImport
-from uwblink.importers.table_rows import Rows, RowSource, has
-from uwblink.importers.trials import SAMPLE, Reading, Sample, Trial, try_others
-from uwblink.importers.units import check_units
-from uwblink.importers.unusable import Unusable
-from uwblink.importers.usable import Usable, usable_exchanges, usable_ranges
+from uwblink.importers.staging import ROWS_AT_ONCE, Staging, Watch, staged
+from uwblink.importers.stamps import (
+    GOOD_ENOUGH,
+    MIN_ROWS,
+    SAMPLE,
+    Reading,
+    Sample,
+    Trial,
+    clocks,
+    stamps_of,
+    to_ticks,
+    try_others,
+)
+from uwblink.importers.tables import Columns
+from uwblink.importers.units import check_units, optional, truth_m
+from uwblink.importers.usable_rows import ENDS, Faults, UsableRows, usable_exchanges, usable_ranges
 from uwblink.recording.contents import Contents
+from uwblink.recording.file import Recording
+from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK
-from uwblink.twr import LARGEST_ID, STAMPS
-
-MOST_NAMES: Final = 12
-"""Ids that are words and are printed with their numbers; a recording has all, as its tags' bodies."""
+from uwblink.twr import LARGEST_ID, STAMPS, Exchanges, raw_range
 
 SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
+MAX_NAMES_SHOWN: Final = 12
+"""Ids that are words and are printed with their numbers; a recording has all, as its tags' bodies."""
+
+ROW_PERIOD_NS: Final = 1_000_000
+"""Between rows of a table that has no times."""
 
 
-def read_table(source: Path, map_file: Path | None = None) -> Contents:
-    """Return the exchanges of a table, or of all tables in a folder as one; `map_file` says what columns are called.
-
-    `meta["notes"]` says what was found out and what was left out. Raises `ImportTableError`.
-    """
-    return read_tables([source], map_file)
-
-
-def read_tables(sources: Sequence[Path], map_file: Path | None = None) -> Contents:
-    """Return the exchanges of several files with the same columns as one table; see `read_table`."""
-    with open_tables(sources, map_file) as found:
-        return found.contents()
+Parts = TypeVar("Parts", Exchanges, Poses)
 
 
 @contextmanager
 def open_tables(
     sources: Sequence[Path], map_file: Path | None = None, watch: Watch | None = None
 ) -> Iterator[TableImport]:
-    """Yield what `read_tables` returns, as something that can be written without being in memory at once."""
-    paths = _tables(sources)
+    """Yield what a table holds, all tables in a folder as one, or several files; raises `ImportTableError`.
+
+    `map_file` says what columns are called.
+    """
+    paths = list(sources)
+    if len(paths) == 1 and paths[0].is_dir():
+        paths = sorted(path for path in paths[0].iterdir() if path.name.lower().endswith(SUFFIXES))
+        if not paths:
+            raise ImportTableError(f"{sources[0]}: is a directory without a table ({', '.join(SUFFIXES)})")
     column_map = load_map(map_file) if map_file else ColumnMap()
     if column_map.topics or column_map.each:
         raise ImportTableError(f"{map_file}: topics and each are of bags; {paths[0]} is a table")
-    with StagedTables(paths, column_map, watch) as tables:
-        yield plan(tables, watch)
+    with staged(paths, column_map, watch) as staging:
+        yield plan(staging, "import csv", ", ".join(path.name for path in paths), watch)
 
 
-def _tables(sources: Sequence[Path]) -> list[Path]:
-    if len(sources) != 1 or not sources[0].is_dir():
-        return list(sources)
-    found = sorted(path for path in sources[0].iterdir() if path.name.lower().endswith(SUFFIXES))
-    if not found:
-        raise ImportTableError(f"{sources[0]}: is a directory without a table ({', '.join(SUFFIXES)})")
-    return found
+def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None = None) -> TableImport:
+    """Return what is to be written; raises `ImportTableError` where half of the rows or more are no use.
 
-
-def plan(tables: StagedTables, watch: Watch | None = None) -> TableImport:
-    """Return what is to be written of tables; raises `ImportTableError` where half of the rows or more are no use."""
-    notes, unusable = _notes(tables), Unusable()
+    `source` and `imported_from` are what the recording says it comes from.
+    """
+    column_map, rows, faults = staging.column_map, staging.rows, Faults(staging)
     for name in IDS:
-        if not tables.has(name):
-            raise tables.missing(name)
-    layout = tables.column_map.layout or _layout(tables)
-    source: RowSource = tables
-    total, protocol = len(tables), tables.column_map.protocol
+        if not rows.has(name):
+            raise staging.missing(name)
+    notes = _notes(staging)
+    layout, protocol = column_map.layout or _layout(staging), column_map.protocol
     if layout in ("messages", "stamps", "parts"):
-        source, found = exchanges_of_long(tables, layout, unusable, watch)
-        total, protocol = len(source) + len(unusable), protocol or found
+        rows, good, found = exchanges_of_long(staging, layout, faults, watch)
+        protocol = protocol or found
+    else:
+        good = faults.reject(rows, ENDS)
+    total = rows.count(good) + len(faults)
     if watch:
         watch("checking", 0.0)
+    reading = None
     if layout == "ranges":
-        usable, reading = _plain_ranges(tables, source, unusable, total), None
-        check_units(tables, _sample(source, usable), None)
-        first, _ = next(usable.of_blocks(source.blocks(["range_m"])))
-        notes += filter(None, [likely_repeated(first)])
+        if not rows.has("range_m"):
+            raise staging.missing("range_m")
+        usable = usable_ranges(rows, faults, good)
+        faults.check(total)
+        check_units(column_map, staging.paths[0], usable.sample(SAMPLE), None)
+        notes += filter(None, [likely_repeated(next(usable.blocks()))])
     else:
-        usable, reading = _from_stamps(tables, source, protocol, unusable, total, notes)
-    return TableImport(
-        tables=tables, source=source, usable=usable, unusable=unusable, reading=reading, notes=notes, total=total,
-        watch=watch,
-    )  # fmt: skip
+        protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
+        for name in stamps_of(protocol):
+            if not rows.has(name):
+                raise staging.missing(name)
+        usable, repeats, bits, counter = usable_exchanges(staging, rows, faults, good, stamps_of(protocol))
+        faults.check(total)
+        if repeats:
+            notes.append(
+                f"{repeats} of {total} rows repeat an exchange, with the same devices and stamps, and are left out"
+            )
+        if counter != "wrapped":
+            notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
+        sample = usable.sample(SAMPLE)
+        reading = _reading(column_map, staging.paths[0], sample, Reading(protocol, bits), notes)
+        raw = raw_range(exchanges_of(column_map, sample, reading))
+        check_units(column_map, staging.paths[0], sample, raw)
+    return TableImport(staging, usable, faults, reading, notes, total, source, imported_from, watch)
 
 
-def _layout(tables: StagedTables) -> str:
-    if all(tables.has(name) for name in STAMPS[:4]):
-        return "exchanges"
-    if tables.has("tx") and tables.has("rx"):
-        return "messages"
-    if tables.has("stamp") and tables.has("event"):
-        return "stamps"
-    if tables.has("range_m") and not any(tables.has(name) for name in STAMPS):
+def _notes(staging: Staging) -> list[str]:
+    notes, names = [], staging.names
+    if names:
+        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(names.items())[:MAX_NAMES_SHOWN])
+        more = f" and {len(names) - MAX_NAMES_SHOWN} more" if len(names) > MAX_NAMES_SHOWN else ""
+        notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}{more}")
+    if not staging.rows.has("time_s"):
+        notes.append("there is no time; rows are put a millisecond apart, in their order")
+    return notes
+
+
+def _layout(staging: Staging) -> str:
+    """Return what a row is, by the columns that there are."""
+    has = staging.rows.has
+    for layout, names in (("exchanges", STAMPS[:4]), ("messages", ("tx", "rx")), ("stamps", ("stamp", "event"))):
+        if all(map(has, names)):
+            return layout
+    if has("range_m") and not any(map(has, STAMPS)):
         return "ranges"
-    raise tables.missing(next(name for name in STAMPS if not tables.has(name)))
+    raise staging.missing(next(name for name in STAMPS if not has(name)))
 
 
-def _plain_ranges(tables: StagedTables, source: RowSource, unusable: Unusable, total: int) -> Usable:
-    if not source.has("range_m"):
-        raise tables.missing("range_m")
-    usable = usable_ranges(source, unusable)
-    _half(tables, unusable, total)
-    return usable
-
-
-def _from_stamps(
-    tables: StagedTables, source: RowSource, protocol: str | None, unusable: Unusable, total: int, notes: list[str]
-) -> tuple[Usable, Reading]:
-    """Return the rows that can be used, and how their stamps are to be read."""
-    chosen = protocol or ("ds" if source.has("tx3") and source.has("rx3") else "ss")
-    for name in stamps_of(chosen):
-        if not source.has(name):
-            raise tables.missing(name)
-    usable, bits, counter = usable_exchanges(source, unusable, stamps_of(chosen), tables.stage)
-    _half(tables, unusable, total)
-    if usable.repeated:
-        notes.append(
-            f"{usable.repeated} of {total} rows repeat an exchange, with the same devices and stamps, and are left out"
-        )
-    if counter != "wrapped":
-        notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
-    sample = _sample(source, usable)
-    reading = _reading(tables, sample, Reading(chosen, bits), notes)
-    check_units(tables, sample, reading)
-    return usable, reading
-
-
-def _half(tables: StagedTables, unusable: Unusable, total: int) -> None:
-    """Raise for the first row that cannot be used where they are not few."""
-    if unusable and 2 * unusable.distinct() >= total:
-        reason, origin = unusable.first()
-        raise ImportTableError(f"{tables.path_of(origin)}: {tables.fault(reason, origin).detail}")
-
-
-def _sample(source: RowSource, usable: Usable) -> Rows:
-    """Return some of the rows that can be used, drawn by chance."""
-    random = np.random.default_rng(0)
-    chosen = np.sort(random.choice(usable.count, min(SAMPLE, usable.count), replace=False))
-    return source.at(usable.places(chosen), (*STAMPS, *LEVELS, *DISTANCES))
-
-
-def _reading(tables: StagedTables, rows: Rows, reading: Reading, notes: list[str]) -> Reading:
+def _reading(column_map: ColumnMap, path: Path, rows: Columns, reading: Reading, notes: list[str]) -> Reading:
     """Return how to read the stamps: as they were meant, or as they clearly make ranges where they do not so."""
-    column_map = tables.column_map
-    pair = rows.ids["from_id"] * (LARGEST_ID + 1) + rows.ids["to_id"]
-    cells = {name: rows.cells[name] for name in STAMPS if has(rows, name)}
-    sample = Sample(
-        cells, pair, optional(rows, "gt_range_m"), optional(rows, "skew2"), _longer_m(rows), column_map.ticks_per_unit
-    )
-    first, other = try_others(sample, reading)
+    pair = rows["from_id"] * (LARGEST_ID + 1) + rows["to_id"]
+    # As they stand in the table, ticks or not: a stamp that only other protocols have may be missing.
+    cells: dict[str, Floats] = {name: rows[name] for name in STAMPS if name in rows}
+    longer_m = _longer_m(column_map, rows)
+    truth_m, skew2 = optional(rows, "gt_range_m"), optional(rows, "skew2")
+    first, other = try_others(Sample(cells, pair, truth_m, skew2, longer_m, column_map.ticks_per_unit), reading)
     if other is None:
-        if first.plausible < 0.5 and len(rows) >= 20:
+        if first.plausible < GOOD_ENOUGH and len(pair) >= MIN_ROWS:
             notes.append(
                 f"the ranges are not plausible ({_span(first)}), and no other protocol, width or order of the columns "
                 "makes better ones; check the map"
@@ -183,21 +169,18 @@ def _reading(tables: StagedTables, rows: Rows, reading: Reading, notes: list[str
     )
     if contradicted:
         raise ImportTableError(
-            f'{tables.paths[0]}: by protocol "{reading.protocol}" its ranges are {_span(first)}; '
+            f'{path}: by protocol "{reading.protocol}" its ranges are {_span(first)}; '
             f"with {difference} they are {_span(other)}: say so in the map"
         )
     notes.append(f'read with {difference}: by protocol "{reading.protocol}" the ranges would be {_span(first)}')
     return other.reading
 
 
-def _longer_m(rows: Rows) -> Floats:
+def _longer_m(column_map: ColumnMap, rows: Columns) -> Floats:
     """Return by how much ranges (n,) are longer because of antenna delays that were not programmed, by the map."""
-    delays = rows.column_map.antenna_delays
-    if not delays:
-        return np.broadcast_to(0.0, len(rows))
-    lacking = np.zeros(len(rows))
-    for name in IDS:
-        ids, back = np.unique(rows.ids[name], return_inverse=True)
+    lacking, delays = np.zeros(len(rows["origin"])), column_map.antenna_delays
+    for name in IDS if delays else ():
+        ids, back = np.unique(rows[name], return_inverse=True)
         programmed = [sum(delays.get(int(tag), delays[None]).values()) for tag in ids]
         lacking += (2 * ANTENNA_DELAY_TICKS - np.array(programmed, dtype=np.float64))[back]
     return lacking / 2 * METRES_PER_TICK
@@ -207,12 +190,192 @@ def _span(trial: Trial) -> str:
     return f"{trial.low_m:.4g} to {trial.high_m:.4g} m"
 
 
-def _notes(tables: StagedTables) -> list[str]:
-    notes = []
-    if tables.names:
-        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(tables.names.items())[:MOST_NAMES])
-        more = f" and {len(tables.names) - MOST_NAMES} more" if len(tables.names) > MOST_NAMES else ""
-        notes.append(f"{len(tables.names)} ids are words or too large, and get numbers: {some}{more}")
-    if not tables.has("time_s"):
-        notes.append("there is no time; rows are put a millisecond apart, in their order")
-    return notes
+def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, before: int = 0) -> Exchanges:
+    """Return rows as exchanges, `before` which others came; ranges as reported, or by the stamps.
+
+    Without a reading they are plain ranges: single-sided exchanges whose stamps are 0.
+    """
+    count = len(rows["origin"])
+    stamps: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(count, dtype=np.int64))
+    protocol, bits = (reading.protocol, reading.bits) if reading else ("ss", 32)
+    if reading:
+        stamps |= to_ticks(rows, clocks(protocol), column_map.ticks_per_unit, bits)
+    exchanges = Exchanges(
+        time_ns=rows.get("time_ns", np.arange(before, before + count) * ROW_PERIOD_NS),
+        initiator=rows["from_id"], target=rows["to_id"], reporter=rows["from_id"], protocol=np.full(count, protocol),
+        range_m=optional(rows, "range_m"), fpp1_dbm=optional(rows, "fpp1"), fpp2_dbm=optional(rows, "fpp2"),
+        skew1_ppm=optional(rows, "skew1"), skew2_ppm=optional(rows, "skew2"), truth_m=truth_m(rows), bits=bits,
+        **stamps,
+    )  # fmt: skip
+    known = np.isfinite(exchanges.range_m)
+    return (
+        exchanges
+        if known.all()
+        else replace(exchanges, range_m=np.where(known, exchanges.range_m, raw_range(exchanges)))
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class TableImport:
+    """Rows of tables that can be used, and how they are to be read (None: as plain ranges)."""
+
+    staging: Staging
+    usable: UsableRows
+    faults: Faults
+    reading: Reading | None
+    notes: list[str]
+    total: int
+    source: str
+    imported_from: str
+    watch: Watch | None
+
+    def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
+        """Write a recording; returns how many rows its tables have, those without any left out, and the notes.
+
+        Raises what `Recording.create` raises.
+        """
+        notes, faults = self._notes_and_faults()
+        counts = {"exchanges": 0, "poses": 0, "powers": 0, "faults": 0}
+        with Recording.create(path, meta=self._meta(notes), force=force, memory_mb=250) as recording:
+            recording.append_tags(self._tags())
+            for exchanges, powers in self._exchanges():
+                with recording.transaction():
+                    recording.append_exchanges(exchanges)
+                    recording.append_columns("powers", powers)
+                counts["exchanges"] += len(exchanges)
+                counts["powers"] += len(exchanges) if powers else 0
+            for poses in self._poses():
+                recording.append_poses(poses)
+                counts["poses"] += len(poses)
+            for some in faults:
+                recording.append_faults(some)
+                counts["faults"] += len(some)
+        return {name: n for name, n in counts.items() if n or name == "exchanges"}, notes
+
+    def contents(self) -> Contents:
+        """Return the same in memory."""
+        notes, faults = self._notes_and_faults()
+        exchanges, powers = zip(*self._exchanges(), strict=True)
+        return Contents(
+            exchanges=_joined(exchanges),
+            tags=self._tags(),
+            poses=_joined([Poses.from_arrays([], "", (0.0, 0.0, 0.0)), *self._poses()]),
+            powers={name: np.concatenate([some[name] for some in powers]) for name in powers[0]},
+            faults=list(chain.from_iterable(faults)),
+            meta=self._meta(notes),
+        )
+
+    def _notes_and_faults(self) -> tuple[list[str], Iterator[list[Fault]]]:
+        faults, count = iter(self.faults), len(self.faults) + self.faults.too_long()
+        if not count:
+            return self.notes, faults
+        first = next(faults)
+        said = f"{count} of {self.total} rows cannot be used and are kept as faults; the first: {first[0].detail}"
+        return [*self.notes, said], chain([first], faults)
+
+    def _exchanges(self) -> Iterator[tuple[Exchanges, Columns]]:
+        """Yield the exchanges in the order of their rows, some at a time, and their columns of the table `powers`."""
+        before = 0
+        for rows in self.usable.blocks():
+            if self.watch:
+                self.watch("writing", before / self.usable.count)
+            exchanges = exchanges_of(self.staging.column_map, rows, self.reading, before)
+            powers: Columns = {}
+            if "rxp1" in rows or "rxp2" in rows:
+                powers = {name: getattr(exchanges, name) for name in ("time_ns", "initiator", "target")}
+                powers |= {f"{name}_dbm": optional(rows, name) for name in ("rxp1", "rxp2")}
+            yield exchanges, powers
+            before += len(exchanges)
+
+    def _tags(self) -> list[Tag]:
+        return [Tag(i, self._body(i), (0.0, 0.0, 0.0)) for i in self.usable.tags()]
+
+    def _meta(self, notes: list[str]) -> dict[str, Any]:
+        delays, names = self.staging.column_map.antenna_delays, self.staging.names
+        if self.reading and self.reading.undelayed:
+            delays = {None: {"tx": 0, "rx": 0}}
+        meta: dict[str, Any] = {
+            "source": self.source,
+            "imported_from": self.imported_from,
+            "timestamp_bits": self.reading.bits if self.reading else 32,
+            "notes": notes,
+        }
+        if names:
+            meta["tag_names"] = {str(number): name for number, name in sorted(names.items())}
+        if delays:
+            meta["configured_antenna_delay_ticks"] = delays[None]
+            own = {str(tag): registers for tag, registers in delays.items() if tag is not None}
+            if own:
+                meta["configured_antenna_delay_ticks_by_tag"] = own
+        return meta
+
+    def _body(self, tag: int) -> str:
+        return self.staging.names.get(tag, f"tag{tag}")
+
+    def _poses(self) -> Iterator[Poses]:
+        """Yield where antennas were, in order of time: one pose a time, and one alone for what never moves."""
+        rows, db = self.usable.rows, self.staging.db
+        if not all(map(rows.has, POSITIONS)):
+            return
+        time = "time_ns" if rows.has("time_s") else f"(row_number() OVER () - 1) * {ROW_PERIOD_NS} AS time_ns"
+        db.execute(
+            f"CREATE TABLE located AS SELECT row, {time}, {', '.join(IDS)}, {', '.join(POSITIONS)} "
+            f"FROM {rows.name} WHERE {self.usable.condition}"
+        )
+        ends = []
+        for rank, (end, name) in enumerate(zip(("from", "to"), IDS, strict=True)):
+            axes = ", ".join(f"{end}_{axis}_m AS {axis}" for axis in "xyz")
+            known = " AND ".join(f"{end}_{axis}_m IS NOT NULL" for axis in "xyz")
+            ends.append(f"SELECT time_ns, {name} AS tag, {rank} AS rank, row, {axes} FROM located WHERE {known}")
+        # Of two places at a time the first counts, those of initiators before those of targets.
+        one = ", ".join(f"arg_min({axis}, (rank, row)) AS {axis}" for axis in "xyz")
+        db.execute(f"CREATE TABLE places AS SELECT time_ns, tag, {one} FROM ({' UNION ALL '.join(ends)}) GROUP BY ALL")
+        moves = " OR ".join(f"min({axis}) <> max({axis})" for axis in "xyz")
+        db.execute(
+            f"CREATE TABLE posed AS SELECT p.* FROM places p JOIN (SELECT tag, min(time_ns) AS first, {moves} AS moves "
+            "FROM places GROUP BY tag) t ON p.tag = t.tag AND (t.moves OR p.time_ns = t.first) "
+            "ORDER BY p.time_ns, p.tag"
+        )
+        for start in range(0, db.execute("SELECT count(*) FROM posed").fetchall()[0][0], ROWS_AT_ONCE):
+            place = f"rowid >= {start} AND rowid < {start + ROWS_AT_ONCE}"
+            found = db.execute(f"SELECT * FROM posed WHERE {place}").fetchnumpy()
+            tags, which = np.unique(found["tag"], return_inverse=True)
+            names = np.array([self._body(int(tag)) for tag in tags])
+            level = np.tile([0.0, 0.0, 0.0, 1.0], (len(which), 1))
+            position = np.column_stack([np.ma.getdata(found[axis]) for axis in "xyz"])
+            yield Poses(np.ma.getdata(found["time_ns"]), names[which], position, level)
+
+
+def _joined(parts: Sequence[Parts]) -> Parts:
+    """Return exchanges or poses as one."""
+    names = [f.name for f in fields(parts[0]) if f.name != "bits"]
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[0], **columns)
+
+
+def likely_repeated(rows: Columns) -> str:
+    """Return why ranges without stamps are likely there twice; nothing where they are not.
+
+    A range that is exactly the one before of the same two devices is so by chance, or repeats it. By chance it comes as
+    long after it as others do; that is asked by the rank test of Mann and Whitney.
+    """
+    if "time_ns" not in rows:
+        return ""
+    one, other = (rows[name] for name in IDS)
+    pair = np.minimum(one, other) * (LARGEST_ID + 1) + np.maximum(one, other)
+    order = np.lexsort((rows["time_ns"], pair))
+    same = np.diff(pair[order]) == 0
+    gap = np.diff(rows["time_ns"][order])[same] * 1e-9
+    equal = (np.diff(rows["range_m"][order]) == 0)[same]
+    if equal.all() or not equal.any():
+        return ""
+    from scipy.stats import mannwhitneyu
+
+    # One in a million sound tables is told to repeat ranges.
+    if not mannwhitneyu(gap[equal], gap[~equal], alternative="less", method="asymptotic").pvalue < 1e-6:
+        return ""
+    after, others = (f"{1e3 * np.median(some):.3g} ms" for some in (gap[equal], gap[~equal]))
+    return (
+        f"{np.count_nonzero(equal)} of {len(pair)} ranges are exactly the one before of the same two devices, {after} "
+        f"after it where others come after {others}: are exchanges there twice, from the logs of both? They are kept"
+    )

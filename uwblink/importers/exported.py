@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from uwblink.errors import ImportTableError, first_line
-from uwblink.importers.staging import confined
+from uwblink.importers.tables import confined
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
 from uwblink.recording.store import Store

@@ -1,8 +1,12 @@
-"""Which columns of a table are which of ours, by their names, and where names do not say it, by what is in them."""
+"""Which columns of a table are which of ours: by their names, and where names do not say it, by what is in them.
+
+The words are those by which labs call columns, English and German, as patterns of plain names.
+"""
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable
 from itertools import product
 from typing import Final
@@ -11,22 +15,127 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.importers.column_map import EVENT, POSITIONS
-from uwblink.importers.guess_words import DEVICE, END, ID, PATTERNS, TWO_ENDS, numbered, plain
-from uwblink.importers.table import Table
-from uwblink.importers.trials import CLEARLY
+from uwblink.importers.stamps import CLEARLY
+from uwblink.importers.tables import Table
 from uwblink.twr import STAMPS
 
 OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sequence", "message")
-_EVENT: Final = re.compile(r"(event|direction|dir|kind|type|action|edge|what|tx_?or_?rx|tx_?rx)")
-_STAMP: Final = re.compile(rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){END}")
-_OF_DEVICE: Final = re.compile(r"device|dw|tick|dtu|raw|chip|counter|^stamp")
-_OF_HOST: Final = re.compile(r"host|ros|unix|utc|iso|date|time_s$")
-_SENT: Final = ("tx", "t", "sent", "send", "transmit", "transmitted")
-_RECEIVED: Final = ("rx", "r", "received", "receive", "recv")
+
+_END: Final = r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|dbm|db|ppm))*"
+_ID: Final = r"(_?(id|addr|address|mac|name))?"
+_DEVICE: Final = (
+    r"(tag|node|device|dev|board|robot|agent|anchor|module|modul|radio|unit|uwb|id|addr|address|mac|geraet|knoten)"
+)
+_RANGE: Final = r"(range|dist|distance|abstand|distanz|entfernung)"
+_TRUE: Final = (
+    r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|laser|"
+    r"soll|wahr(er)?|referenz)"
+)
+_FPP: Final = r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path)"
+_RXP: Final = r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)"
+_SKEW: Final = r"(skew|cfo|carrier|clock_?offset)"
+_OF_TIME: Final = r"((t|ts|time|stamp|timestamp|zeit)_)?"
+_FROM: Final = r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)"
+_TO: Final = r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)"
 
 
-SAME_UNIT: Final = 2.0
-"""Ranges and the distances of antennas that differ more, in the median, have different units."""
+def _place(name: str) -> str:
+    """Return what columns of one of `POSITIONS` are called: `tag_x`, `anchor_pos_x_m`, `x_tag`, `x1`; `x` is whose?
+
+    A single `x` is that of the initiator, which moves where anchors are called so.
+    """
+    (end, axis), (number, words) = name.split("_")[:2], ("1", _FROM) if name.startswith("from") else ("2", _TO)
+    true, place = r"((gt|true|truth|ground_?truth|mocap|ref)_?)?", r"(pos(ition)?|loc(ation)?|place|p)?"
+    forms = [rf"{true}{words}_?{place}_?{axis}", rf"{true}{place}_?{axis}_?({words}|{number})", rf"p{number}_?{axis}"]
+    forms += [rf"{true}{place}_?{axis}"] if end == "from" else []
+    return "|".join(forms)
+
+
+_PATTERNS: Final = {
+    "time_s": (
+        r"(ros_?|host_?|unix_?|utc_?|mess_?)?"
+        r"(time|timestamp|stamp|t|datetime|date(_?time)?|epoch|zeit|zeitstempel|uhrzeit|datum)(_(utc|iso))?"
+    ),
+    "from_id": rf"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|quelle|von|id_?(from|von)|id_?1){_ID}",
+    "to_id": (
+        r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|ziel|an|nach|anker|"
+        rf"empf(ae|a)nger|id_?(to|an|nach)|id_?2){_ID}"
+    ),
+    "tx1": _OF_TIME + r"(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
+    "rx1": _OF_TIME + r"(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
+    "tx2": _OF_TIME + r"(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
+    "rx2": _OF_TIME + r"(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
+    "tx3": _OF_TIME + r"(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
+    "rx3": _OF_TIME + r"(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
+    "fpp1": rf"{_FPP}_?1",
+    "fpp2": rf"{_FPP}_?2?",
+    "rxp1": rf"{_RXP}_?1",
+    "rxp2": rf"{_RXP}_?2?",
+    "skew1": rf"{_SKEW}_?1",
+    "skew2": rf"{_SKEW}_?2?",
+    "gt_range_m": rf"{_TRUE}_?{_RANGE}?|{_RANGE}_?{_TRUE}",
+    "range_m": rf"(device_?|measured?_?|uwb_?|est(imated)?_?)?{_RANGE}",
+    "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
+    "message": r"(msg|message|frame|nachricht)(_?(no|num|nr|number|type|id))?",
+    "tx": r"tx",
+    "rx": r"rx",
+    "fpp": _FPP,
+    "rxp": _RXP,
+    "skew": _SKEW,
+} | {name: _place(name) for name in POSITIONS}
+
+_OF_MESSAGE: Final = {"poll": 1, "resp": 2, "response": 2}
+_AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init": 2, "initiator": 2, "tag": 2}
+
+
+def _plain(header: str) -> str:
+    """Return a name in small letters without accents, words joined by `_`: `first_path_1_dbm`."""
+    bare = unicodedata.normalize("NFKD", header.replace("ß", "ss")).encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]+", "_", bare.lower()).strip("_")
+
+
+def _plain_names(headers: Iterable[str]) -> dict[str, str]:
+    """Return plain names by header; powers and skews have the number of their message: `fp_power_init` is `fp_power_2`.
+
+    `resp` is the device where another column is of the initiator, else the message.
+    """
+    level, whose = rf"(?P<level>{_FPP}|{_RXP}|{_SKEW})", "|".join(sorted({*_OF_MESSAGE, *_AT_DEVICE}, key=len)[::-1])
+    forms = (rf"{level}_(at_|of_)?(?P<whose>{whose})(?P<end>{_END})", rf"(?P<whose>{whose})_{level}(?P<end>{_END})")
+    names = {header: _plain(header) for header in headers}
+    matches = {h: re.fullmatch(forms[0], name) or re.fullmatch(forms[1], name) for h, name in names.items()}
+    ends = {match["whose"] for match in matches.values() if match}
+    numbers = _AT_DEVICE | _OF_MESSAGE | ({"resp": 1, "response": 1} if ends & {"init", "initiator", "tag"} else {})
+    for header, match in matches.items():
+        if match:
+            names[header] = f"{match['level']}_{numbers[match['whose']]}{match['end']}"
+    return names
+
+
+def named_columns(headers: Iterable[str]) -> dict[str, str]:
+    """Return which column each of our names is, raw ones before others, first ones before later ones."""
+    listed = sorted(headers, key=lambda header: "raw" not in header.lower())
+    called = _plain_names(listed)
+    found = _ends(called)
+    for ours, pattern in _PATTERNS.items():
+        # A column is one thing; only the names of messages may repeat those of exchanges, until the layout is known.
+        taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
+        for header in listed:
+            if re.fullmatch(f"({pattern}){_END}", called[header]) and listed.count(header) == 1 and header not in taken:
+                found[ours] = header
+                break
+    return found
+
+
+def _ends(called: dict[str, str]) -> dict[str, str]:
+    """Return which columns are of the two devices where these are called alike, as `node_i` and `node_j`."""
+    letters = (("a", "b"), ("i", "j"), ("1", "2"), ("0", "1"), ("one", "two"))
+    for both, form in product(letters, ("{0}_?{1}", "{0}{2}_{1}", "{0}_?{1}{2}")):
+        patterns = [form.format(f"({_DEVICE})", letter, _ID) for letter in both]
+        ends = [[header for header, name in called.items() if re.fullmatch(one, name)] for one in patterns]
+        stems = [{called[header][:2] for header in headers} for headers in ends]
+        if all(len(headers) == 1 for headers in ends) and stems[0] == stems[1]:
+            return {"from_id": ends[0][0], "to_id": ends[1][0]}
+    return {}
 
 
 def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | None:
@@ -36,13 +145,21 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
     """
     if all(name in columns for name in STAMPS[:4]) or ("tx" in columns and "rx" in columns):
         return None
-    single = [name for name in table.names if table.names.count(name) == 1]
-    event = next((name for name in single if _EVENT.fullmatch(plain(name)) and _is_event(table, name)), None)
-    times = [name for name in single if _STAMP.fullmatch(plain(name))]
+    single = {name: _plain(name) for name in table.names if table.names.count(name) == 1}
+    kinds = r"(event|direction|dir|kind|type|action|edge|what|tx_?or_?rx|tx_?rx)"
+    clock = rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){_END}"
+    event = next(
+        (name for name, plain in single.items() if re.fullmatch(kinds, plain) and _is_event(table, name)), None
+    )
+    times = [name for name, plain in single.items() if re.fullmatch(clock, plain)]
     if event is None or not times:
         return None
-    # The first of those that are equal in that: False is before True.
-    stamp = min(times, key=lambda name: (not _OF_DEVICE.search(plain(name)), bool(_OF_HOST.search(plain(name)))))
+
+    def unlikely(name: str) -> tuple[bool, bool]:
+        of_device = re.search(r"device|dw|tick|dtu|raw|chip|counter|^stamp", single[name])
+        return not of_device, bool(re.search(r"host|ros|unix|utc|iso|date|time_s$", single[name]))
+
+    stamp = min(times, key=unlikely)
     rest = {ours: header for ours, header in columns.items() if header not in (stamp, event)}
     if "time_s" not in rest and len(times) > 1:
         rest["time_s"] = next(name for name in times if name != stamp)
@@ -52,63 +169,24 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
 def _is_event(table: Table, name: str) -> bool:
     """Whether words of a column are of sending and of receiving, about as often."""
     words = np.char.lower(table.read(words=[name])[1][name])
-    sent, received = np.isin(words, _SENT), np.isin(words, _RECEIVED)
+    sent = np.isin(words, ("tx", "t", "sent", "send", "transmit", "transmitted"))
+    received = np.isin(words, ("rx", "r", "received", "receive", "recv"))
     return bool(np.mean(sent | received) > CLEARLY and 0.25 < np.mean(sent) < 0.75) if len(sent) else False
 
 
-def placed(columns: dict[str, str], cells: dict[str, Floats]) -> tuple[dict[str, str], dict[str, Floats], str]:
-    """Return columns and cells, without positions that cannot be used, and why these cannot."""
-    there = [name for name in POSITIONS if name in columns]
-    if not there:
-        return columns, cells, ""
-    why = ""
-    if len(there) < len(POSITIONS):
-        lacking = ", ".join(name for name in POSITIONS if name not in columns)
-        why = f"positions are used where all six columns are there; missing: {lacking}"
-    elif "range_m" in columns:
-        ends = np.array([cells[name] for name in POSITIONS])
-        apart = np.sqrt(((ends[3:] - ends[:3]) ** 2).sum(axis=0))
-        used = np.isfinite(apart) & (apart > 0) & np.isfinite(cells["range_m"])
-        ratio = float(np.median(cells["range_m"][used] / apart[used])) if used.any() else 1.0
-        if not 1 / SAME_UNIT < ratio < SAME_UNIT:
-            why = f"positions are left out: ranges are {ratio:.3g} of their distance; distances have one unit"
-    if not why:
-        return columns, cells, ""
-    return (
-        {name: header for name, header in columns.items() if name not in POSITIONS},
-        {name: column for name, column in cells.items() if name not in POSITIONS},
-        why,
-    )
-
-
-def named_columns(names: Iterable[str]) -> dict[str, str]:
-    """Return which column each of our names is, raw ones before others, first ones before later ones."""
-    listed = sorted(names, key=lambda name: "raw" not in name.lower())
-    called = numbered({name: plain(name) for name in listed})
-    found = _ends(called)
-    for ours, pattern in PATTERNS.items():
-        whole = re.compile(f"({pattern}){END}")
-        for header in listed:
-            if whole.fullmatch(called[header]) and listed.count(header) == 1 and _free(ours, header, found):
-                found[ours] = header
-                break
-    return found
-
-
-def _ends(called: dict[str, str]) -> dict[str, str]:
-    """Return which columns are of the two devices where these are called alike, as `node_i` and `node_j`."""
-    for words in product(TWO_ENDS, ("{0}_?{1}", "{0}{2}_{1}", "{0}_?{1}{2}")):
-        (one, other), form = words
-        ends = []
-        for letter in (one, other):
-            whole = re.compile(form.format(f"({DEVICE})", letter, ID))
-            ends.append([header for header, name in called.items() if whole.fullmatch(name)])
-        stems = [{called[header][:2] for header in headers} for headers in ends]
-        if all(len(headers) == 1 for headers in ends) and stems[0] == stems[1]:
-            return {"from_id": ends[0][0], "to_id": ends[1][0]}
-    return {}
-
-
-def _free(ours: str, header: str, found: dict[str, str]) -> bool:
-    """A column is one thing; only the names of messages may repeat those of exchanges, until the layout is known."""
-    return header not in [taken for name, taken in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)]
+def unusable_positions(columns: dict[str, str], cells: dict[str, Floats]) -> str:
+    """Return why positions that a table has cannot be used; nothing where they can be, or where there are none."""
+    lacking = [name for name in POSITIONS if name not in columns]
+    if len(lacking) == len(POSITIONS):
+        return ""
+    if lacking:
+        return f"positions are used where all six columns are there; missing: {', '.join(lacking)}"
+    if "range_m" not in columns:
+        return ""
+    ends = np.array([cells[name] for name in POSITIONS])
+    apart = np.sqrt(((ends[3:] - ends[:3]) ** 2).sum(axis=0))
+    used = np.isfinite(apart) & (apart > 0) & np.isfinite(cells["range_m"])
+    ratio = float(np.median(cells["range_m"][used] / apart[used])) if used.any() else 1.0
+    if 0.5 < ratio < 2.0:
+        return ""
+    return f"positions are left out: ranges are {ratio:.3g} of their distance; distances have one unit"

@@ -8,19 +8,61 @@ ticks again. All files of a folder share one clock; `timeshift.yaml` says when i
 
 from __future__ import annotations
 
-from dataclasses import replace
+import reprlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import yaml
 
-from uwblink.errors import ImportTableError
-from uwblink.importers import miluv_files as files
-from uwblink.importers.miluv_anchors import Anchors, find_anchors, read_tags, unplaced
-from uwblink.importers.miluv_yaml import read_mapping
+from uwblink.arrays import Floats
+from uwblink.errors import ImportTableError, first_line
+from uwblink.importers.stamps import NEVER, clocks, to_ticks, whole
+from uwblink.importers.tables import Columns, Table
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
+from uwblink.recording.schema import CirRow, Fault, Poses, Tag
+from uwblink.text_files import read_text
+from uwblink.ticks import REPORT_BITS, TICKS_PER_SECOND
 from uwblink.text_files import TomlReader
+from uwblink.twr import LARGEST_ID, STAMPS, Exchanges
+
+Vectors = dict[str, dict[int, tuple[float, float, float]]]
+"""Vectors by name and number: lever arms by robot and tag, or places in metres by constellation and anchor."""
+
+SAME_ANCHORS_M: Final = 0.05
+"""Median difference from `gt_range`: the constellations of the dataset are a decimetre and more apart."""
+
+_CLOCKS: Final = clocks("ds")
+_ENDS: Final = {"initiator": "from_id", "target": "to_id"}
+_NEIGHBOURS: Final = tuple(tuple(f"{name}_n" for name in clock) for clock in _CLOCKS)
+_POSE: Final = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
+_LEVELS: Final = {"fpp1_dbm": "fpp1", "fpp2_dbm": "fpp2", "skew1_ppm": "skew1", "skew2_ppm": "skew2"}
+_OVERHEARD: Final = {
+    f"{name}{end}_{unit}": f"{name}{end}"
+    for name, unit in (("fpp", "dbm"), ("skew", "ppm"))
+    for end in ("1", "2", "3", "1_n", "2_n")
+}
+_IMU: Final = {
+    f"{ours}{axis}": f"{theirs}.{axis}"
+    for ours, theirs in (("w", "angular_velocity"), ("a", "linear_acceleration"))
+    for axis in "xyz"
+}
+
+
+@dataclass(slots=True)
+class Flight:
+    """A folder, its robots' folders, and what was found in them that is no row: doubled ones by file, and faults.
+
+    Times are nanoseconds since the clock of the folder began.
+    """
+
+    folder: Path
+    robots: tuple[Path, ...]
+    doubled: dict[str, int] = field(default_factory=dict)
+    faults: list[Fault] = field(default_factory=list)
 
 
 def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
@@ -30,35 +72,47 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     `gt_range`. `meta["notes"]` says what was left out. Raises `ImportTableError`.
     """
     wanted = _constellation(map_file)
-    flight = files.open_flight(folder)
+    if not folder.is_dir():
+        raise ImportTableError(
+            f"{folder}: no such folder; expected one with a folder a robot (ifo001/uwb_range.csv ...)"
+        )
+    flight = Flight(folder, tuple(sorted(path.parent for path in folder.glob("*/uwb_range.csv"))))
+    if not flight.robots:
+        raise ImportTableError(f"{folder}: no folder in it holds uwb_range.csv, as those of MILUV's robots do")
     start_ns = _start_ns(folder)
-    exchanges, measured_m = files.read_exchanges(flight)
-    poses, tags = files.read_poses(flight), read_tags(flight)
-    anchors = find_anchors(flight, exchanges, measured_m, poses, tags, wanted)
-    poses, tags = anchors.join(poses), [*tags, *anchors.tags()]
+    exchanges, measured_m = _read_exchanges(flight)
+    poses, tags = _read_poses(flight), _read_tags(flight)
+    constellation, off_m, places = _find_anchors(flight, exchanges, measured_m, poses, tags, wanted)
+    poses, tags = _with_anchors(poses, tags, places)
     # What the authors measured stands in where a tag's place is not known, and nowhere else.
     known_m = distances_m(poses, tags, exchanges.initiator, exchanges.target, exchanges.time_ns)
     truth_m = np.where(np.isfinite(known_m), np.nan, measured_m)
-    tags += unplaced(tags, exchanges)
-    overheard, cirs, imu, height = (
-        _later(read(flight), start_ns)
-        for read in (files.read_overheard, files.read_cirs, files.read_imu, files.read_heights)
+    ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
+    tags += [Tag(number, f"tag{number}", (0.0, 0.0, 0.0)) for number in ranging]
+    own = {f"rx{k}": f"rx{k}{{raw}}" for k in (1, 2, 3)}
+    neighbours = {f"{name}_n": f"{name}{{raw}}_n" for name in STAMPS}
+    ids = {"listener": "my_id", **_ENDS}
+    heard = _read(
+        flight, "uwb_passive.csv", ids, {}, _OVERHEARD, own | neighbours, (("rx1", "rx2", "rx3"), *_NEIGHBOURS)
     )
+    cirs = _read(
+        flight, "uwb_cir.csv", {"board": "my_id", **_ENDS}, {"first_path_index": "idx"}, lists={"magnitudes": "cir"}
+    )
+    imu, height = _read(flight, "imu_px4.csv", {}, _IMU), _read(flight, "height.csv", {}, {"height_m": "range"})
+    for columns in (heard, cirs, imu, height):
+        if columns:
+            columns["time_ns"] += start_ns
     return Contents(
         exchanges=replace(exchanges, truth_m=truth_m, time_ns=exchanges.time_ns + start_ns),
         tags=sorted(tags, key=lambda tag: tag.tag),
         poses=replace(poses, time_ns=poses.time_ns + start_ns),
-        overheard=overheard,
-        cirs=files.cir_rows(cirs),
+        overheard=heard,
+        cirs=_cir_rows(cirs),
         imu=imu,
         height=height,
         faults=[replace(fault, time_ns=fault.time_ns + start_ns) for fault in flight.faults],
-        meta=_meta(flight, start_ns, anchors),
+        meta=_meta(flight, start_ns, constellation, off_m),
     )
-
-
-def _later(columns: files.Columns, start_ns: int) -> files.Columns:
-    return columns | {"time_ns": columns["time_ns"] + start_ns} if columns else columns
 
 
 def _constellation(map_file: Path | None) -> str | None:
@@ -71,28 +125,216 @@ def _constellation(map_file: Path | None) -> str | None:
     return found
 
 
-def _meta(flight: files.Flight, start_ns: int, anchors: Anchors) -> dict[str, Any]:
+def _meta(flight: Flight, start_ns: int, constellation: str | None, off_m: float) -> dict[str, Any]:
     doubled, lost = sum(flight.doubled.values()), len(flight.faults)
     notes = [f"{doubled} rows stand in the files of two robots, and are taken once"] if doubled else []
     notes += [f"{lost} rows cannot be used and are kept as faults"] if lost else []
-    if anchors.constellation is not None:
-        notes.append(f"anchors of constellation {anchors.constellation}, {100 * anchors.off_m:.1f} cm off gt_range")
+    if constellation is not None:
+        notes.append(f"anchors of constellation {constellation}, {100 * off_m:.1f} cm off gt_range")
     return {
         "source": "import miluv",
         "imported_from": flight.folder.resolve().name,
         "clock_began_ns": start_ns,
         "doubled_rows": flight.doubled,
         "notes": notes,
-        **({"anchor_constellation": anchors.constellation} if anchors.constellation else {}),
+        **({"anchor_constellation": constellation} if constellation else {}),
     }
+
+
+def _read(
+    flight: Flight,
+    name: str,
+    ids: Mapping[str, str],
+    numbers: Mapping[str, str],
+    optional: Mapping[str, str] = {},
+    stamps: Mapping[str, str] = {},
+    by_clock: tuple[tuple[str, ...], ...] = (),
+    lists: Mapping[str, str] = {},
+) -> Columns:
+    """Return the rows of all robots' files of one name in order of time; nothing where no robot has such rows.
+
+    `ids`, `numbers` and so on are the files' columns by ours; `{raw}` stands for `_raw` where a file has that. Rows
+    with ids are taken once; those without are of the robot's body. Rows in which a number is missing that is not
+    optional go to the faults.
+    """
+    parts: list[Columns] = []
+    for robot in flight.robots:
+        if not (robot / name).exists():
+            continue
+        with Table(robot / name) as table:
+            raw = "_raw" if any("_raw" in header for header in table.names) else ""
+            named = {n: header.format(raw=raw) for n, header in {**ids, **numbers, **stamps}.items()}
+            extra = {n: header for n, header in optional.items() if header in table.names}
+            found = table.read(["timestamp", *named.values(), *extra.values()])[0]
+            taps = {
+                n: table.query({"taps": f"TRY_CAST({table.word(h)} AS USMALLINT[])"})["taps"] for n, h in lists.items()
+            }
+        time_ns = whole(found["timestamp"] * 1e9)
+        good, count = time_ns != NEVER, len(time_ns)
+        columns: Columns = {"time_ns": time_ns}
+        if not ids:
+            columns["body"] = np.full(count, robot.name)
+        for ours in ids:
+            values = found[named[ours]]
+            good &= (values >= 0) & (values <= LARGEST_ID) & (values == np.rint(values))
+            columns[ours] = whole(values)
+        ticks = to_ticks({n: found[named[n]] for n in stamps}, by_clock, TICKS_PER_SECOND * 1e-9, REPORT_BITS)
+        good &= np.all([column != NEVER for column in [time_ns, *ticks.values()]], axis=0)
+        columns |= ticks | {ours: found[named[ours]] for ours in numbers}
+        good &= np.all([np.ones(count), *(np.isfinite(columns[ours]) for ours in numbers)], axis=0)
+        columns |= {n: found[extra[n]] if n in extra else np.full(count, np.nan) for n in optional}
+        for ours, column in taps.items():
+            good &= ~np.ma.getmaskarray(column)
+            columns[ours] = np.ma.getdata(column)
+        for row in np.flatnonzero(~good).tolist():
+            detail = f"{robot.name}/{name}: row {row + 2}: a number is missing or none"
+            flight.faults.append(Fault(0, name, "unusable row", detail))
+        parts.append({n: column[good] for n, column in columns.items()})
+    if not sum(len(part["time_ns"]) for part in parts):
+        return {}
+    joined = {n: np.concatenate([part[n] for part in parts]) for n in parts[0]}
+    order = np.argsort(joined["time_ns"], kind="stable")
+    if ids:
+        key = ["time_ns", *ids, *(n for n in ("tx1", "rx1") if n in joined)]
+        rows = np.column_stack([joined[n][order] for n in key])
+        first = np.sort(np.unique(rows, axis=0, return_index=True)[1])
+        flight.doubled[name] = len(order) - len(first)
+        order = order[first]
+    return {n: column[order] for n, column in joined.items()}
+
+
+def _read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
+    """Return all exchanges in order of time, without truth, and the distances that the authors measured (n,)."""
+    stamps, optional = {name: f"{name}{{raw}}" for name in STAMPS}, {"measured_m": "gt_range", **_LEVELS}
+    columns: dict[str, Any] = _read(
+        flight, "uwb_range.csv", _ENDS, {"range_m": "range{raw}"}, optional, stamps, _CLOCKS
+    )
+    if not columns:
+        raise ImportTableError(f"{flight.folder}: its uwb_range.csv hold no row that can be used")
+    measured = columns.pop("measured_m")
+    unknown, protocol = np.full(len(measured), np.nan), np.full(len(measured), "ds")
+    return Exchanges(protocol=protocol, reporter=columns["initiator"], truth_m=unknown, **columns), measured
+
+
+def _cir_rows(columns: Columns) -> list[CirRow]:
+    if not columns:
+        return []
+    plain = [columns[name].tolist() for name in ("time_ns", "board", "initiator", "target", "first_path_index")]
+    taps = [tuple(row.tolist()) for row in columns["magnitudes"]]
+    return [CirRow(*row) for row in zip(*plain, taps, strict=True)]
+
+
+def _read_poses(flight: Flight) -> Poses:
+    """Return the poses of the robots, none where there is no motion capture."""
+    columns = _read(flight, "mocap.csv", {}, {name: name for name in _POSE})
+    if not columns:
+        return Poses.from_arrays([], "", (0.0, 0.0, 0.0))
+    values = np.column_stack([columns[name] for name in _POSE])
+    norm = np.linalg.norm(values[:, 3:], axis=1)
+    good = (norm > 0.9) & (norm < 1.1)
+    for row in np.flatnonzero(~good):
+        detail = f"{columns['body'][row]}/mocap.csv: a quaternion of length {norm[row]:.3g}"
+        flight.faults.append(Fault(int(columns["time_ns"][row]), "mocap.csv", "unusable row", detail))
+    return Poses(columns["time_ns"], columns["body"], values[:, :3], values[:, 3:] / norm[:, None])[good]
+
+
+def _read_tags(flight: Flight) -> list[Tag]:
+    """Return the robots' tags and lever arms from tags.yaml; none where there is no such file."""
+    path = flight.folder / "tags.yaml"
+    arms, names = _read_vectors(path) if path.exists() else {}, {robot.name for robot in flight.robots}
+    return [Tag(number, body, arm) for body, tags in arms.items() if body in names for number, arm in tags.items()]
+
+
+def _find_anchors(
+    flight: Flight, exchanges: Exchanges, measured_m: Floats, poses: Poses, tags: list[Tag], wanted: str | None
+) -> tuple[str | None, float, dict[int, tuple[float, float, float]]]:
+    """Return the constellation called `wanted`, or else the one whose distances are those of `gt_range`.
+
+    It is the name (None: no anchors known), the median difference of its distances from `gt_range`, NaN where nothing
+    can be compared, and places by anchor. Raises `ImportTableError` for a name that anchors.yaml does not have, and
+    where no constellation fits.
+    """
+    path = flight.folder / "anchors.yaml"
+    if not path.exists():
+        if wanted is not None:
+            raise ImportTableError(f"{path}: no such file, so there is no constellation {wanted[:40]!r}")
+        return None, float("nan"), {}
+    known = _read_vectors(path)
+    if wanted is not None and wanted not in known:
+        raise ImportTableError(f"{path}: no constellation {wanted[:40]!r}; there are {', '.join(known)}")
+    ends = exchanges.initiator, exchanges.target
+    ranging = {*ends[0].tolist(), *ends[1].tolist()} - {tag.tag for tag in tags}
+    if not ranging and wanted is None:
+        return None, float("nan"), {}
+    found = []
+    for name, all_places in known.items():
+        places = {number: place for number, place in all_places.items() if number in ranging}
+        true_m = distances_m(*_with_anchors(poses, tags, places), *ends, exchanges.time_ns)
+        off = np.abs(true_m - measured_m)[np.isin(ends[0], list(places)) | np.isin(ends[1], list(places))]
+        off = off[np.isfinite(off)]
+        found.append((float(np.median(off)) if len(off) else float("nan"), name, places))
+    chosen = [one for one in found if one[1] == wanted or (wanted is None and one[0] < SAME_ANCHORS_M)]
+    if not chosen:
+        raise ImportTableError(
+            f"{path}: which constellation the flight was beside cannot be told from gt_range; "
+            f"choose one of {', '.join(known)}"
+        )
+    off_m, name, places = min(chosen)
+    return name, off_m, places
+
+
+def _with_anchors(
+    poses: Poses, tags: list[Tag], places: dict[int, tuple[float, float, float]]
+) -> tuple[Poses, list[Tag]]:
+    """Return poses and tags with those of anchors: each alone on a body with a single pose, which does not move."""
+    numbers = sorted(places)
+    anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in numbers]
+    begins = int(poses.time_ns.min()) if len(poses) else 0
+    position = np.array([places[number] for number in numbers], dtype=np.float64).reshape(-1, 3)
+    joined = Poses(
+        np.concatenate([poses.time_ns, np.full(len(numbers), begins)]),
+        np.concatenate([poses.body, np.array([tag.body for tag in anchors], dtype=np.str_)]),
+        np.concatenate([poses.position_m, position]),
+        np.concatenate([poses.quaternion, np.tile([0.0, 0.0, 0.0, 1.0], (len(numbers), 1))]),
+    )
+    return joined[np.argsort(joined.time_ns, kind="stable")], [*tags, *anchors]
 
 
 def _start_ns(folder: Path) -> int:
     path = folder / "timeshift.yaml"
     if not path.exists():
         return 0
-    table = read_mapping(path)
+    table = _read_mapping(path)
     try:
         return int(table["timeshift_s"]) * 1_000_000_000 + int(table["timeshift_ns"])
     except (KeyError, TypeError, ValueError) as error:
         raise ImportTableError(f"{path}: expected whole numbers timeshift_s and timeshift_ns") from error
+
+
+def _read_mapping(path: Path) -> dict[str, Any]:
+    """Return a YAML file whose top level is a mapping; raises `ImportTableError`."""
+    try:
+        table = yaml.safe_load(read_text(path, ImportTableError))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ImportTableError(f"{path}: not YAML ({first_line(error)})") from error
+    if not isinstance(table, dict):
+        raise ImportTableError(f"{path}: expected names and values, as in `name: value`")
+    return {str(name): value for name, value in table.items()}
+
+
+def _read_vectors(path: Path) -> Vectors:
+    """Return vectors of three numbers; each is a list, or text such as "[1.0, 2.0, 3.0]". Raises `ImportTableError`."""
+    found: Vectors = {}
+    for name, group in _read_mapping(path).items():
+        if not isinstance(group, dict):
+            raise ImportTableError(f"{path}: {name[:40]}: expected numbers, each with [x, y, z]")
+        found[name] = {}
+        for number, value in group.items():
+            try:
+                x, y, z = (float(cell) for cell in (value.strip("[] ").split(",") if isinstance(value, str) else value))
+                found[name][int(number)] = (x, y, z)
+            except (TypeError, ValueError) as error:
+                raise ImportTableError(
+                    f"{path}: {name[:40]}: {str(number)[:20]}: found {reprlib.repr(value)[:40]}, expected [x, y, z]"
+                ) from error
+    return found

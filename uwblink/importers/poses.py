@@ -7,21 +7,51 @@ begins with `#timestamp`, one body a file. Bags (ROS 1, ROS 2, MCAP) need the ex
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Callable, Iterable, Mapping
+from array import array
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Any, Final
 
 import numpy as np
 
+from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
-from uwblink.importers.pose_bags import Row, read_bag
-from uwblink.importers.pose_columns import LATEST_NS, NUMBERS, poses_of_lines, poses_of_table
+from uwblink.importers.bags import opened
+from uwblink.importers.tables import Table
 from uwblink.recording.schema import Poses
 from uwblink.text_files import read_text, require_regular
+from uwblink.twr import LATEST_NS
 
-Reader = Callable[[Path, str | None], Iterable[Row]]
+NUMBERS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
+EUROC_NUMBERS: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
+SUFFIXES: Final = ("bag", "csv", "db3", "mcap", "tum", "txt")
+
+Place = Callable[[int, str], tuple[int, str]]
+"""Returns the line of a pose, the first being 0, and what stands there in a column."""
+
+MESSAGES: Final = {
+    "geometry_msgs/msg/PoseStamped": ("pose.position", "pose.orientation", False),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose.pose.position", "pose.pose.orientation", False),
+    "geometry_msgs/msg/TransformStamped": ("transform.translation", "transform.rotation", True),
+    "nav_msgs/msg/Odometry": ("pose.pose.position", "pose.pose.orientation", False),
+    "tf2_msgs/msg/TFMessage": ("transform.translation", "transform.rotation", True),
+    "foxglove.PoseInFrame": ("pose.position", "pose.orientation", False),
+    "foxglove.FrameTransform": ("translation", "rotation", True),
+}
+"""The messages that carry poses, those first that are taken where a bag has several kinds.
+
+Each with where in it position and attitude are, and whether its child frame is called after the body.
+"""
+
+DRIVERS: Final = frozenset(
+    {
+        "vrpn_client_node", "vrpn_mocap", "mocap", "mocap_node", "optitrack", "vicon", "vicon_bridge", "vicon_receiver",
+        "natnet_ros", "natnet_ros2", "natnet", "qualisys", "qualisys_node", "motion_capture", "rigid_bodies", "pose",
+        "odom", "poses", "tf",
+    }
+)  # fmt: skip
+"""What motion-capture nodes call all of their topics, beside the name of a body."""
 
 
 def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | None = None) -> Poses:
@@ -31,143 +61,196 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
     """
     require_regular(path, ImportTableError, "file of poses", folders=True)
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
-    reader = _READERS.get(kind)
-    if reader is None:
+    if kind not in SUFFIXES:
         raise ImportTableError(
-            f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(sorted(_READERS))}"
+            f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(SUFFIXES)}"
         )
-    if topics and reader is not _bag:
+    is_bag = kind in ("bag", "mcap", "db3")
+    if topics and not is_bag:
         raise ImportTableError(f"{path}: has no topics; only bags have")
-    poses = None if topics else _at_once(path, reader, body)
-    if poses is None:
-        poses = _as_poses(path, read_bag(path, topics) if topics else reader(path, body))
+    if is_bag:
+        poses = _from_bag(path, topics)
+    elif kind == "csv" and not _is_euroc(path):
+        poses = _from_table(path, body)
+    else:
+        poses = _from_lines(path, body, euroc=kind == "csv")
     if not len(poses):
         raise ImportTableError(f"{path}: holds no poses")
     return poses
 
 
-def _at_once(path: Path, reader: Reader, body: str | None) -> Poses | None:
-    """Return the poses of a file in which every cell is as it should be; None for all others, and for bags."""
-    if reader is _bag:
-        return None
-    if reader is _csv and not _is_euroc(path):
-        return poses_of_table(path, body)
-    return None if body is None else poses_of_lines(path, body, euroc=reader is _csv)
-
-
 def _is_euroc(path: Path) -> bool:
     with path.open("rb") as file:
-        return file.readline().removeprefix(b"\xef\xbb\xbf").lower().startswith(EUROC.encode())
+        return file.readline().removeprefix(b"\xef\xbb\xbf").lower().startswith(b"#timestamp")
 
 
-EUROC: Final = "#timestamp"
-EUROC_NUMBERS: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
-
-
-def _euroc(path: Path, body: str | None, file: TextIO) -> Iterable[Row]:
-    if body is None:
-        raise ImportTableError(f"{path}: a EuRoC file does not say whose poses it holds; name it as `body`")
-    for number, line in enumerate(file, start=1):
-        cells = line.split(",")
-        if line.startswith("#") or not line.strip():
-            continue
-        if len(cells) < 8:
+def _from_table(path: Path, body: str | None) -> Poses:
+    """Return the poses of a CSV file with a header."""
+    with Table(path, ",", ".") as table:
+        time = next((name for name in ("time_ns", "time_s") if name in table.names), "")
+        missing = [name for name in (*NUMBERS, *(() if body else ("body",))) if name not in table.names]
+        if not time or missing:
             raise ImportTableError(
-                f"{path}: row {number}: found {len(cells)} cells, EuRoC has 8: time_ns, {', '.join(EUROC_NUMBERS)}"
+                f"{path}: column {[*missing, 'time_s'][0]!r} is missing; there are {', '.join(table.names)[:400]}; "
+                "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, "
+                "in metres and between commas"
             )
-        found = {n: _number(path, number, n, c) for n, c in zip(EUROC_NUMBERS, cells[1:], strict=False)}
-        yield _time_ns(path, number, "time_ns", cells[0]), body, [found[name] for name in NUMBERS]
+        cells = {name: table.number(name) for name in (*NUMBERS, time)}
+        # One query, as a file that somebody is still writing is longer when it is read again.
+        cells |= {"exact": table.whole_number(time)} if time == "time_ns" else {}
+        cells |= {} if body else {"body": table.word("body")}
+        found = table.query(cells)
+        if len(lines := table.rejected()):
+            raise ImportTableError(f"{path}: row {lines[0]}: more cells than the header has")
+        numbers = {name: np.ma.filled(found[name], np.nan) for name in (*NUMBERS, time)}
+        count = len(numbers["x"])
+
+        def place(row: int, name: str) -> tuple[int, str]:
+            return int(table.lines(np.array([row]))[0]), table.words_at([name], np.array([row]))[row][name]
+
+        bodies = np.full(count, body) if body else np.ma.filled(found["body"], "").astype(np.str_)
+        if (bodies == "").any():
+            raise ImportTableError(
+                f"{path}: row {place(int(np.argmax(bodies == '')), 'body')[0]}: column 'body' is empty"
+            )
+        seconds = numbers.pop(time)
+        time_ns = _nanoseconds(path, time, seconds, place)
+        if "exact" in cells:  # also those that no float holds
+            time_ns = np.where(np.ma.getmaskarray(found["exact"]), time_ns, np.ma.getdata(found["exact"]))
+        values = np.column_stack([numbers[name] for name in NUMBERS])
+        return _poses(path, time_ns, bodies, values, place)
 
 
-_EXPECTED: Final = (
-    "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, in metres and "
-    "between commas"
-)
-
-
-def _csv(path: Path, body: str | None) -> Iterable[Row]:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            if file.readline().lower().startswith(EUROC):
-                file.seek(0)
-                yield from _euroc(path, body, file)
-                return
-            file.seek(0)
-            reader = csv.DictReader(file)
-            names = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = names
-            time = next((name for name in ("time_ns", "time_s") if name in names), None)
-            missing = [name for name in (*NUMBERS, *(() if body else ("body",))) if name not in names]
-            if time is None or missing:
-                first, there = (missing or ["time_s"])[0], ", ".join(names)[:400]
-                raise ImportTableError(f"{path}: column {first!r} is missing; there are {there}; {_EXPECTED}")
-            for row in reader:
-                line = reader.line_num
-                name = body or str(row["body"]).strip()
-                if not name:
-                    raise ImportTableError(f"{path}: row {line}: column 'body' is empty")
-                yield _time_ns(path, line, time, row[time]), name, [_number(path, line, n, row[n]) for n in NUMBERS]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ImportTableError(f"{path}: cannot be read as a table ({error})") from error
-
-
-def _tum(path: Path, body: str | None) -> Iterable[Row]:
+def _from_lines(path: Path, body: str | None, *, euroc: bool) -> Poses:
+    """Return the poses of a TUM or a EuRoC file."""
+    kind, mark, time, names = ("EuRoC", ",", "time_ns", EUROC_NUMBERS) if euroc else ("TUM", None, "time_s", NUMBERS)
     if body is None:
-        raise ImportTableError(f"{path}: a TUM file does not say whose poses it holds; name it as `body`")
-    text = read_text(path, ImportTableError, "TUM file")
-    for number, line in enumerate(text.splitlines(), start=1):
-        cells = line.split()
-        if not cells or cells[0].startswith("#"):
+        raise ImportTableError(f"{path}: a {kind} file does not say whose poses it holds; name it as `body`")
+    lines, exact, seconds, values = array("q"), array("q"), array("d"), array("d")
+    text = read_text(path, ImportTableError, f"{kind} file").removeprefix("\ufeff").splitlines()
+    for number, line in enumerate(text, start=1):
+        cells = line.split(mark)
+        if not line.strip() or line.lstrip().startswith("#"):
             continue
-        if len(cells) != 8:
-            raise ImportTableError(f"{path}: row {number}: found {len(cells)} cells, TUM has 8: time x y z qx qy qz qw")
-        values = [_number(path, number, n, c) for n, c in zip(NUMBERS, cells[1:], strict=True)]
-        yield _time_ns(path, number, "time_s", cells[0]), body, values
+        if len(cells) < 8 or (len(cells) > 8 and not euroc):
+            expected = f"{time.removesuffix('_s')} {' '.join(names)}" if mark is None else f"{time}, {', '.join(names)}"
+            raise ImportTableError(f"{path}: row {number}: found {len(cells)} cells, {kind} has 8: {expected}")
+        lines.append(number)
+        seconds.append(_number(cells[0]))
+        whole = euroc and len(cells[0]) < 20 and cells[0].strip().lstrip("-").isdecimal()
+        exact.append(int(cells[0]) if whole and abs(seconds[-1]) <= LATEST_NS else 0)
+        values.extend(map(_number, cells[1:8]))
+
+    def place(row: int, name: str) -> tuple[int, str]:
+        return lines[row], text[lines[row] - 1].split(mark)[(time, *names).index(name)]
+
+    order = [names.index(name) for name in NUMBERS]
+    time_ns = _nanoseconds(path, time, np.array(seconds), place)
+    time_ns = np.where(np.array(exact, dtype=np.int64) != 0, exact, time_ns)  # no float holds nanoseconds since 1970
+    return _poses(path, time_ns, np.full(len(lines), body), np.array(values).reshape(-1, 7)[:, order], place)
 
 
-def _bag(path: Path, _body: str | None) -> Iterable[Row]:
-    return read_bag(path)
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
-_READERS: Final[dict[str, Reader]] = {
-    "csv": _csv,
-    "tum": _tum,
-    "txt": _tum,
-    "bag": _bag,
-    "mcap": _bag,
-    "db3": _bag,
-}
+def _nanoseconds(path: Path, name: str, times: Floats, place: Place) -> Ints:
+    """Return times in whole nanoseconds, of a column in seconds or in nanoseconds."""
+    # Seconds since 1970 have ten digits; a float of them is good to 0.2 us.
+    scaled = times if name == "time_ns" else times * 1e9
+    wrong = ~(np.abs(scaled) <= LATEST_NS)
+    if wrong.any():
+        line, cell = place(int(np.argmax(wrong)), name)
+        raise ImportTableError(f"{path}: row {line}: column {name!r}: found {cell!r}, expected a time")
+    return np.rint(scaled).astype(np.int64)
 
 
-def _as_poses(path: Path, rows: Iterable[Row]) -> Poses:
-    listed = list(rows)
-    time = np.array([row[0] for row in listed], dtype=np.int64)
-    body = np.array([row[1] for row in listed], dtype=np.str_)
-    values = np.array([row[2] for row in listed], dtype=np.float64).reshape(-1, len(NUMBERS))
+def _poses(path: Path, time_ns: Ints, body: np.ndarray, values: Floats, place: Place | None = None) -> Poses:
+    """Return poses in order of time; `values` (n, 7) are `NUMBERS`, finite ones where there is a place of each."""
+    wrong = ~np.isfinite(values)
+    if place is not None and wrong.any():
+        row, column = (int(k) for k in np.argwhere(wrong)[0])
+        line, cell = place(row, NUMBERS[column])
+        raise ImportTableError(f"{path}: row {line}: column {NUMBERS[column]!r}: found {cell!r}, expected a number")
     norm = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.flatnonzero((norm < 0.9) | (norm > 1.1))
     if len(bad):
         raise ImportTableError(f"{path}: pose {bad[0] + 1}: its quaternion has length {norm[bad[0]]:.3g}, expected 1")
-    order = np.argsort(time, kind="stable")
-    return Poses(time[order], body[order], values[order, :3], values[order, 3:] / norm[order, None])
+    poses = Poses(time_ns, body, values[:, :3], values[:, 3:] / norm[:, None])
+    return poses if (np.diff(time_ns) >= 0).all() else poses[np.argsort(time_ns, kind="stable")]
 
 
-def _number(path: Path, line: int, name: str, cell: str | None) -> float:
-    try:
-        value = float(cell or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ImportTableError(f"{path}: row {line}: column {name!r}: found {cell!r}, expected a number")
-    return value
+def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
+    """Return the poses of a bag.
+
+    `topics` are those to read by the body that they are of. Without it all topics of PoseStamped are, or, where there
+    are none, all of the next kind of `MESSAGES`; a body is what a topic is called beside the name of its driver, and
+    that of a transform its child frame.
+    """
+    times, bodies, values = list[int](), list[str](), array("d")
+    with opened(path) as bag:
+        wanted = _chosen_topics(path, bag.kinds, topics)
+        for topic, kind, _, message in bag.messages(wanted):
+            try:
+                for time_ns, child, numbers in _of_message(kind, message):
+                    times.append(time_ns)
+                    bodies.append(wanted[topic] or child or body_of(topic))
+                    values.extend(numbers)
+            except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+                # JSON need not hold what its schema is called after.
+                raise ImportTableError(f"{path}: a message of {topic[:80]!r} is no {kind}") from error
+    return _poses(path, np.array(times, dtype=np.int64), np.array(bodies, np.str_), np.array(values).reshape(-1, 7))
 
 
-def _time_ns(path: Path, line: int, name: str, cell: str | None) -> int:
-    if name == "time_ns" and cell and cell.strip().lstrip("-").isdecimal():
-        value = int(cell)
-    else:
-        # Seconds since 1970 have ten digits; a float of them is good to 0.2 us.
-        value = round(_number(path, line, name, cell) * (1 if name == "time_ns" else 1e9))
-    if abs(value) > LATEST_NS:
-        raise ImportTableError(f"{path}: row {line}: column {name!r}: found {cell!r}, expected a time")
-    return value
+def body_of(topic: str) -> str:
+    """Return the body of a topic: its first part that is not what motion-capture nodes call all of theirs."""
+    return _body_in(topic) or topic
+
+
+def _body_in(name: str) -> str:
+    return next((part for part in name.split("/") if part and part not in DRIVERS), "")
+
+
+def _chosen_topics(path: Path, kinds: Mapping[str, str], topics: Mapping[str, str] | None) -> dict[str, str | None]:
+    """Return the topics to read and the bodies they are of; None where the message or the topic's name says it."""
+    for topic in (topics or {}).values():
+        if kinds.get(topic) not in MESSAGES:
+            known = ", ".join(sorted(name for name, kind in kinds.items() if kind in MESSAGES)) or "none"
+            raise ImportTableError(
+                f"{path}: topic {topic[:80]!r} is {kinds.get(topic, 'not there')}; topics with poses are {known}"
+            )
+    if topics:
+        return {topic: body for body, topic in topics.items()}
+    for kind in MESSAGES:
+        found = [topic for topic, its in kinds.items() if its == kind]
+        if found:
+            return dict.fromkeys(found)
+    raise ImportTableError(
+        f"{path}: no topic of {', '.join(name.replace('/msg', '') for name in MESSAGES)}; "
+        f"found {', '.join(sorted(set(kinds.values()))) or 'nothing'}"
+    )
+
+
+def _of_message(kind: str, message: Any) -> Iterator[tuple[int, str, list[float]]]:
+    """Yield time in nanoseconds, body (empty where the message does not say it), and `NUMBERS` of each pose."""
+    position, attitude, named = MESSAGES[kind]
+    for one in message.transforms if kind == "tf2_msgs/msg/TFMessage" else [message]:
+        is_json = isinstance(one, dict)
+        stamp = _at(one, "timestamp" if is_json else "header.stamp")
+        time_ns = int(_at(stamp, "sec")) * 1_000_000_000 + int(_at(stamp, "nsec" if is_json else "nanosec"))
+        places = [(position, axis) for axis in "xyz"] + [(attitude, axis) for axis in "xyzw"]
+        numbers = [float(_at(one, f"{part}.{axis}")) for part, axis in places]
+        if is_json and (abs(time_ns) > LATEST_NS or not all(map(math.isfinite, numbers))):
+            raise ValueError
+        child = str(one.get("child_frame_id", "") if is_json else one.child_frame_id) if named else ""
+        yield time_ns, _body_in(child), numbers  # Vicon's frames are called vicon/drone/drone
+
+
+def _at(message: Any, path: str) -> Any:
+    """Return a field of a field of a message, of ROS or of JSON."""
+    for name in path.split("."):
+        message = message[name] if isinstance(message, dict) else getattr(message, name)
+    return message

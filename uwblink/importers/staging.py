@@ -1,127 +1,263 @@
-"""Columns of strangers' files, put aside once they are parsed: however long they are, little of them is in memory.
+"""The rows of tables, read once and staged in a database: columns by the names of a map, ids as numbers, SI units.
 
-They lie in a database of the process that keeps `STAGED_MB` of them in memory, and the rest in a folder for temporary
-files (`TMPDIR`) that vanishes with it.
+The database belongs to the process. It keeps 350 MB in memory, and the rest in a folder for temporary files (`TMPDIR`)
+that vanishes with it, so memory does not grow with the tables. What all rows decide (whether ids are words, whether
+times are) is asked of what was staged; such columns are read a second time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile, gettempdir
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
+from tempfile import TemporaryDirectory, gettempdir
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uwblink.arrays import Ints
-from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line
-from uwblink.output import is_utf8
+from uwblink.importers.column_map import DISTANCES, EVENT, IDS, ISO, NAMES, POWERS, TIME_UNITS, ColumnMap
+from uwblink.importers.tables import Columns, Table, confined
+from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS
 
 if TYPE_CHECKING:
     import duckdb
 
-STAGED_MB: Final = 250
-"""Of what is put aside so much is kept in memory."""
+ROWS_AT_ONCE: Final = 245_760
+"""Twice what DuckDB keeps together: parts of that would stay apart in a recording."""
 
+MAX_ID_WORDS: Final = 1_000_000
+"""Different words in a column of ids from which on it holds none: more than ids can be written in."""
 
-def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBPyConnection:
-    """Return a connection that can open these files and no others, and whose settings are locked.
-
-    With a `folder` it keeps no more than `STAGED_MB` in memory, and the rest there.
-    """
-    for path in paths:
-        if not is_utf8(path):
-            raise ImportTableError(f"{path}: its name and those of its folders must be UTF-8; rename it")
-    return connect(paths=paths, temporary=folder, memory_mb=None if folder is None else STAGED_MB)
-
-
-class Stage:
-    """Where columns are put aside. Close it, or use it as a context manager."""
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        """Make room for what is in some files."""
-        self._folder = TemporaryDirectory(prefix="uwblink-")
-        self.db = confined(paths, self._folder.name)
-        self._made = 0
-        self._files: list[BinaryIO] = []
-
-    def __enter__(self) -> Self:
-        """Return the stage itself."""
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        """Forget everything."""
-        self.close()
-
-    def close(self) -> None:
-        """Forget everything."""
-        self.db.close()
-        for file in self._files:
-            file.close()
-        self._folder.cleanup()
-
-    def keep(self, query: str, bound: Sequence[Any], columns: Iterable[str]) -> Kept:
-        """Put the result of a query aside, in its order; `columns` are what its columns are called.
-
-        Raises what DuckDB raises.
-        """
-        self._made += 1
-        table = f"kept{self._made}"
-        self.db.execute(f"CREATE TABLE {table} AS {query}", list(bound))
-        ((count,),) = self.db.execute(f"SELECT count(*) FROM {table}").fetchall()  # noqa: S608 - a name of ours
-        return Kept(self, table, tuple(columns), int(count))
-
-    def add(self, kept: Kept, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Append rows to what was put aside."""
-        self.db.register("more", dict(columns))
-        self.db.execute(f"INSERT INTO {kept.table} SELECT {', '.join(kept.columns)} FROM more")  # noqa: S608 - names of ours
-        self.db.unregister("more")
-
-    def file(self) -> BinaryIO:
-        """Return a file for what is put aside beside the database; it vanishes when it is closed."""
-        file = TemporaryFile(dir=self._folder.name)  # noqa: SIM115 - `close` closes it
-        self._files.append(file)
-        return file
-
-    def unwritable(self, error: Exception) -> ImportTableError:
-        """Return the error for a disk that does not take what is put aside."""
-        return ImportTableError(
-            f"{gettempdir()}: what does not fit into memory cannot be put there ({first_line(error)}); "
-            "TMPDIR names another folder"
-        )
+Watch = Callable[[str, float], object]
+"""Is told what is being done, and which share of it is."""
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
-    """Columns that were put aside, by names of ours; `count` rows, of which the first is 0."""
+class StagedRows:
+    """Rows in a table or view of a database: `row` counts them, and `origin` is their place among all rows read.
 
-    stage: Stage
-    table: str
+    `from_id` and `to_id` are INTEGER, `time_ns` is BIGINT, all other `columns` are DOUBLE; NULL where a cell holds
+    none.
+    """
+
+    db: duckdb.DuckDBPyConnection
+    name: str
     columns: tuple[str, ...]
-    count: int
 
-    def between(self, start: int, stop: int, columns: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Return columns of the rows from `start` until before `stop`, masked where there is nothing."""
-        # Rows come in their order without being asked to, which would sort them.
-        return self._read(columns, f"WHERE rowid >= {int(start)} AND rowid < {int(stop)}")
+    def count(self, where: str = "true") -> int:
+        """Return the number of rows that fulfil a condition."""
+        return int(self.db.execute(f"SELECT count(*) FROM {self.name} WHERE {where}").fetchall()[0][0])
 
-    def at(self, rows: Ints, columns: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Return columns of some rows, in ascending order without repetition."""
-        self.stage.db.register("chosen", {"chosen": np.asarray(rows, dtype=np.int64)})
-        found = self._read(columns, "WHERE rowid IN (SELECT chosen FROM chosen) ORDER BY rowid")
-        self.stage.db.unregister("chosen")
-        return found
+    def has(self, name: str) -> bool:
+        """Return whether there is a column of one of `NAMES`."""
+        return ("time_ns" if name == "time_s" else name) in self.columns
 
-    def ask(self, query: str) -> list[tuple[Any, ...]]:
-        """Return the rows of what follows SELECT, FROM these columns."""
-        return self.stage.db.execute(f"SELECT {query} FROM {self.table}").fetchall()  # noqa: S608 - of ours
+    def read(self, more: str, columns: Collection[str] | None = None) -> Columns:
+        """Return columns (None: all) as arrays (n,), NaN where there is nothing; `more` follows the table in the query.
 
-    def _read(self, columns: Iterable[str], where: str) -> dict[str, NDArray[Any]]:
-        wanted = list(columns)
-        if not wanted:
-            return {}
-        query = f"SELECT {', '.join(wanted)} FROM {self.table} {where}"  # noqa: S608 - names of ours
-        return dict(self.stage.db.execute(query).fetchnumpy())
+        Ids and times are read of rows that have them.
+        """
+        chosen = ", ".join(name for name in self.columns if columns is None or name in columns)
+        found = self.db.execute(f"SELECT {chosen} FROM {self.name} {more}").fetchnumpy()
+        whole = ("from_id", "to_id", "time_ns", "origin")
+        return {
+            name: np.ma.getdata(column).astype(np.int64)
+            if name in whole
+            else np.ma.filled(column.astype(np.float64, copy=False), np.nan)
+            for name, column in found.items()
+        }
+
+    def blocks(self, where: str = "true") -> Iterator[Columns]:
+        """Yield the rows that fulfil a condition in their order, some at a time."""
+        for start in range(0, self.count(), ROWS_AT_ONCE):
+            # Rows come in their order without being asked to, which would sort them.
+            yield self.read(f"WHERE row >= {start} AND row < {start + ROWS_AT_ONCE} AND {where}")
+
+
+@contextmanager
+def staged(paths: Sequence[Path], column_map: ColumnMap, watch: Watch | None = None) -> Iterator[Staging]:
+    """Yield tables as one, which are forgotten after the block; raises `ImportTableError`, also where the disk is full.
+
+    Of the tables the columns are read that the map names, and those that have our names.
+    """
+    import duckdb
+
+    with TemporaryDirectory(prefix="uwblink-") as folder, confined(paths, folder) as db:
+        try:
+            yield Staging(db, paths, column_map, watch)
+        except (duckdb.OutOfMemoryException, duckdb.IOException) as error:
+            raise ImportTableError(
+                f"{gettempdir()}: what does not fit into memory cannot be put there ({first_line(error)}); "
+                "TMPDIR names another folder"
+            ) from error
+
+
+class Staging:
+    """Tables as one: their `rows`.
+
+    `names` are the ids that were words, by the number that they got; `offsets` are the place of the first row of each
+    table among all rows, and the number of all.
+    """
+
+    def __init__(
+        self, db: duckdb.DuckDBPyConnection, paths: Sequence[Path], column_map: ColumnMap, watch: Watch | None
+    ) -> None:
+        """See `staged`."""
+        self.db, self.paths, self.column_map = db, tuple(paths), column_map
+        self.tables: list[Table] = []
+        self.names: dict[int, str] = {}
+        self._headers: dict[str, str] = {}
+        counts = [0]
+        for k, path in enumerate(paths):
+            if watch:
+                watch("reading", k / len(paths))
+            self._add(Table(path, column_map.delimiter, column_map.decimal, db=db, key=k))
+            counts.append(self._ask("count(*)"))
+        self.offsets = np.array(counts)
+        if not counts[-1]:
+            raise ImportTableError(f"{paths[0]}: a header and no rows")
+        self.rows = self._make_rows()
+
+    def missing(self, name: str) -> ImportTableError:
+        """Return the error that says which column the tables lack."""
+        names, header = self.tables[0].names, self.column_map.header(name)
+        remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
+        if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in names}:
+            remedy = "these are poses, which `uwblink poses` puts into a recording"
+        there = ", ".join(names)[:400]
+        return ImportTableError(f"{self.paths[0]}: column {header!r} is missing; there are {there}; {remedy}")
+
+    def _add(self, table: Table) -> None:
+        """Stage the columns of one more table."""
+        self.tables.append(table)
+        column_map = self.column_map
+        wanted = {name: column_map.header(name) for name in NAMES if name not in column_map.constants}
+        headers = {name: header for name, header in wanted.items() if header in table.names}
+        absent = [name for name in column_map.columns if name in wanted and name not in headers]
+        if absent or not headers:
+            raise self.missing([*absent, "from_id"][0])
+        if headers.keys() != (self._headers or headers).keys():
+            raise ImportTableError(f"{table.path}: has other columns than {self.paths[0]}, so they are not one table")
+        self._headers = headers
+        cells = {name: table.number(header) for name, header in headers.items()}
+        if EVENT in cells:
+            first = f"lower(left({table.word(headers[EVENT])}, 1))"
+            cells[EVENT] = f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
+        self._stage("staged", table, cells)
+
+    def _stage(self, name: str, table: Table, cells: dict[str, str]) -> None:
+        """Read SQL expressions of columns of a table into one of the database."""
+        chosen = ", ".join(f"{cell} AS {column}" for column, cell in cells.items())
+        into = f"CREATE TABLE {name} AS" if table is self.tables[0] else f"INSERT INTO {name}"
+        with table.reading():
+            self.db.execute(f"{into} SELECT {chosen} FROM {table.source}")
+
+    def _ask(self, number: str) -> int:
+        """Return a number that a query finds in what is staged."""
+        return int(self.db.execute(f"SELECT {number} FROM staged").fetchall()[0][0])
+
+    def _put_beside(self, query: str) -> None:
+        """Put the columns that a query returns beside those that are staged, row by row."""
+        self.db.execute(f"CREATE TABLE beside AS {query}")
+        self.db.execute("CREATE TABLE wider AS SELECT * FROM staged POSITIONAL JOIN beside")
+        self.db.execute("DROP TABLE staged")
+        self.db.execute("DROP TABLE beside")
+        self.db.execute("ALTER TABLE wider RENAME TO staged")
+
+    def _make_rows(self) -> StagedRows:
+        """Return a view of what is staged with exact numbers, SI units, and ids as numbers."""
+        exact, column_map = self._read_again(), self.column_map
+        values = {name: name for name in self._headers}
+        values |= {n: f"CAST({v!r} AS DOUBLE)" for n, v in column_map.constants.items() if not isinstance(v, str)}
+        # The low 40 bits of ticks are all that differences need.
+        low = {n: f"CAST({n}_exact & {(1 << 40) - 1} AS DOUBLE)" for n in exact if n in _COUNTED}
+        values |= {n: f"CASE WHEN {n} = trunc({n}) THEN {value} ELSE {n} END" for n, value in low.items()}
+        factors = dict.fromkeys(DISTANCES, column_map.metres_per_unit) | dict.fromkeys(POWERS, column_map.power_sign)
+        values |= {n: f"{values[n]} * {factor!r}" for n, factor in factors.items() if n in values and factor != 1.0}
+        ids = self._ids(values, exact)
+        if "time_s" in values:
+            seconds = f"{values['time_s']} * {TIME_UNITS.get(column_map.time_unit or 's', 1.0)!r}"
+            time = "time_s_exact" if "time_s" in exact else seconds
+            ids["time_ns"] = f"CASE WHEN {time} BETWEEN -{LATEST_NS} AND {LATEST_NS} THEN CAST({time} AS BIGINT) END"
+        values = ids | {name: value for name, value in values.items() if name not in (*IDS, "time_s")}
+        chosen = ", ".join(f"{value} AS {name}" for name, value in values.items())
+        self.db.execute(f"CREATE VIEW rows AS SELECT rowid AS row, rowid AS origin, {chosen} FROM staged")
+        return StagedRows(self.db, "rows", ("origin", *values))
+
+    def _read_again(self) -> set[str]:
+        """Read columns again that are words, or hold whole numbers that no float does; returns which."""
+        found: dict[str, Callable[[Table, str], str]] = {}
+        for name in self._headers:
+            unit = self.column_map.time_unit
+            counted = name in _COUNTED and self.column_map.ticks_per_unit == 1.0
+            if name in IDS:
+                # A few ids that are no numbers are faults; more than that say that ids are words.
+                if self._ask(f"count(*) - count(*) FILTER ({_is_id(name)})") > 0.01 * self.offsets[-1]:
+                    found[name] = Table.word
+            elif name == "time_s" and (unit == ISO or (unit is None and not self._ask("count(time_s)"))):
+                found[name] = Table.time_ns
+            elif (counted or (name == "time_s" and unit == "ns")) and self._ask(
+                f"count(*) FILTER (abs({name}) >= {2**53})"
+            ):
+                found[name] = Table.whole_number  # not all whole numbers from 2**53 on are floats
+        if found:
+            for table in self.tables:
+                cells = {f"{name}_exact": cell(table, self._headers[name]) for name, cell in found.items()}
+                self._stage("again", table, cells)
+            self._put_beside("SELECT * FROM again")
+            self.db.execute("DROP TABLE again")
+        return set(found)
+
+    def _ids(self, values: dict[str, str], exact: set[str]) -> dict[str, str]:
+        """Return ids as whole numbers, NULL where there is none; words get numbers."""
+        told = {n: v for n, v in self.column_map.constants.items() if n in IDS and isinstance(v, str)}
+        numbers = {
+            n: f"CASE WHEN {_is_id(values[n])} THEN CAST({values[n]} AS INTEGER) END" for n in IDS if n in values
+        }
+        if not told and not exact & {*IDS}:
+            return numbers
+        words = {n: f"{n}_exact" if n in exact else f"coalesce(CAST({x} AS VARCHAR), '')" for n, x in numbers.items()}
+        found = set(told.values())
+        for word in words.values():
+            if self._ask(f"approx_count_distinct({word})") > MAX_ID_WORDS:
+                raise self._too_many_ids()
+            found |= {str(one) for (one,) in self.db.execute(f"SELECT DISTINCT {word} FROM staged").fetchall()}
+        known = self._number_words(sorted(found - {""}))
+        if words:
+            columns = {"word": np.array(["", *known]), "number": np.array([-1, *known.values()])}
+            self.db.register("known", columns)
+            joined = " ".join(f"LEFT JOIN known {n} ON {n}.word = {word}" for n, word in words.items())
+            chosen = ", ".join(f"CAST(nullif({n}.number, -1) AS INTEGER) AS {n}_number" for n in words)
+            self._put_beside(f"SELECT {chosen} FROM staged {joined} ORDER BY staged.rowid")
+            self.db.unregister("known")
+        return {n: f"{n}_number" for n in words} | {n: f"CAST({known[word]} AS INTEGER)" for n, word in told.items()}
+
+    def _number_words(self, words: list[str]) -> dict[str, int]:
+        """Return the number of each id: its own, that of the map, or else a free one in the order of the words."""
+        # Texts of thousands of digits are no numbers to Python, either.
+        numbers = {w: int(w) for w in words if w.isdecimal() and len(w) < 9 and int(w) <= LARGEST_ID}
+        if len(numbers) == len(words):
+            return numbers
+        numbers |= self.column_map.ids
+        free = iter(sorted({*range(1, LARGEST_ID + 1)} - {*numbers.values()}))
+        for word in words:
+            if word not in numbers:
+                number = next(free, None)
+                if number is None:
+                    raise self._too_many_ids()
+                numbers[word] = number
+        self.names = {numbers[word]: word for word in words if word != str(numbers[word])}
+        return {word: numbers[word] for word in words}
+
+    def _too_many_ids(self) -> ImportTableError:
+        return ImportTableError(f"{self.paths[0]}: more than {LARGEST_ID} different ids; are from_id and to_id ids?")
+
+
+_COUNTED: Final = (*STAMPS, "tx", "rx", "stamp")
+"""Columns of stamps."""
+
+
+def _is_id(value: str) -> str:
+    return f"{value} BETWEEN 0 AND {LARGEST_ID} AND {value} = trunc({value})"

@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, POWERS, REGISTER_MAX
-from uwblink.importers.exchange_rows import exchanges_of, optional, truth_m
-from uwblink.importers.staged_tables import StagedTables
-from uwblink.importers.table_rows import Rows
-from uwblink.importers.trials import Reading
+from uwblink.importers.column_map import DISTANCE_UNITS, POSITIONS, POWERS, REGISTER_MAX, ColumnMap
+from uwblink.importers.stamps import MIN_ROWS
+from uwblink.importers.tables import Columns
 from uwblink.ticks import METRES_PER_TICK
-from uwblink.twr import raw_range
 
-ENOUGH_ROWS: Final = 20
-"""Fewer ranges may agree with anything."""
-
-FARTHEST_M: Final = 300.0
-"""How far DW1000 devices reach: 290 m in the open by their data sheet."""
-
-LONGEST_DELAY_M: Final = REGISTER_MAX * METRES_PER_TICK
+MAX_DELAY_M: Final = REGISTER_MAX * METRES_PER_TICK
 """How much longer or shorter ranges can be by antenna delays: all that registers hold, at both ends."""
 
 Errors = Callable[[float], Floats]
@@ -41,14 +33,13 @@ def other_unit(errors: Mapping[str, Errors]) -> tuple[str, str] | None:
     what the factor would make of it than to what it is. Distances that have nothing to do with the ranges come down to
     the ranges' own spread, by the root of two at most.
     """
-    plain = {name: _remaining(of(1.0)) for name, of in errors.items()}
     best, found = 0.0, None
     for name, of in errors.items():
+        plain = _remaining(of(1.0))
         for unit, factor in DISTANCE_UNITS.items():
-            if factor == 1.0 or not np.isfinite(plain[name]):
+            if factor == 1.0 or not plain > 0:
                 continue
-            remaining = max(_remaining(of(factor)), METRES_PER_TICK)
-            gain = np.log(plain[name] / remaining) if plain[name] > 0 else 0.0
+            gain = np.log(plain / max(_remaining(of(factor)), METRES_PER_TICK))
             if gain > max(best, -np.log(factor) / 2):
                 best, found = gain, (name, unit)
     return found
@@ -57,22 +48,22 @@ def other_unit(errors: Mapping[str, Errors]) -> tuple[str, str] | None:
 def _remaining(errors_m: Floats) -> float:
     """Return the median size of errors beside a constant that antenna delays can make; NaN of few."""
     finite = errors_m[np.isfinite(errors_m)]
-    if len(finite) < ENOUGH_ROWS:
+    if len(finite) < MIN_ROWS:
         return float("nan")
-    constant = np.clip(np.median(finite), -LONGEST_DELAY_M, LONGEST_DELAY_M)
+    constant = np.clip(np.median(finite), -MAX_DELAY_M, MAX_DELAY_M)
     return float(np.median(np.abs(finite - constant)))
 
 
 def doubted_metres(ranges: Floats) -> str:
     """Return why numbers (n,) can be no ranges in metres; nothing where they can be."""
     finite = ranges[np.isfinite(ranges)]
-    if len(finite) < ENOUGH_ROWS:
+    if len(finite) < MIN_ROWS:
         return ""
     middle = float(np.median(np.abs(finite)))
-    if middle > FARTHEST_M:
+    if middle > 300.0:  # DW1000 devices reach 290 m in the open by their data sheet
         return f"{middle:.6g} in the middle, farther than devices reach in metres"
     # Noise of centimetres leaves no range a whole number of metres, those that repeat one number aside.
-    if len(np.unique(finite)) > ENOUGH_ROWS // 4 and np.array_equal(finite, np.rint(finite)):
+    if len(np.unique(finite)) > MIN_ROWS // 4 and np.array_equal(finite, np.rint(finite)):
         return "whole numbers all, as no ranges in metres are"
     return ""
 
@@ -85,33 +76,43 @@ def doubted_dbm(powers: Floats) -> str:
     return f"{middle:+.4g} in the middle, and no received power is above 0 dBm" if middle > 0 else ""
 
 
-def check_units(tables: StagedTables, rows: Rows, reading: Reading | None) -> None:
+def truth_m(rows: Columns) -> Floats:
+    """Return distances (n,) that were measured, or those between antennas; NaN where there are none."""
+    if "gt_range_m" in rows or not all(name in rows for name in POSITIONS):
+        return optional(rows, "gt_range_m")
+    ends = np.array([rows[name] for name in POSITIONS])
+    return np.asarray(np.sqrt(((ends[3:] - ends[:3]) ** 2).sum(axis=0)))
+
+
+def optional(rows: Columns, name: str) -> Floats:
+    """Return a column (n,), NaN where there is no such column."""
+    return rows[name] if name in rows else np.full(len(rows["origin"]), np.nan)
+
+
+def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats | None) -> None:
     """Raise `ImportTableError` where some rows of a table say that lengths or powers are in another unit.
 
     What is wrong by itself is asked for unless the map says the unit; lengths that contradict each other are refused.
+    `raw_m` are ranges by the stamps (n,), if there are any.
     """
-    column_map = tables.column_map
-    where = {name: f"{tables.paths[0]}: column {column_map.header(name)!r}" for name in ("range_m", *POWERS)}
     for name in POWERS:
         if column_map.power_unit is None and (why := doubted_dbm(optional(rows, name))):
             raise ImportTableError(
-                f'{where[name]}: its powers are {why}; say units.power in the map: "-dBm" where they lack their sign'
+                f"{path}: column {column_map.header(name)!r}: its powers are {why}; say units.power in the map: "
+                '"-dBm" where they lack their sign'
             )
     ranges, true = optional(rows, "range_m"), truth_m(rows)
     if column_map.distance_unit is None and (why := doubted_metres(ranges)):
-        raise ImportTableError(f"{where['range_m']}: its ranges are {why}; say units.distance in the map")
-    if reading is None:
-        errors: dict[str, Errors] = {
-            "ranges": lambda f: ranges - true / f,
-            "true distances": lambda f: ranges - f * true,
-        }
-    else:
-        raw = raw_range(exchanges_of(rows, reading, 0))
-        errors = {"ranges": lambda f: raw - f * ranges, "true distances": lambda f: raw - f * true}
-    found = other_unit(errors)
-    if found:
-        beside = "its stamps" if reading else "the others"
         raise ImportTableError(
-            f"{tables.paths[0]}: {found[0]} are in {found[1]} by {beside}, and in {column_map.distance_unit or 'm'} by "
-            "the map; units.distance says one unit for all ranges, true distances and positions"
+            f"{path}: column {column_map.header('range_m')!r}: its ranges are {why}; say units.distance in the map"
+        )
+    if raw_m is None:
+        found = other_unit({"ranges": lambda f: ranges - true / f, "true distances": lambda f: ranges - f * true})
+    else:
+        found = other_unit({"ranges": lambda f: raw_m - f * ranges, "true distances": lambda f: raw_m - f * true})
+    if found:
+        beside = "the others" if raw_m is None else "its stamps"
+        raise ImportTableError(
+            f"{path}: {found[0]} are in {found[1]} by {beside}, and in {column_map.distance_unit or 'm'} by the map; "
+            "units.distance says one unit for all ranges, true distances and positions"
         )

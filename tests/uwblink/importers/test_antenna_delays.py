@@ -6,7 +6,7 @@ import pytest
 from tests import processes
 from tests.uwblink.importers.test_table_forms import AIR, HEADER, TICKS, flights, mapped, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers.exchange_tables import read_table
+from uwblink.importers import read_table
 from uwblink.recording.contents import load
 
 PROGRAMMED = 16_436

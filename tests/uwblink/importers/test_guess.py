@@ -6,8 +6,8 @@ import pytest
 from tests import processes
 from tests.shared_data import shared
 from tests.uwblink.importers.test_table_forms import HEADER, as_messages, flights, same, wrapped, write
+from uwblink.importers import read_table
 from uwblink.importers.column_map import load_map
-from uwblink.importers.exchange_tables import read_table
 from uwblink.importers.guess import guess_map
 from uwblink.recording.contents import load
 from uwblink.ticks import TICKS_PER_SECOND

@@ -1,15 +1,11 @@
 """Tables in which an exchange has several rows: a few rows at a time they come to what they come to at once."""
 
-import errno
-import io
 import tracemalloc
 from contextlib import nullcontext
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.uwblink.importers.test_long_tables import told
 from tests.uwblink.importers.test_planted_delays import messages_of
@@ -24,100 +20,11 @@ from tests.uwblink.importers.test_table_forms import (
     write,
 )
 from uwblink.errors import ImportTableError
-from uwblink.importers import exchange_bags, import_file, row_files, split_rows, staged_tables, table_rows
-from uwblink.importers.column_map import ColumnMap
-from uwblink.importers.exchange_tables import read_table
-from uwblink.importers.long_tables import exchanges_of_long
-from uwblink.importers.staging import Stage
-from uwblink.importers.stamps import NEVER
-from uwblink.importers.table_rows import HeldRows, Rows
-from uwblink.importers.unusable import Unusable
-
-SECOND = 1_000_000_000
+from uwblink.importers import bags, import_file, read_table, staging
 
 
 def at_once(patch, rows):
-    for room in (table_rows, staged_tables, split_rows, row_files):
-        patch.setattr(room, "ROWS_AT_ONCE", rows)
-    # Or the few rows of a test were all in one part.
-    patch.setattr(split_rows, "DRAWN", 2)
-
-
-class Tables:
-    """Rows in memory where tables are expected."""
-
-    def __init__(self, rows, size):
-        self.rows, self.size, self.stage = rows, size, self
-
-    def __len__(self):
-        return len(self.rows)
-
-    def has(self, name):
-        return table_rows.has(self.rows, name)
-
-    def blocks(self, names=None):
-        for start in range(0, len(self), self.size):
-            yield table_rows.take(self.rows, np.arange(start, min(start + self.size, len(self))))
-
-    def at(self, places, names):
-        return HeldRows(self.rows).at(places, names)
-
-    file = io.BytesIO
-
-
-@st.composite
-def long_rows(draw):
-    """Rows of a few devices, in any order, some of them repeated or with nothing in a cell, close to each other."""
-    layout = draw(st.sampled_from(["messages", "stamps", "parts"]))
-    count = draw(st.integers(1, 60))
-    chance = np.random.default_rng(draw(st.integers(0, 2**32)))
-    few, low, high = draw(st.integers(1, 8)), draw(st.integers(0, 1)), draw(st.integers(2, 4))
-    have = {name: draw(st.booleans()) for name in ("sequence", "message", "time", "gt_range_m", "fpp")}
-    cells = {
-        "sequence": chance.integers(few, size=count),
-        "message": chance.integers(low, high + 1, size=count),
-    }
-    cells |= {"gt_range_m": chance.random(count), "fpp": chance.random(count)}
-    named = {"messages": ("tx", "rx"), "stamps": ("stamp",), "parts": ("tx1", "rx1", "tx2", "rx2")}[layout]
-    cells = {name: column for name, column in cells.items() if have[name] or (layout, name) == ("stamps", "message")}
-    cells |= {name: chance.integers(2**32, size=count) for name in named}
-    if layout == "stamps":
-        cells["event"] = chance.integers(1, 3, size=count)
-    empty = draw(st.sampled_from([0.0, 0.0, 0.1, 0.5]))
-    cells = {n: np.where(chance.random(count) < empty, np.nan, column.astype(float)) for n, column in cells.items()}
-    ids = [np.where(chance.random(count) < 0.05, NEVER, chance.integers(3, size=count)) for _ in range(2)]
-    return layout, Rows(
-        column_map=ColumnMap(within_s=draw(st.sampled_from([0.5, 2.0, 100.0]))),
-        cells=cells,
-        ids=dict(zip(("from_id", "to_id"), ids, strict=True)),
-        time_ns=chance.integers(count, size=count) * SECOND if have["time"] else None,
-        origin=np.arange(count),
-    )
-
-
-def columns(source):
-    rows = table_rows.joined(list(source.blocks())) if len(source) else None
-    return rows and {**rows.cells, **rows.ids, "time": rows.time_ns, "origin": rows.origin}
-
-
-@settings(max_examples=120, derandomize=True, deadline=None)
-@given(long_rows(), st.integers(2, 12))
-def test_a_few_rows_at_a_time_make_the_same_exchanges(made, size):
-    layout, rows = made
-    with pytest.MonkeyPatch.context() as patch:
-        told = []
-        for count in (1000, size):
-            at_once(patch, count)
-            unusable = Unusable()
-            tables: Any = Tables(rows, count)
-            source, protocol = exchanges_of_long(tables, layout, unusable)
-            reasons = [(reason, places.tolist()) for reason, places in unusable.reasons()]
-            told.append((columns(source), protocol, reasons, len(source)))
-    (whole, *others), (few, *same) = told
-    assert same == others
-    assert (few is None) == (whole is None)
-    for name in whole or ():
-        np.testing.assert_array_equal(few[name], whole[name], err_msg=name)
+    patch.setattr(staging, "ROWS_AT_ONCE", rows)
 
 
 def lines_of(layout):
@@ -254,7 +161,7 @@ def test_memory_does_not_grow_with_a_bag(tmp_path, monkeypatch):
     peaks = []
     for count in (200, 2_500, 5_500):  # the first is for what is only made once; the others fill a sample of 2,000
         bag = Bag(tmp_path / "b.mcap", count)
-        monkeypatch.setattr(exchange_bags, "opened", lambda path, bag=bag: nullcontext(bag))
+        monkeypatch.setattr(bags, "opened", lambda path, bag=bag: nullcontext(bag))
         tracemalloc.start()
         done = import_file(bag.path, tmp_path / f"{count}.uwb")
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -262,15 +169,3 @@ def test_memory_does_not_grow_with_a_bag(tmp_path, monkeypatch):
         assert done.counts["exchanges"] == count
     # Exchanges that stayed would be 450 kB more.
     assert peaks[2] - peaks[1] < 100_000
-
-
-def test_a_disk_that_takes_no_more_is_told_of(monkeypatch):
-    class Full(io.BytesIO):
-        def write(self, _):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    rows = Rows(column_map=ColumnMap(), cells={}, ids={}, time_ns=None, origin=np.arange(0))
-    with Stage([]) as stage:
-        monkeypatch.setattr(stage, "file", Full)
-        with pytest.raises(ImportTableError, match=r"No space left on device\); TMPDIR names another folder"):
-            row_files.RowFile(stage, rows).append(rows)

@@ -10,8 +10,7 @@ import pytest
 import uwblink
 from tests.uwblink.importers.test_table_forms import flights, repeated, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import antenna_places, import_file, row_faults, staged_tables, table_rows
-from uwblink.importers.exchange_tables import read_table
+from uwblink.importers import exchange_tables, import_file, read_table, staging, usable_rows
 
 SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
 
@@ -34,10 +33,9 @@ def told(contents):
 
 
 def few_at_once(monkeypatch):
-    for room in (table_rows, staged_tables):
+    for room in (staging, exchange_tables):
         monkeypatch.setattr(room, "ROWS_AT_ONCE", 20)
-    monkeypatch.setattr(row_faults, "FAULTS_AT_ONCE", 5)
-    monkeypatch.setattr(antenna_places, "POSES_AT_ONCE", 4)
+    monkeypatch.setattr(usable_rows, "FAULTS_AT_ONCE", 5)
 
 
 @pytest.mark.parametrize("more", [{}, {"from_id": "a tag"}], ids=["numbers", "words"])
@@ -67,8 +65,7 @@ def test_a_table_that_is_half_useless_is_refused_alike_and_leaves_nothing(tmp_pa
 
 
 def test_memory_does_not_grow_with_the_table(tmp_path, monkeypatch):
-    for room in (table_rows, staged_tables):
-        monkeypatch.setattr(room, "ROWS_AT_ONCE", 1_000)
+    monkeypatch.setattr(staging, "ROWS_AT_ONCE", 1_000)
     peaks = []
     for times in (20, 150, 600):  # the first is for what is only made once
         table = write(tmp_path / f"{times}.csv", wrapped(repeated(flights(), times)))

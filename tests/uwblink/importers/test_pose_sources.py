@@ -6,8 +6,7 @@ import pytest
 from uwblink.errors import ImportTableError, PlanError
 from uwblink.exporters import export_recording
 from uwblink.importers.motion_capture import add_poses
-from uwblink.importers.pose_bags import body_of
-from uwblink.importers.poses import read_poses
+from uwblink.importers.poses import body_of, read_poses
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges

@@ -10,9 +10,8 @@ import pytest
 from tests import processes
 from uwblink.errors import ImportTableError
 from uwblink.importers.motion_capture import add_poses
-from uwblink.importers.pose_columns import poses_of_table
-from uwblink.importers.poses import _READERS, _as_poses, _at_once, read_poses
-from uwblink.importers.table import Table
+from uwblink.importers.poses import read_poses
+from uwblink.importers.tables import Table
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Tag
@@ -38,31 +37,33 @@ def test_csv_and_tum_say_the_same(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "head", "line"),
+    ("name", "head", "order"),
     [
-        ("a.csv", HEADER, "{s},b{k},{p},{q}"),
-        ("a.csv", "note,body,time_ns,qw,qz,qy,qx,z,y,x\n", 'a "b",é,{ns},{r},{p}'),
-        ("a.tum", "# time x y z qx qy qz qw\n", "{s} {p} {q}"),
-        ("a.csv", "#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, v_x\n", "{ns},{p},{r},7"),
+        ("a.csv", HEADER, "time_s,body,x,y,z,qx,qy,qz,qw"),
+        ("a.csv", "note,body,time_ns,qw,qz,qy,qx,z,y,x\n", "note,body,time_ns,qw,qz,qy,qx,z,y,x"),
+        ("a.tum", "# time x y z qx qy qz qw\n", "time_s x y z qx qy qz qw"),
+        ("a.csv", "#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, v_x\n", "time_ns,x,y,z,qw,qx,qy,qz,note"),
     ],
 )
-def test_the_quick_way_and_the_careful_one_read_the_same(tmp_path, name, head, line):
-    random = np.random.default_rng(2)
+def test_every_number_of_every_form_in_order_of_time(tmp_path, name, head, order):
+    random, mark = np.random.default_rng(2), " " if name.endswith("tum") else ","
     rows = []
     for k in random.permutation(50).tolist():
-        turned = random.normal(size=4)
-        numbers = [f"{v:.7g}" for v in [*random.normal(size=3), *turned / np.linalg.norm(turned)]]
-        mark = " " if name.endswith("tum") else ","
-        p, q, r = (mark.join(part) for part in (numbers[:3], numbers[3:], [numbers[6], *numbers[3:6]]))
-        time_ns = SHIFT_NS + k * 10_000_001
-        rows.append(line.format(s=f"{time_ns // 10**9}.{time_ns % 10**9:09d}", ns=time_ns, k=k % 3, p=p, q=q, r=r))
-    (tmp_path / name).write_text(head + "\n".join(rows) + "\n")
-    body = None if "{k}" in line or "é" in line else "drone"
-    quick = _at_once(tmp_path / name, _READERS[name[2:]], body)
-    careful = _as_poses(tmp_path / name, _READERS[name[2:]](tmp_path / name, body))
-    assert quick is not None
-    for column in ("time_ns", "body", "position_m", "quaternion"):
-        np.testing.assert_array_equal(getattr(quick, column), getattr(careful, column))
+        turned, time_ns = random.normal(size=4), SHIFT_NS + k * 10_000_001
+        numbers = [*random.normal(size=3), *turned / np.linalg.norm(turned)]
+        row = {"note": 'a "b"', "body": "é", "time_ns": time_ns, "time_s": f"{time_ns // 10**9}.{time_ns % 10**9:09d}"}
+        rows.append(
+            row | {n: f"{v:.7g}" for n, v in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), numbers, strict=True)}
+        )
+    lines = [mark.join(str(row[n]) for n in order.split(mark)) for row in rows]
+    (tmp_path / name).write_text(head + "\n".join(lines) + "\n")
+    found = read_poses(tmp_path / name, None if "body" in order else "é")
+    rows.sort(key=lambda row: row["time_ns"])
+    times = [row["time_ns"] if "time_ns" in order else round(float(row["time_s"]) * 1e9) for row in rows]
+    assert (found.time_ns.tolist(), set(found.body)) == (times, {"é"})
+    assert found.position_m.tolist() == [[float(row[n]) for n in "xyz"] for row in rows]
+    expected = [[float(row[n]) for n in ("qx", "qy", "qz", "qw")] for row in rows]
+    np.testing.assert_allclose(found.quaternion, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +169,7 @@ def test_a_file_that_grows_while_it_is_read_gives_what_was_there(tmp_path, monke
     path = tmp_path / "motion.csv"
     lines = [f"{k * 10**9},drone,{k}.0,0.0,1.0,0.0,0.0,0.0,1.0\n" for k in range(300)]
     path.write_text("time_ns,body,x,y,z,qx,qy,qz,qw\n" + "".join(lines[:200]))
-    plain = Table.read
+    plain = Table.query
 
     def growing(table, *arguments):
         found = plain(table, *arguments)
@@ -176,8 +177,8 @@ def test_a_file_that_grows_while_it_is_read_gives_what_was_there(tmp_path, monke
             file.writelines(lines[200:])
         return found
 
-    monkeypatch.setattr(Table, "read", growing)
-    poses = poses_of_table(path, None)
+    monkeypatch.setattr(Table, "query", growing)
+    poses = read_poses(path)
     assert poses.time_ns.tolist() == [k * 10**9 for k in range(200)]
     assert poses.position_m[:, 0].tolist() == list(map(float, range(200)))
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests import processes
 from tests.uwblink.importers.test_table_forms import HEADER, flights, wrapped, write
-from uwblink.importers.exchange_tables import read_table, read_tables
+from uwblink.importers import read_table, read_tables
 from uwblink.recording.contents import load
 
 

@@ -10,8 +10,7 @@ import pytest
 
 from tests import processes
 from uwblink.errors import ArgumentError, ImportTableError
-from uwblink.importers import import_recording, read_source
-from uwblink.importers.exchange_tables import read_table, read_tables
+from uwblink.importers import import_recording, read_source, read_table, read_tables
 from uwblink.recording.contents import load
 
 TICKS = 128 * 499_200_000
@@ -420,14 +419,14 @@ def test_no_text_of_a_map_is_a_program(tmp_path, place, monkeypatch):
 
 
 def test_duckdb_may_open_the_named_file_only(tmp_path):
-    from uwblink.importers.table import Table
+    from uwblink.importers.tables import Table
 
     write(tmp_path / "t.csv", wrapped(flights()))
     (tmp_path / "secret.csv").write_text("a\n1\n")
     with Table(tmp_path / "t.csv") as table:
         for query in (f"SELECT * FROM read_csv('{tmp_path}/secret.csv')", f"COPY (SELECT 1) TO '{tmp_path}/x.csv'"):
             with pytest.raises(duckdb.Error):
-                table._db.execute(query)
+                table.db.execute(query)
     assert not (tmp_path / "x.csv").exists()
 
 

@@ -1,0 +1,193 @@
+"""Which rows of tables can be used: those that cannot are faults with file, line, column and what stood there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from uwblink.arrays import Ints
+from uwblink.errors import ImportTableError
+from uwblink.importers.column_map import IDS
+from uwblink.importers.staging import StagedRows, Staging
+from uwblink.importers.stamps import how_counted
+from uwblink.importers.tables import Columns
+from uwblink.recording.schema import Fault
+from uwblink.twr import LARGEST_ID
+
+FAULTS_AT_ONCE: Final = 100_000
+
+
+class Condition(NamedTuple):
+    """What is wrong with a row: the column (ours), what is expected there, and SQL that is true of such rows."""
+
+    column: str
+    expected: str
+    wrong: str
+
+
+ENDS: Final = (
+    *(Condition(name, f"a whole number from 0 to {LARGEST_ID}", f"{name} IS NULL") for name in IDS),
+    Condition("to_id", "another tag than from_id", "from_id = to_id"),
+)
+"""Of rows that name two devices."""
+
+_TIME: Final = Condition("time_s", "a time", "time_ns IS NULL")
+
+
+class Faults:
+    """Rows that cannot be used, by the first reason of each."""
+
+    def __init__(self, staging: Staging) -> None:
+        """See `reject`."""
+        self._staging = staging
+        self._reasons: list[Condition] = []
+        staging.db.execute("CREATE TABLE faulty (origin BIGINT, reason INTEGER)")
+
+    def reject(self, rows: StagedRows, conditions: Sequence[Condition], among: str = "true") -> str:
+        """Note the rows among some that fulfil one of the conditions; returns SQL that is true of the others."""
+        first = len(self._reasons)
+        self._reasons += conditions
+        cases = " ".join(f"WHEN {one.wrong} THEN {first + k}" for k, one in enumerate(conditions))
+        query = f"SELECT origin, CASE {cases} END AS reason FROM {rows.name} WHERE {among}"
+        rows.db.execute(f"INSERT INTO faulty SELECT * FROM ({query}) WHERE reason IS NOT NULL")
+        return f"{among} AND CASE {cases} END IS NULL"
+
+    def __len__(self) -> int:
+        """Return how many rows cannot be used, beside those with too many cells."""
+        return int(self._staging.db.execute("SELECT count(*) FROM faulty").fetchall()[0][0])
+
+    def too_long(self) -> int:
+        """Return how many rows have more cells than the header."""
+        return sum(len(table.rejected()) for table in self._staging.tables)
+
+    def check(self, total: int) -> None:
+        """Raise for the first row that cannot be used where those are half of all or more."""
+        if len(self) and 2 * len(self) >= total:
+            order = "ORDER BY origin, reason LIMIT 1"
+            ((origin, reason),) = self._staging.db.execute(f"SELECT origin, reason FROM faulty {order}").fetchall()
+            path = self._staging.paths[int(self._files(np.array([origin]))[0])]
+            (fault,) = self._described(np.array([origin]), np.array([reason]), np.array([0]))
+            raise ImportTableError(f"{path}: {fault.detail}")
+
+    def __iter__(self) -> Iterator[list[Fault]]:
+        """Yield the faults, some at a time, in the order of their rows; those with too many cells last."""
+        db, timed = self._staging.db, self._staging.rows.has("time_s")
+        time = "coalesce(time_ns, 0)" if timed else "0"
+        joined = f"SELECT f.*, {time} AS time_ns FROM faulty f JOIN rows USING (origin) ORDER BY origin, reason"
+        db.execute(f"CREATE OR REPLACE TABLE faults AS {joined}")
+        for start in range(0, len(self), FAULTS_AT_ONCE):
+            place = f"rowid >= {start} AND rowid < {start + FAULTS_AT_ONCE}"
+            found = db.execute(f"SELECT * FROM faults WHERE {place}").fetchnumpy()
+            yield self._described(*(np.ma.getdata(found[name]) for name in ("origin", "reason", "time_ns")))
+        for table in self._staging.tables:
+            lines = table.rejected().tolist()
+            for start in range(0, len(lines), FAULTS_AT_ONCE):
+                details = [f"row {n}: more cells than the header has" for n in lines[start : start + FAULTS_AT_ONCE]]
+                yield [Fault(0, table.path.name, "unusable row", detail) for detail in details]
+
+    def _files(self, origin: Ints) -> Ints:
+        return np.searchsorted(self._staging.offsets, origin, side="right") - 1
+
+    def _described(self, origin: Ints, reason: Ints, time_ns: Ints) -> list[Fault]:
+        """Return rows, in ascending order, as faults: (n,) each."""
+        column_map, found = self._staging.column_map, []
+        files = self._files(origin)
+        for k in np.unique(files).tolist():
+            table, mine = self._staging.tables[k], files == k
+            rows = origin[mine] - self._staging.offsets[k]
+            reasons = [self._reasons[number] for number in reason[mine].tolist()]
+            headers = {one.column: column_map.header(one.column) for one in reasons}
+            there = [name for name, header in headers.items() if header in table.names]
+            words = table.words_at([headers[name] for name in there], rows)
+            for row, line, when, why in zip(
+                rows.tolist(), table.lines(rows).tolist(), time_ns[mine].tolist(), reasons, strict=True
+            ):
+                place = f"column {headers[why.column][:60]!r}"
+                if why.column in column_map.constants:
+                    place = f"constant {why.column!r}: found {str(column_map.constants[why.column])[:40]!r}"
+                elif why.column in there and row in words:
+                    place += f": found {words[row][headers[why.column]][:40]!r}"
+                found.append(
+                    Fault(when, table.path.name, "unusable row", f"row {line}, {place}, expected {why.expected}")
+                )
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class UsableRows:
+    """The rows of which a condition in SQL is true: `count` of them."""
+
+    rows: StagedRows
+    condition: str
+    count: int
+
+    def blocks(self) -> Iterator[Columns]:
+        """Yield the rows in their order, some at a time, without those that have no rows."""
+        return filter(_some, self.rows.blocks(self.condition))
+
+    def sample(self, size: int) -> Columns:
+        """Return some of the rows, drawn by chance, in their order."""
+        chosen = f"SELECT row FROM {self.rows.name} WHERE {self.condition} ORDER BY hash(row) LIMIT {size}"
+        return self.rows.read(f"WHERE row IN ({chosen}) ORDER BY row")
+
+    def tags(self) -> list[int]:
+        """Return the ids of all devices, in ascending order."""
+        ends = (f"SELECT {name} AS id FROM {self.rows.name} WHERE {self.condition}" for name in IDS)
+        return [int(tag) for (tag,) in self.rows.db.execute(f"{' UNION '.join(ends)} ORDER BY id").fetchall()]
+
+
+def _some(columns: Columns) -> bool:
+    return bool(len(columns["origin"]))
+
+
+def usable_ranges(rows: StagedRows, faults: Faults, among: str) -> UsableRows:
+    """Return the rows among some that hold a plain range."""
+    timed = [_TIME] if rows.has("time_s") else []
+    return _usable(
+        rows, faults.reject(rows, [*timed, Condition("range_m", "a finite number", "range_m IS NULL")], among)
+    )
+
+
+def usable_exchanges(
+    staging: Staging, rows: StagedRows, faults: Faults, among: str, stamps: Iterable[str]
+) -> tuple[UsableRows, int, int, str]:
+    """Return the rows among some that hold all stamps, each exchange once, and how many repeat one before.
+
+    The last two numbers are the bits of the counter, and how it is written.
+    """
+    scale, names = staging.column_map.ticks_per_unit, list(stamps)
+    ticks = {name: name if scale == 1.0 else f"{name} * {scale!r}" for name in names}
+
+    def count(low: float, high: float) -> int:
+        span = f">= CAST('{low!r}' AS DOUBLE)", f"< CAST('{high!r}' AS DOUBLE)"
+        parts = (f"count(*) FILTER ({value} {span[0]} AND {value} {span[1]})" for value in ticks.values())
+        return int(rows.db.execute(f"SELECT {' + '.join(parts)} FROM {rows.name}").fetchall()[0][0])
+
+    bits, counter = how_counted(count, staging.column_map.bits, staging.column_map.counter)
+    largest = (1 << bits) - 1
+    low = 0 if counter == "wrapped" else -(1 << (bits - 1))
+    expected = f"{'a whole number' if scale == 1.0 else 'a stamp in ticks'} from {low} to {largest}"
+    conditions = [_TIME] if rows.has("time_s") else []
+    for name, value in ticks.items():
+        wrong = [] if counter == "unwrapped" else [f"{value} < {low} OR {value} >= {low + largest + 1}"]
+        wrong += [f"{value} <> trunc({value})"] if scale == 1.0 else []
+        conditions.append(Condition(name, "a finite number", f"{name} IS NULL"))
+        conditions += [Condition(name, expected, " OR ".join(wrong))] if wrong else []
+    good = faults.reject(rows, conditions, among)
+    # Two of 10 million different exchanges have the same hash of 64 bits once in 400,000 tables.
+    code = f"hash({', '.join([*IDS, *names])})"
+    some = f"({good}) AND ({' OR '.join(f'{name} <> 0' for name in names)})"
+    twice = f"SELECT {code} AS code, min(row) AS first FROM {rows.name} WHERE {some} GROUP BY code HAVING count(*) > 1"
+    later = f"SELECT row FROM {rows.name} JOIN ({twice}) ON {code} = code WHERE {some} AND row > first"
+    rows.db.execute(f"CREATE TABLE repeats AS {later}")
+    repeats = int(rows.db.execute("SELECT count(*) FROM repeats").fetchall()[0][0])
+    if repeats:
+        good += " AND row NOT IN (SELECT row FROM repeats)"
+    return _usable(rows, good), repeats, bits, counter
+
+
+def _usable(rows: StagedRows, condition: str) -> UsableRows:
+    return UsableRows(rows, condition, rows.count(condition))
