@@ -24,9 +24,8 @@ from uwblink.importers.tables import Columns, Table
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
 from uwblink.recording.schema import CirRow, Fault, Poses, Tag
-from uwblink.text_files import read_text
+from uwblink.text_files import TomlReader, read_text
 from uwblink.ticks import REPORT_BITS, TICKS_PER_SECOND
-from uwblink.text_files import TomlReader
 from uwblink.twr import LARGEST_ID, STAMPS, Exchanges
 
 Vectors = dict[str, dict[int, tuple[float, float, float]]]
