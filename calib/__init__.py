@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from calib.estimation.new_tag import add_tag
     from calib.estimation.result import FitResult
     from calib.evaluation.localization import localize
-    from calib.evaluation.onboard import localize_onboard
-    from calib.evaluation.onboard_track import OnboardSettings
+    from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
     from calib.planning.arranging import plan
     from calib.planning.flight_result import FlightPlan
@@ -89,7 +88,7 @@ _HOMES: Final = {
     "FlightPlan": "calib.planning.flight_result",
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",
-    "OnboardSettings": "calib.evaluation.onboard_track",
+    "OnboardSettings": "calib.evaluation.onboard",
     "Plan": "calib.planning.result",
     "Ranges": "calib.data.ranges",
     "SurveyResult": "calib.surveys.result",

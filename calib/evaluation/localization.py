@@ -1,33 +1,58 @@
-"""What a calibration is worth to a robot: an EKF that tracks one body from its ranges to the others.
+"""What a calibration is worth to a robot: each body is tracked from its ranges to the others, with and without it.
 
-State is the body's position; its velocity and attitude are inputs taken from motion capture, velocity with noise; the
-other bodies are known (ICRA 2023, section V). Four filters see the same ranges and the same noise of velocity: raw and
-calibrated with fixed variances, calibrated with the variance of the sigma curve, and calibrated with all that a
-calibration says of errors, reflections included. `calib.evaluation.onboard` does without motion capture.
+Four filters see the same ranges and the same noise of velocity: raw and calibrated with fixed variances, calibrated
+with the variance of the sigma curve, and calibrated with all that a calibration says of errors, reflections included
+(`calib.evaluation.tracking`). `calib.evaluation.onboard` does without motion capture.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.stats import chi2
 
 from calib.calibration.model import Calibration, require_calibration
 from calib.data.sources import Data, Flight, load_flight, require_times
 from calib.errors import UnanswerableError
-from calib.evaluation.tracking import FixedStd, Localization, Settings
-from calib.evaluation.tracking_filters import filter_ranges, run_filters
-from calib.evaluation.tracking_problem import Noise, problems
-from calib.evaluation.tracking_runs import FilterRanges, Run
+from calib.evaluation.range_updates import range_errors
+from calib.evaluation.tracking import FILTERS, FilterRanges, Run, Settings, Track, problems, run_filters
+from uwblink.arrays import Floats
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
 """Mean over six scenarios (ICRA 2023, its only table): flights of its own, another filter's noise."""
 
 TUNED_OVER: Final = (0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.6, 1.0)
-"""Fixed standard deviations that are tried, in metres."""
+"""Fixed standard deviations that are tried on a training flight, in metres: two in each octave, about."""
 
-TUNED_RANGES: Final = 2500
-"""Ranges of each body of a training flight by which they are judged."""
+
+@dataclass(frozen=True, slots=True)
+class FixedStd:
+    """The fixed standard deviations of ranges, by filter, and where they come from, in words."""
+
+    std_m: dict[str, float]
+    source: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Localization:
+    """One body of one recording: a track for each of `FILTERS`, and the RMSE of each over seeds (seeds,) in metres.
+
+    `simulated` says whether the flight was; `fixed` are the fixed variances of the filters that have one.
+    """
+
+    source: str
+    body: str
+    tracks: dict[str, Track]
+    rmse_m: dict[str, Floats]
+    fixed: FixedStd
+    simulated: bool
+
+    def __repr__(self) -> str:
+        """Return how far off each filter is, over seeds, on one line."""
+        found = ", ".join(f"{name} {np.mean(rmse):.3f} m" for name, rmse in self.rmse_m.items())
+        return f"{self.body} of {self.source}: rms error {found}"
 
 
 def localize(
@@ -57,12 +82,7 @@ def localize(
     flight = data if isinstance(data, Flight) else load_flight(data, need_power=calibration.needs_power)
     fixed = fixed_std(calibration, chosen, training)
     require_times(flight.ranges)
-    applied = calibration.apply(flight.ranges)
-    runs = []
-    for problem in problems(flight):
-        noises = [Noise.drawn(problem, chosen, chosen.seed + k) for k in range(chosen.seeds)]
-        ranges = filter_ranges(flight.ranges[problem.rows], applied, problem.rows, calibration, fixed.std_m)
-        runs.append(Run(problem, ranges, noises))
+    runs = filter_runs(flight, calibration, fixed)
     if not runs:
         raise UnanswerableError(
             f"{flight.ranges.source}: no body moves among poses and ranges, so there is nothing to localize"
@@ -80,42 +100,130 @@ def localize(
     ]
 
 
+def filter_runs(flight: Flight, calibration: Calibration, fixed: FixedStd) -> list[Run]:
+    """Return what each of `FILTERS` measures of each body; the robust one only where it is known what errors are made
+    of."""
+    applied, runs = calibration.apply(flight.ranges), []
+    for problem in problems(flight):
+        rows = problem.rows
+        raw, corrected, sigma = applied.raw_m[rows], applied.corrected_m[rows], applied.sigma_m[rows]
+        ranges = {
+            "raw": FilterRanges(raw, np.full(len(rows), fixed.std_m["raw"])),
+            "calibrated": FilterRanges(corrected, np.full(len(rows), fixed.std_m["calibrated"])),
+            "variance": FilterRanges(corrected, sigma),
+        }
+        if calibration.errors is not None:
+            noise, errors = range_errors(calibration, flight.ranges[rows])
+            ranges["robust"] = FilterRanges(corrected - calibration.errors.location_m, noise, errors)
+        runs.append(Run(problem, ranges))
+    return runs
+
+
 def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
     """Return the fixed standard deviations of raw and calibrated ranges, by what is known before the flight.
 
-    The one that is given; else the best ones on a training flight; else those of the errors that the calibration was
-    fitted to, or its sigma at the middle of its powers, where it is too old to remember them.
+    The one that is given; else those with which filters err least on a training flight (the first 2500 ranges of each
+    body); else those of the errors that the calibration was fitted to, or its sigma at the middle of its powers, where
+    it is too old to remember them.
     """
     if settings.fixed_std_m is not None:
         return FixedStd(dict.fromkeys(("raw", "calibrated"), settings.fixed_std_m), "given")
-    if training is not None:
-        return _tuned(training if isinstance(training, Flight) else load_flight(training), calibration, settings)
     known = calibration.provenance.get("error_std_m")
-    if isinstance(known, dict) and {"raw", "corrected"} <= set(known):
-        return FixedStd(
-            {"raw": float(known["raw"]), "calibrated": float(known["corrected"])}, "of the errors that were fitted"
-        )
-    middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
-    return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
-
-
-def _tuned(flight: Flight, calibration: Calibration, settings: Settings) -> FixedStd:
-    """Return the standard deviations with which the filters err least on a flight."""
-    applied = calibration.apply(flight.ranges)
-    runs = []
-    for whole in problems(flight):
-        problem = whole.first(TUNED_RANGES)
-        noises = [Noise.drawn(problem, settings, settings.seed + k) for k in range(settings.seeds)]
+    if training is None and isinstance(known, dict) and {"raw", "corrected"} <= set(known):
+        std = {"raw": float(known["raw"]), "calibrated": float(known["corrected"])}
+        return FixedStd(std, "of the errors that were fitted")
+    if training is None:
+        middle = float(calibration.sigma_curve(np.array([np.mean(calibration.sigma_curve.range)]))[0])
+        return FixedStd(dict.fromkeys(("raw", "calibrated"), middle), "the sigma curve's middle")
+    flight = training if isinstance(training, Flight) else load_flight(training)
+    applied, runs = calibration.apply(flight.ranges), []
+    for problem in (whole.first(2500) for whole in problems(flight)):
         measured = {"raw": applied.raw_m[problem.rows], "calibrated": applied.corrected_m[problem.rows]}
-        ranges = {
-            f"{name}, {std}": FilterRanges(own, np.full(len(own), std))
-            for name, own in measured.items()
-            for std in TUNED_OVER
-        }
-        runs.append(Run(problem, ranges, noises))
+        each = [(name, own, std) for name, own in measured.items() for std in TUNED_OVER]
+        runs.append(
+            Run(problem, {f"{name}, {std}": FilterRanges(own, np.full(len(own), std)) for name, own, std in each})
+        )
     squares = np.zeros((2, len(TUNED_OVER)))
     for tracks in run_filters(runs, settings):
         errors = [[track.rmse_m for track in own] for own in tracks.values()]
         squares += np.sum(np.array(errors) ** 2, axis=1).reshape(squares.shape)
-    best = [TUNED_OVER[k] for k in np.argmin(squares, axis=1)]
-    return FixedStd({"raw": best[0], "calibrated": best[1]}, f"tuned on {flight.ranges.source}")
+    raw, calibrated = (TUNED_OVER[k] for k in np.argmin(squares, axis=1))
+    return FixedStd({"raw": raw, "calibrated": calibrated}, f"tuned on {flight.ranges.source}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """Over all bodies of all recordings: mean RMSE by filter, its reduction, mean NIS and NEES of the variance filter.
+
+    `rmse_m` are means over seeds, too, `spread_m` standard deviations over seeds of the mean over bodies (NaN of one
+    seed). `nis` is over accepted ranges, of which a gate at 99.9 % leaves 0.99; `nees` should be 3, a state's size.
+    `nis_bounds` and `nees_bounds` hold 95 % of such means if the filter is consistent: chi-square over the number of
+    independent values (Bar-Shalom, Li and Kirubarajan 2001, section 5.4), where a NEES counts once in the time that the
+    error takes to forget. `nis_inside` and `nees_inside` are the shares of single values within their 95 % bounds.
+    """
+
+    rmse_m: dict[str, float]
+    spread_m: dict[str, float]
+    reduction: dict[str, float]
+    nis: float
+    nis_bounds: tuple[float, float]
+    nis_inside: float
+    nees: float
+    nees_bounds: tuple[float, float]
+    nees_inside: float
+    accepted: float
+
+
+def summarize(found: list[Localization]) -> Summary:
+    """Average over bodies and recordings, each counting the same, as in the paper.
+
+    Raises `UnanswerableError` where the filter took no range at all.
+    """
+    filters = [name for name in FILTERS if all(name in one.tracks for one in found)]
+    means = {name: np.mean([one.rmse_m[name] for one in found], axis=0) for name in filters}
+    rmse = {name: float(np.mean(over)) for name, over in means.items()}
+    last = [one.tracks["variance"] for one in found]
+    nis = np.concatenate([track.nis[track.accepted] for track in last])
+    nees = np.concatenate([track.nees for track in last])
+    if not len(nis):
+        names = ", ".join(f"{one.source}: {one.body}" for one in found)
+        raise UnanswerableError(f"{names}: no range agrees with the track within its gate; look at `calib doctor`")
+    return Summary(
+        rmse_m=rmse,
+        spread_m={name: float(np.std(over, ddof=1)) if len(over) > 1 else np.nan for name, over in means.items()},
+        reduction={name: 1 - rmse[name] / rmse["raw"] for name in filters[1:]},
+        nis=float(np.mean(nis)),
+        nis_bounds=_mean_bounds(len(nis), 1),
+        nis_inside=_inside(nis, 1),
+        nees=float(np.mean(nees)),
+        nees_bounds=_mean_bounds(sum(_independent(track.nees) for track in last), 3),
+        nees_inside=_inside(nees, 3),
+        accepted=float(np.mean([np.mean(track.accepted) for track in last])),
+    )
+
+
+def _mean_bounds(count: float, degrees: int) -> tuple[float, float]:
+    """Return bounds that hold the mean of `count` independent chi-squares with 95 %."""
+    some = max(count, 1.0)
+    low, high = (float(chi2.ppf(share, some * degrees)) / some for share in (0.025, 0.975))
+    return low, high
+
+
+def _inside(values: Floats, degrees: int) -> float:
+    low, high = (float(chi2.ppf(share, degrees)) for share in (0.025, 0.975))
+    return float(np.mean((values >= low) & (values <= high)))
+
+
+def _independent(values: Floats) -> float:
+    """Return how many independent values a correlated series is worth: n over the sum of its autocorrelations.
+
+    The sum ends where the autocorrelation first falls below a twentieth.
+    """
+    centred = values - values.mean()
+    size = 1 << int(2 * len(centred) - 1).bit_length()
+    power = np.abs(np.fft.rfft(centred, size)) ** 2
+    correlation = np.fft.irfft(power, size)[: len(centred)]
+    correlation = correlation / max(float(correlation[0]), 1e-300)
+    small = np.flatnonzero(correlation < 0.05)
+    end = int(small[0]) if len(small) else len(centred)
+    return len(centred) / (1 + 2 * float(correlation[1:end].sum()))

@@ -1,45 +1,116 @@
 """Localization without a motion-capture studio: ranges to fixed anchors, an IMU or none, a height sensor or none.
 
-The start comes from the first ranges (`multilateration`), tilt from gravity, heading from several that are tried at
+The start comes from the first ranges (`multilaterate`), tilt from gravity, heading from several that are tried at
 once; the likeliest so far is told. Where half of the latest ranges cannot be explained, the filter begins anew from
 them. Poses of the body, where there are any, are truth to judge by and nothing else.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from calib.calibration.model import Calibration, require_calibration
-from calib.data.sources import Data
-from calib.errors import UnanswerableError
-from calib.evaluation.onboard_data import Readings, readings
-from calib.evaluation.onboard_events import SPAN_S, events, still_spans
-from calib.evaluation.onboard_filter import InertialFilter, P
-from calib.evaluation.onboard_start import (
-    FEWEST_ANCHORS,
-    FEWEST_RANGES,
-    first_attitudes,
-    first_fix,
-    latest_fix,
-    mean_force,
-)
-from calib.evaluation.onboard_track import OnboardSettings, OnboardTrack
-from calib.evaluation.tracking_problem import nearest_attitude
-from uwblink.arrays import Floats
+from calib.data.ranges import MAX_RANGE_M, Ranges, require_some
+from calib.data.sources import Data, opened, require_times
+from calib.errors import BadInputError, UnanswerableError
+from calib.evaluation.inertial_filter import GRAVITY, InertialFilter, Noise, P
+from calib.evaluation.range_updates import Fix, RangeErrors, multilaterate, range_errors
+from calib.evaluation.tracking import nearest_attitude
+from uwblink.arrays import Floats, Ints
 from uwblink.recording.distances import bodies_m
+from uwblink.recording.schema import Poses
+from uwblink.recording.target_reports import single_reports
 
-LOST_SIGMAS: Final = 3.0
-"""Where half of the latest ranges are off by more standard deviations, a filter is not where it thinks to be."""
+MODELS: Final = ("imu", "constant-velocity")
 
-MOVING_M_S2: Final = 0.7
-"""How a body may accelerate while it begins."""
+MIN_ANCHORS: Final = 3
+"""Fewer leave a position open; a start takes one more, for three leave its mirror image."""
 
-REST_EVERY: Final = 5
-SLOW_S: Final = 1.0
-"""How often it counts that a body is no faster than it may be; velocities of a second ago say nothing of now."""
+MIN_RANGES_PER_FIX: Final = 6
+SPAN_S: Final = 0.5
+"""Span of time in which a body is found at rest, and in which gravity is averaged for the first tilt."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnboardSettings:
+    """How a body is localized: `model` is one of `MODELS`, `height` whether its height sensor is used.
+
+    `start_m` is where it begins, with a standard deviation of `start_std_m` an axis, instead of where its first ranges
+    say; a wrong one is left after `reopen_s`, or as many ranges as a fix takes. `headings` are tried at once;
+    inertial readings are averaged to `rate_hz`. `speed_m_s` is how fast it may move at a start.
+
+    >>> import calib
+    >>> calib.OnboardSettings(start_m=(0.0, 0.0, 1.0)).model
+    'imu'
+    """
+
+    model: str = "imu"
+    height: bool = True
+    start_m: tuple[float, float, float] | None = None
+    start_std_m: float = 0.3
+    reopen_s: float = 0.5
+    headings: int = 8
+    rate_hz: float = 50.0
+    speed_m_s: float = 1.0
+    noise: Noise = field(default_factory=Noise)
+
+    def __post_init__(self) -> None:
+        """Refuse what no filter can run with; raises `BadInputError`."""
+        if self.model not in MODELS:
+            raise BadInputError(
+                f"found {self.model!r:.40}, allowed: {', '.join(MODELS)}, or poses with motion capture",
+                parameter="model",
+            )
+        for name in ("start_std_m", "reopen_s", "rate_hz", "speed_m_s"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise BadInputError(f"found {getattr(self, name)!r:.40}, expected a number above 0", parameter=name)
+        if self.start_m is not None and not (len(self.start_m) == 3 and np.isfinite(self.start_m).all()):
+            raise BadInputError(f"found {self.start_m!r:.60}, expected three numbers", parameter="start_m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnboardTrack:
+    """Where a body was (n, 3), with attitudes x y z w (n, 4), from the first fix on, and what to think of it.
+
+    `std_m` (n,) is the root of the sum of the filter's three variances. `truth_m` (n, 3), `true_attitude` (n, 4) and
+    `nees` (n,) are NaN where poses do not say. `nis` (ranges,) are squared innovations over their variance at
+    `range_time_ns`, `believed` those that were; `restarts_s` when the filter began anew, in seconds since the first
+    exchange.
+    """
+
+    source: str
+    body: str
+    model: str
+    used: str
+    time_ns: Ints
+    estimate_m: Floats
+    attitude: Floats
+    std_m: Floats
+    truth_m: Floats
+    true_attitude: Floats
+    nees: Floats
+    range_time_ns: Ints
+    nis: Floats
+    believed: Floats
+    restarts_s: tuple[float, ...]
+
+    @property
+    def rmse_m(self) -> float:
+        """Root of the mean squared distance from the truth, NaN where nothing is known of it."""
+        known = np.isfinite(self.truth_m).all(axis=1)
+        wrong = self.estimate_m[known] - self.truth_m[known]
+        return float(np.sqrt(np.mean(np.sum(wrong**2, axis=1)))) if known.any() else float("nan")
+
+    def __repr__(self) -> str:
+        """Return what it rests on and how far off it is, on one line."""
+        off = f"rms error {self.rmse_m:.3f} m" if self.rmse_m == self.rmse_m else "no truth to judge by"
+        return f"{self.body} of {self.source} by {self.used}: {off}"
 
 
 def localize_onboard(
@@ -60,102 +131,287 @@ def localize_onboard(
     """
     require_calibration(calibration)
     chosen = settings or OnboardSettings()
-    return [_track(one, chosen) for one in readings(data, calibration)]
+    return [_track(one, chosen) for one in _readings(data, calibration)]
 
 
-@dataclass(slots=True, kw_only=True)
-class _Log:
-    """What is kept of the likeliest heading, step by step."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Readings:
+    """One body's: ranges (n,) in order of time with lever arms and anchors (n, 3), inertial readings, heights.
 
-    time_s: list[float] = field(default_factory=list)
-    place: list[Floats] = field(default_factory=list)
-    attitude: list[Floats] = field(default_factory=list)
-    covariance: list[Floats] = field(default_factory=list)
-    heard_s: list[float] = field(default_factory=list)
-    nis: list[float] = field(default_factory=list)
-    believed: list[bool] = field(default_factory=list)
-    restarts_s: list[float] = field(default_factory=list)
+    Times are seconds since `began_ns`, the first exchange. `imu` are angular velocities in rad/s and specific forces in
+    m/s^2 (m, 6) in the axes of the body. `truth` are its poses, or None.
+    """
+
+    source: str
+    body: str
+    time_s: Floats
+    range_m: Floats
+    noise_m: Floats
+    errors: RangeErrors
+    arm_m: Floats
+    anchor_m: Floats
+    imu_s: Floats
+    imu: Floats
+    height_s: Floats
+    height_m: Floats
+    truth: Poses | None
+    began_ns: int
 
 
-def _track(one: Readings, settings: OnboardSettings) -> OnboardTrack:
-    inertial = settings.model == "imu"
+def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
+    """Return the readings of every body that is no anchor and ranges with one."""
+    with opened(data) as (name, source):
+        exchanges = single_reports(source.exchanges).exchanges
+        poses, tags = source.poses, list(source.tags)
+        imu, heights = (dict(getattr(source, table, None) or {}) for table in ("imu", "height"))
+    ranges = Ranges.from_exchanges(exchanges, source=name)
+    powered = np.isfinite(ranges.fpp1_dbm) | np.isfinite(ranges.fpp2_dbm) | (not calibration.needs_power)
+    possible = np.isfinite(ranges.raw_m) & (np.abs(ranges.raw_m) < MAX_RANGE_M)
+    excluded = {"no power": int(np.sum(~powered)), "impossible stamps": int(np.sum(powered & ~possible))}
+    require_some(name, len(ranges), excluded, "")
+    ranges = ranges[powered & possible]
+    anchors = {}
+    for body in sorted(set(poses.body.tolist())):
+        place = poses.position_m[poses.body == body]
+        if np.ptp(place, axis=0).max() <= 0.1:
+            anchors[body] = np.asarray(np.median(place, axis=0))
+    fixed = {tag.tag: anchors[tag.body] + tag.lever_arm_m for tag in tags if tag.body in anchors}
+    if len(fixed) < MIN_ANCHORS:
+        raise UnanswerableError(
+            f"{name}: {len(fixed)} tags stay in one place by its poses, at least {MIN_ANCHORS} are needed as "
+            "anchors; 'uwblink poses' adds them"
+        )
+    require_times(ranges)
+    began = int(ranges.time_ns.min())
+    found = []
+    for body in sorted({tag.body for tag in tags if tag.body not in anchors}):
+        arms = {tag.tag: np.array(tag.lever_arm_m) for tag in tags if tag.body == body}
+        own, theirs = list(arms), list(fixed)
+        first = np.isin(ranges.initiator, own) & np.isin(ranges.target, theirs)
+        second = np.isin(ranges.target, own) & np.isin(ranges.initiator, theirs)
+        some = ranges[np.flatnonzero(first | second)]
+        if not len(some):
+            continue
+        some = some[np.argsort(some.time_ns, kind="stable")]
+        initiates = np.isin(some.initiator, own)
+        mine, other = np.where(initiates, [some.initiator, some.target], [some.target, some.initiator])
+        corrected, noise, errors = _corrected(some, calibration)
+        imu_s, inertial = _table(imu, body, ("wx", "wy", "wz", "ax", "ay", "az"), began)
+        height_s, height = _table(heights, body, ("height_m",), began)
+        known = poses.body == body
+        found.append(
+            _Readings(
+                source=ranges.source,
+                body=body,
+                time_s=np.asarray((some.time_ns - began) * 1e-9, dtype=np.float64),
+                range_m=corrected,
+                noise_m=noise,
+                errors=errors,
+                arm_m=np.array([arms[tag] for tag in mine.tolist()]),
+                anchor_m=np.array([fixed[tag] for tag in other.tolist()]),
+                imu_s=imu_s,
+                imu=inertial,
+                height_s=height_s,
+                height_m=height.ravel(),
+                truth=poses[known] if known.any() else None,
+                began_ns=began,
+            )
+        )
+    if not found:
+        raise UnanswerableError(f"{name}: no moving body ranges with a fixed anchor, so there is nothing to localize")
+    return found
+
+
+def _corrected(ranges: Ranges, calibration: Calibration) -> tuple[Floats, Floats, RangeErrors]:
+    """Return corrected ranges (n,), the noise of direct ones (n,), and what their errors are made of besides."""
+    applied = calibration.apply(ranges)
+    if calibration.errors is None:
+        # What is reckoned with where a calibration does not say: a tenth reflected, by 30 cm on average.
+        unknown = RangeErrors(share=0.1, least_m=0.0, detour_m=0.3, outlier=0.01, outlier_m=3.0)
+        return applied.corrected_m, applied.sigma_m, unknown.times(len(ranges))
+    return (applied.corrected_m - calibration.errors.location_m, *range_errors(calibration, ranges))
+
+
+def _table(
+    table: Mapping[str, NDArray[Any]], body: str, names: tuple[str, ...], began_ns: int
+) -> tuple[Floats, Floats]:
+    """Return times in seconds and columns (n, names) of a body's rows, in order of time."""
+    if not table:
+        return np.zeros(0), np.zeros((0, len(names)))
+    rows = np.flatnonzero(table["body"] == body)
+    rows = rows[np.argsort(table["time_ns"][rows], kind="stable")]
+    columns = np.column_stack([np.asarray(table[name][rows], dtype=np.float64) for name in names])
+    return np.asarray((table["time_ns"][rows] - began_ns) * 1e-9), columns
+
+
+def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilter]:
+    """Return the range at which the filter begins, and the filter there."""
+    inertial, first = settings.model == "imu", 0
     if inertial and not len(one.imu_s):
         raise UnanswerableError(f"{one.source}: no inertial readings of {one.body}; choose the model constant-velocity")
-    first, found = first_fix(one, settings)
-    begin_s = float(one.time_s[first])
-    turned = first_attitudes(one, begin_s, settings) if inertial else np.eye(3)[None]
-    running = InertialFilter(found, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s)
+    if settings.start_m is not None:
+        fix = Fix(np.array(settings.start_m, dtype=np.float64), np.eye(3) * settings.start_std_m**2)
+    else:
+        counts = range(MIN_RANGES_PER_FIX, len(one.time_s) + 1)
+        enough = (k for k in counts if len(np.unique(one.anchor_m[:k], axis=0)) > MIN_ANCHORS)
+        first = next(enough, 0) - 1
+        if first < 0:
+            raise UnanswerableError(f"{one.source}: {one.body} ranges with too few anchors for a start; give it one")
+        fix = _fix(one, np.arange(first + 1), settings)
+    near = np.abs(one.imu_s - float(one.time_s[first])) < SPAN_S / 2
+    force = one.imu[near, 3:].mean(axis=0) if near.any() else np.array([0.0, 0.0, GRAVITY])
+    turned = _attitudes(force, settings.headings) if inertial else np.eye(3)[None]
+    found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s)
     if inertial:
-        running.pulled(mean_force(one, begin_s), MOVING_M_S2)
-    log = _Log()
-    _run(one, settings, running, first, log)
-    return _told(one, settings, log)
+        found.pulled(force, 0.7)  # m/s^2: how a body may accelerate while it begins
+    return first, found
 
 
-def _run(one: Readings, settings: OnboardSettings, running: InertialFilter, first: int, log: _Log) -> None:
-    """Play ranges, steps and heights in order of time."""
+def _fix(one: _Readings, rows: Ints, settings: OnboardSettings) -> Fix:
+    """Return where a body is at the last of some ranges (n,), which it may have moved between."""
+    span = float(one.time_s[rows[-1]] - one.time_s[rows[0]])
+    arm = float(np.linalg.norm(one.arm_m[rows], axis=1).max())
+    moves = 0.3 * settings.speed_m_s * span
+    near = np.abs(one.height_s - one.time_s[rows[-1]]) < 1.0 if settings.height else np.zeros(0, dtype=bool)
+    height = float(np.median(one.height_m[near])) if near.any() else None
+    found = multilaterate(one.range_m[rows], one.anchor_m[rows], float(np.hypot(arm / 2, moves)), height)
+    return Fix(found.place_m, found.covariance_m2 + np.eye(3) * moves**2)
+
+
+def _attitudes(force: Floats, headings: int) -> Floats:
+    """Return attitudes (headings, 3, 3) with the tilt that gravity says, and headings all around."""
+    up = force / np.linalg.norm(force)
+    # The world's vertical in the axes of the body, and two axes across it.
+    east = np.cross((0.0, 1.0, 0.0), up)
+    east = east / np.linalg.norm(east)
+    tilt = np.vstack([east, np.cross(up, east), up])
+    angles = 2 * np.pi * np.arange(headings) / headings
+    turns = [[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in zip(np.cos(angles), np.sin(angles), strict=True)]
+    return np.array([np.array(turn) @ tilt for turn in turns])
+
+
+def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterator[tuple[float, str, int, Floats]]:
+    """Yield times at which something happens, what, its number, and mean inertial readings since the one before."""
+    end_s = float(one.time_s[-1])
+    grid = np.arange(begin_s + 1 / settings.rate_hz, end_s, 1 / settings.rate_hz)
+    ranges = np.flatnonzero(one.time_s >= begin_s)
+    happens = [("step", grid, np.arange(len(grid))), ("range", one.time_s[ranges], ranges)]
+    if settings.height and len(one.height_s):
+        # Ten a second are enough: its offset wanders slowly.
+        every = np.unique(np.floor(one.height_s * 10), return_index=True)[1]
+        rows = every[(one.height_s[every] >= begin_s) & (one.height_s[every] <= end_s)]
+        happens.append(("height", one.height_s[rows], rows))
+    kinds = np.repeat([kind for kind, _, _ in happens], [len(times) for _, times, _ in happens])
+    when, which = (np.concatenate([event[k] for event in happens]) for k in (1, 2))
+    order = np.argsort(when, kind="stable")
+    between = _means(one, np.concatenate([[begin_s], when[order]]))
+    for k, row in enumerate(order.tolist()):
+        yield float(when[row]), str(kinds[row]), int(which[row]), between[k]
+
+
+def _means(one: _Readings, edges: Floats) -> Floats:
+    """Return the means of inertial readings between edges (n + 1,), straight between two readings: (n, 6)."""
+    if not len(one.imu_s):
+        return np.zeros((len(edges) - 1, 6))
+    steps = np.diff(one.imu_s)[:, None] * (one.imu[1:] + one.imu[:-1]) / 2
+    gathered = np.vstack([np.zeros(6), np.cumsum(steps, axis=0)])
+    inside = np.clip(edges, one.imu_s[0], one.imu_s[-1])
+    at = np.column_stack([np.interp(inside, one.imu_s, column) for column in gathered.T])
+    span = np.diff(inside)[:, None]
+    now = np.column_stack([np.interp(inside[1:], one.imu_s, column) for column in one.imu.T])
+    # A sum of straight pieces read straight between its own points is off by less than its last piece.
+    return np.asarray(np.where(span > 1e-9, np.diff(at, axis=0) / np.maximum(span, 1e-9), now))
+
+
+def _still_spans(one: _Readings) -> set[int]:
+    """Return the half seconds in which inertial readings say that nothing moves: no vibration, no turning.
+
+    A body at rest scatters less than 4 mrad/s and 5 cm/s^2: rotors vibrate twenty times as much.
+    """
+    span = np.floor(one.imu_s / SPAN_S).astype(np.int64)
+    edges = np.flatnonzero(np.diff(span, prepend=span[:1] - 1)) if len(span) else np.zeros(0, dtype=np.int64)
+    found = set()
+    for begin, end in zip(edges, np.append(edges[1:], len(span)), strict=True):
+        turns, pulls = one.imu[begin:end, :3], one.imu[begin:end, 3:]
+        calm = turns.std(axis=0).max() < 0.004 and pulls.std(axis=0).max() < 0.05
+        if end - begin > 1 and calm and np.abs(turns.mean(axis=0)).max() < 0.02:
+            found.add(int(span[begin]))
+    return found
+
+
+def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
+    """Play ranges, steps and heights in order of time, and return where the likeliest heading was."""
+    first, running = _begin(one, settings)
     now = float(one.time_s[first])
+    calm = _still_spans(one) if running.inertial else set()
+    states: list[tuple[float, Floats, Floats, Floats]] = []
+    heards: list[tuple[float, float, bool]] = []
+    restarts: list[float] = []
     window: list[tuple[int, float]] = []
-    slow_every = max(round(settings.rate_hz * SLOW_S), 1)
-    calm = still_spans(one) if running.inertial else set()
-    for time_s, kind, number, gyro, force in events(one, settings, now):
+    # How fast it may be counts once a second: velocities of a second ago say nothing of now.
+    slow_every = max(round(settings.rate_hz), 1)
+    for time_s, kind, number, inertial in _events(one, settings, now):
+        gyro, force = inertial[:3], inertial[3:]
         if time_s > now:
             running.predict(time_s - now, gyro, force)
             now = time_s
         best = int(np.argmax(running.likelihood))
         if kind == "height":
             running.level(float(one.height_m[number]))
-        elif kind == "step" and int(now // SPAN_S) in calm and number % REST_EVERY == 0:
+        elif kind == "step" and int(now // SPAN_S) in calm and number % 5 == 0:
             running.rest(gyro, force)
         elif kind == "step" and number % slow_every == 0:
             running.slow(settings.speed_m_s)
         elif kind == "range":
-            heard = running.hear(
-                float(one.range_m[number]), float(one.noise_m[number]), one.errors.at(number), one.arm_m[number],
-                one.anchor_m[number],
-            )  # fmt: skip
-            log.heard_s.append(now)
-            log.nis.append(float(heard.nis[best]))
-            log.believed.append(bool(heard.believed[best]))
+            measured, noise_m = float(one.range_m[number]), float(one.noise_m[number])
+            heard = running.hear(measured, noise_m, one.errors.at(number), one.arm_m[number], one.anchor_m[number])
+            heards.append((now, float(heard.nis[best]), bool(heard.believed[best])))
             window.append((number, float(np.sqrt(heard.nis[best]))))
             if _lost(one, window, settings):
-                running.restart(latest_fix(one, np.array([row for row, _ in window]), settings), settings.speed_m_s)
-                log.restarts_s.append(now)
+                running.restart(_fix(one, np.array([row for row, _ in window]), settings), settings.speed_m_s)
+                restarts.append(now)
                 window = []
         best = int(np.argmax(running.likelihood))
-        log.time_s.append(now)
-        log.place.append(running.place[best].copy())
-        log.attitude.append(running.attitude[best].copy())
-        log.covariance.append(running.covariance[best][P, P].copy())
+        covariance = running.covariance[best][P, P]
+        states.append((now, running.place[best].copy(), running.attitude[best].copy(), covariance.copy()))
+    return _told(one, settings, states, heards, restarts)
 
 
-def _lost(one: Readings, window: list[tuple[int, float]], settings: OnboardSettings) -> bool:
-    """Return whether half of the latest ranges are further off than noise explains; forget those before them.
+def _lost(one: _Readings, window: list[tuple[int, float]], settings: OnboardSettings) -> bool:
+    """Return whether half of the latest ranges are off by more than three standard deviations; forget those before.
 
     The window reaches back for `reopen_s`, or for as many ranges as a fix takes.
     """
     now = float(one.time_s[window[-1][0]])
-    while len(window) > FEWEST_RANGES and now - one.time_s[window[1][0]] > settings.reopen_s:
+    while len(window) > MIN_RANGES_PER_FIX and now - one.time_s[window[1][0]] > settings.reopen_s:
         window.pop(0)
     rows = [row for row, _ in window]
-    if len(window) < FEWEST_RANGES or now - one.time_s[rows[0]] < settings.reopen_s:
+    if len(window) < MIN_RANGES_PER_FIX or now - one.time_s[rows[0]] < settings.reopen_s:
         return False
-    enough = len(np.unique(one.anchor_m[rows], axis=0)) > FEWEST_ANCHORS
-    return enough and float(np.median([score for _, score in window])) > LOST_SIGMAS
+    enough = len(np.unique(one.anchor_m[rows], axis=0)) > MIN_ANCHORS
+    return enough and float(np.median([score for _, score in window])) > 3.0
 
 
-def _told(one: Readings, settings: OnboardSettings, log: _Log) -> OnboardTrack:
-    from scipy.spatial.transform import Rotation
+def _told(
+    one: _Readings,
+    settings: OnboardSettings,
+    states: list[tuple[float, Floats, Floats, Floats]],
+    heards: list[tuple[float, float, bool]],
+    restarts: list[float],
+) -> OnboardTrack:
+    """Return a track of states (time, place, attitude, covariance) and ranges (time, nis, whether believed)."""
 
-    time_ns = one.began_ns + np.rint(np.array(log.time_s) * 1e9).astype(np.int64)
-    place, covariance = np.array(log.place), np.array(log.covariance)
-    truth = np.full_like(place, np.nan)
-    turned = np.full((len(place), 4), np.nan)
+    def nanoseconds(seconds: Any) -> Ints:
+        return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
+
+    times, places, attitudes, covariances = zip(*states, strict=True)
+    heard_s, nis, believed = zip(*heards, strict=True)
+    time_ns, place, covariance = nanoseconds(times), np.array(places), np.array(covariances)
+    truth, turned = np.full_like(place, np.nan), np.full((len(place), 4), np.nan)
     if one.truth is not None:
         truth = bodies_m(one.truth, one.body, time_ns)
         turned = nearest_attitude(one.truth, one.body, time_ns)
     wrong = place - truth
-    nees = np.einsum("ni,ni->n", wrong, np.linalg.solve(covariance, wrong[..., None])[..., 0])
     used = ["ranges"] + ["imu"] * (settings.model == "imu") + ["height"] * (settings.height and len(one.height_s) > 0)
     return OnboardTrack(
         source=one.source,
@@ -164,13 +420,13 @@ def _told(one: Readings, settings: OnboardSettings, log: _Log) -> OnboardTrack:
         used=", ".join(used),
         time_ns=time_ns,
         estimate_m=place,
-        attitude=np.asarray(Rotation.from_matrix(np.array(log.attitude)).as_quat()),
+        attitude=np.asarray(Rotation.from_matrix(np.array(attitudes)).as_quat()),
         std_m=np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
         truth_m=truth,
         true_attitude=turned,
-        nees=nees,
-        range_time_ns=one.began_ns + np.rint(np.array(log.heard_s) * 1e9).astype(np.int64),
-        nis=np.array(log.nis),
-        believed=np.array(log.believed),
-        restarts_s=tuple(log.restarts_s),
+        nees=np.einsum("ni,ni->n", wrong, np.linalg.solve(covariance, wrong[..., None])[..., 0]),
+        range_time_ns=nanoseconds(heard_s),
+        nis=np.array(nis),
+        believed=np.array(believed),
+        restarts_s=tuple(restarts),
     )

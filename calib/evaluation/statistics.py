@@ -1,9 +1,10 @@
-"""How well a calibration does on ranges with known truth: tables by pair and overall."""
+"""How well a calibration does on ranges with known truth: errors by stage of correction, of all ranges and by pair."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
+from html import escape
 from typing import Any, Final
 
 import numpy as np
@@ -13,25 +14,68 @@ from calib.calibration.model import Calibration, require_calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
-from calib.evaluation.display import as_html, as_text
-from calib.evaluation.error_statistics import ErrorStatistics, Stats
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}
+"""What each stage of correction is called in `CorrectedRanges`."""
+
+NOMINAL: Final = {"50": 0.6744897501960817, "68": 1.0, "90": 1.6448536269514722, "95": 1.959963984540054,
+                  "99": 2.5758293035489004}  # fmt: skip
+"""Bounds of a standard normal distribution that hold so many per cent."""
+
 CHI_SQUARE_95: Final = 3.841458820694124
 """95 % quantile of the chi-square distribution with one degree of freedom."""
 
 
-NOMINAL: Final = {
-    "50": 0.6744897501960817,
-    "68": 1.0,
-    "90": 1.6448536269514722,
-    "95": 1.959963984540054,
-    "99": 2.5758293035489004,
-}
-"""Bounds of a standard normal distribution that hold so many per cent."""
+TITLE: Final = "Range errors in cm: mean and robust standard deviation, raw, with delays and fully corrected"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stats:
+    """Statistics of range errors in metres; `robust_std_m` is 1.4826 median absolute deviations.
+
+    95 % of the errors lie between `low_m` and `high_m`, with as many below as above; 95 % are smaller than `abs95_m`.
+    """
+
+    n: int
+    mean_m: float
+    median_m: float
+    std_m: float
+    robust_std_m: float
+    low_m: float
+    high_m: float
+    abs95_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorStatistics:
+    """A pair, or all pairs: statistics in the three stages, and the chi-square test.
+
+    `rejected` is the share of fully corrected errors whose square exceeds the 95 % quantile of
+    chi-square times sigma squared, `accepted` the statistics of the others. `rejected_raw` is the same share of raw
+    errors with the variance that all of them have, which is what there is without a calibration. `coverage` maps a
+    nominal share of a normal distribution to the share of corrected errors within its bounds.
+
+    With all that errors are made of: `total_mean` and `total_std` are mean and standard deviation of errors, less the
+    mean that is expected of them, over `sigma_total_m` (0 and 1 if right); `inside_95` is the share between the 2.5 and
+    97.5 % quantiles by pair and power, `tail_share` how many of the ranges should be reflected. NaN where the
+    calibration does not say.
+    """
+
+    raw: Stats
+    delays: Stats
+    full: Stats
+    rejected_raw: float
+    rejected: float
+    accepted: Stats
+    coverage: dict[str, float]
+    clamped: float
+    total_mean: float
+    total_std: float
+    inside_95: float
+    tail_share: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +107,20 @@ class Evaluation:
 
     def __repr__(self) -> str:
         """Return a table of errors in cm, a row a pair."""
-        return as_text(self.pairs, self.overall)
+        lines = ["".join(f"{cell:>8s}" for cell in row[:-1]) + f"  {row[-1]}" for row in self._rows()]
+        return "\n".join([TITLE, *lines])
 
     def _repr_html_(self) -> str:
         """Return the same as HTML, for notebooks."""
-        return as_html(self.pairs, self.overall)
+        rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self._rows())
+        return f"<p>{escape(TITLE)}</p><table>{rows}</table>"
+
+    def _rows(self, most: int = 40) -> list[list[str]]:
+        groups = [*list(self.pairs.items())[:most], ("all", self.overall)]
+        rows = [[name, *_cells(group)] for name, group in groups]
+        if len(self.pairs) > most:
+            rows.insert(-1, ["...", *[""] * 8, f"{len(self.pairs) - most} more"])
+        return [["pair", "n", "raw", "std", "delays", "std", "full", "std", "total z", "95 % holds"], *rows]
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib evaluate --json` prints; `planted` only where a simulation planted something."""
@@ -77,6 +130,15 @@ class Evaluation:
             "pairs": {name: _plain(asdict(group)) for name, group in self.pairs.items()},
         }
         return document | ({"planted": _plain(asdict(self.planted))} if self.planted else {})
+
+
+def _cells(group: ErrorStatistics) -> list[str]:
+    cells = [str(group.raw.n)]
+    for stats in (group.raw, group.delays, group.full):
+        cells += [f"{100 * stats.mean_m:+.1f}", f"{100 * stats.robust_std_m:.1f}"]
+    if group.total_std != group.total_std:
+        return [*cells, "-", f"{100 * group.coverage['95']:.0f} %"]
+    return [*cells, f"{group.total_std:.2f}", f"{100 * group.inside_95:.0f} %"]
 
 
 def _plain(value: Any) -> Any:

@@ -1,17 +1,29 @@
-"""What localization takes and gives: the filters' settings, the track of a body, and its errors over seeds."""
+"""Extended Kalman filters of one body, side by side: what they are given, how they run, and what they come to.
+
+State is the body's position; its velocity and attitude are inputs taken from motion capture, velocity with noise; the
+places of the other bodies are known (ICRA 2023, section V).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from calib.data.sources import Flight
 from calib.errors import BadInputError
+from calib.evaluation.range_updates import Heard, RangeErrors, gated, multilaterate, weighed
 from uwblink.arrays import Bools, Floats, Ints
+from uwblink.recording.distances import antennas_m, bodies_m
+from uwblink.recording.schema import Poses
 
 FILTERS: Final = ("raw", "calibrated", "variance", "robust")
-ROBUST: Final = "robust"
+
+FEWEST_IN_WINDOW: Final = 12
+"""Ranges by which a filter may be found lost: four for each coordinate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,29 +85,210 @@ class Track:
         return float(np.sqrt(np.mean(np.sum((self.estimate_m - self.truth_m) ** 2, axis=1))))
 
 
-@dataclass(frozen=True, slots=True)
-class FixedStd:
-    """The fixed standard deviations of ranges, by filter, and where they come from, in words."""
-
-    std_m: dict[str, float]
-    source: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Localization:
-    """One body of one recording: a track for each of `FILTERS`, and the RMSE of each over seeds (seeds,) in metres.
+class Problem:
+    """What is known of one body at each of its ranges: rows of the flight, true place, own lever arm turned into the
+    world, and the other antenna's place, (n, 3) each."""
 
-    `simulated` says whether the flight was; `fixed` are the fixed variances of the filters that have one.
-    """
-
-    source: str
     body: str
-    tracks: dict[str, Track]
-    rmse_m: dict[str, Floats]
-    fixed: FixedStd
-    simulated: bool
+    rows: Ints
+    time_ns: Ints
+    attitude: Floats
+    place: Floats
+    arm: Floats
+    other: Floats
 
-    def __repr__(self) -> str:
-        """Return how far off each filter is, over seeds, on one line."""
-        found = ", ".join(f"{name} {np.mean(rmse):.3f} m" for name, rmse in self.rmse_m.items())
-        return f"{self.body} of {self.source}: rms error {found}"
+    def first(self, count: int) -> Problem:
+        """Return its first ranges."""
+        columns = ("rows", "time_ns", "attitude", "place", "arm", "other")
+        return replace(self, **{name: getattr(self, name)[:count] for name in columns})
+
+    def velocity_spread(self, settings: Settings) -> Floats:
+        """Return by how much velocity's noise widens each axis between ranges (n,), in square metres."""
+        dt = np.diff(self.time_ns, prepend=self.time_ns[:1]) * 1e-9
+        return np.asarray(settings.velocity_std_mps**2 / settings.velocity_rate_hz * np.maximum(dt, 0))
+
+    def noisy(self, settings: Settings, seed: int) -> tuple[Floats, Floats]:
+        """Draw a start (3,) and displacements between ranges (n, 3), both with noise.
+
+        Each body and flight has noise of its own, the same for every filter.
+        """
+        own = [zlib.crc32(part) for part in (self.time_ns.tobytes(), self.body.encode())]
+        rng = np.random.default_rng([seed, *own])
+        moves = np.diff(self.place, axis=0, prepend=self.place[:1])
+        noise = rng.normal(size=moves.shape) * np.sqrt(self.velocity_spread(settings))[:, None]
+        start = self.place[0] + rng.normal(size=3) * settings.initial_std_m + settings.initial_offset_m
+        return start, moves + noise
+
+
+def problems(flight: Flight) -> list[Problem]:
+    """Return a problem for every body of a flight that moves, and ranges while its place is known."""
+    ranges, found = flight.ranges, []
+    for body in flight.moving_bodies():
+        mine = [tag.tag for tag in flight.tags if tag.body == body]
+        first, second = (np.isin(ids, mine) for ids in (ranges.initiator, ranges.target))
+        rows = np.flatnonzero(first ^ second)
+        rows = rows[np.argsort(ranges.time_ns[rows], kind="stable")]
+        time = ranges.time_ns[rows]
+        own = np.where(first[rows], ranges.initiator[rows], ranges.target[rows])
+        other = np.where(first[rows], ranges.target[rows], ranges.initiator[rows])
+        place = bodies_m(flight.poses, body, time)
+        antenna, away = (antennas_m(flight.poses, flight.tags, ids, time) for ids in (own, other))
+        known = np.isfinite(np.hstack([place, antenna, away])).all(axis=1)
+        if known.any():
+            found.append(
+                Problem(
+                    body=body,
+                    rows=rows[known],
+                    time_ns=time[known],
+                    attitude=nearest_attitude(flight.poses, body, time[known]),
+                    place=place[known],
+                    arm=(antenna - place)[known],
+                    other=away[known],
+                )
+            )
+    return found
+
+
+def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
+    """Return the attitude of a body at the pose nearest to each time, (n, 4)."""
+    rows = np.flatnonzero(poses.body == body)
+    known = poses.time_ns[rows]
+    after = np.clip(np.searchsorted(known, time_ns), 1, max(len(known) - 1, 1))
+    later = known[np.minimum(after, len(known) - 1)] - time_ns
+    nearest = np.where(time_ns - known[after - 1] < later, after - 1, after)
+    return poses.quaternion[rows[np.minimum(nearest, len(rows) - 1)]]
+
+
+@dataclass(frozen=True, slots=True)
+class FilterRanges:
+    """What a filter measures (n,), its standard deviation (n,), and what errors are made of if it reckons with it."""
+
+    measured_m: Floats
+    std_m: Floats
+    errors: RangeErrors | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A body, and what some filters measure of it, by name."""
+
+    problem: Problem
+    ranges: Mapping[str, FilterRanges]
+
+
+def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[Track]]]:
+    """Run filters with every noise; return the tracks of each run by filter, a noise each. All have the same filters.
+
+    Bodies run side by side: arrays are by time, filter, and a column a body and noise. Runs that end before the
+    longest one stand still then, and go on measuring what they measured last.
+    """
+    if not runs:
+        return []
+    count, body = max(len(run.problem.rows) for run in runs), np.repeat(np.arange(len(runs)), settings.seeds)
+
+    def beside(parts: list[Floats]) -> Floats:
+        """Return arrays (some, ...) side by side (count, parts, ...), each with its last row where it has none."""
+        return np.stack([part[np.minimum(np.arange(count), len(part) - 1)] for part in parts], axis=1)
+
+    measured = beside([np.array([one.measured_m for one in run.ranges.values()]).T for run in runs])
+    variance = beside([np.array([one.std_m for one in run.ranges.values()]).T for run in runs]) ** 2
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    noises = [run.problem.noisy(settings, seed) for run in runs for seed in seeds]
+    moves = beside([np.vstack([own, np.zeros(3)]) for _, own in noises])
+    spread = beside([np.append(run.problem.velocity_spread(settings), 0.0) for run in runs])
+    place, arm, other = (beside([getattr(run.problem, name) for run in runs]) for name in ("place", "arm", "other"))
+    errors = [_errors_beside([run.ranges[name].errors for run in runs], count) for name in runs[0].ranges]
+
+    shape, eye = (len(errors), len(body)), np.eye(3)
+    x = np.tile([start for start, _ in noises], (shape[0], 1, 1))
+    p = np.tile(eye * settings.initial_std_m**2, (*shape, 1, 1))
+    estimate, (std, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
+    accepted, began = np.zeros((count, *shape), dtype=bool), np.zeros(shape, dtype=np.int64)
+    for k in range(count):
+        x = x + moves[k]
+        p = p + spread[k][body][:, None, None] * eye
+        towards = x + arm[k][body] - other[k][body]
+        distance = np.sqrt(np.einsum("fsi,fsi->fs", towards, towards))
+        h = towards / np.maximum(distance, 1e-6)[..., None]
+        ph = np.matmul(p, h[..., None])[..., 0]
+        innovation = measured[k].T[:, body] - distance
+        s = np.einsum("fsi,fsi->fs", h, ph) + variance[k].T[:, body]
+        nis[k] = innovation**2 / s
+        heard = _heard(innovation, s, [known and known.at((k, body)) for known in errors], settings.gate)
+        gain = ph / s[..., None]
+        x = x + gain * heard.noise_m[..., None]
+        p = p + gain[..., None] * gain[..., None, :] * (heard.variance_m2 - s)[..., None, None]
+        for f, one, first in _lost(nis[: k + 1], runs, body, settings, began) if k % 8 == 0 else ():
+            problem, rows = runs[body[one]].problem, slice(first, k + 1)
+            # What the body moved since each range is known from its velocity, and counted to the anchors.
+            since = np.vstack([moves[first + 1 : k + 1, one][::-1].cumsum(axis=0)[::-1], np.zeros(3)])
+            anchors = problem.other[rows] - problem.arm[rows] + since
+            fix = multilaterate(measured[rows, body[one], f], anchors, 0.0)
+            x[f, one], p[f, one] = fix.place_m, fix.covariance_m2
+            began[f, one] = k + 1
+        wrong = x - place[k][body]
+        estimate[k], accepted[k], std[k] = x, heard.believed, np.sqrt(np.trace(p, axis1=-2, axis2=-1))
+        nees[k] = np.einsum("fsi,fsi->fs", wrong, np.linalg.solve(p, wrong[..., None])[..., 0])
+
+    def track(problem: Problem, f: int, column: int) -> Track:
+        some = (slice(0, len(problem.rows)), f, column)
+        return Track(
+            time_ns=problem.time_ns,
+            attitude=problem.attitude,
+            estimate_m=estimate[some],
+            truth_m=problem.place,
+            std_m=std[some],
+            nis=nis[some],
+            nees=nees[some],
+            accepted=accepted[some],
+        )
+
+    return [
+        {
+            name: [track(run.problem, f, column) for column in np.flatnonzero(body == k).tolist()]
+            for f, name in enumerate(run.ranges)
+        }
+        for k, run in enumerate(runs)
+    ]
+
+
+def _errors_beside(parts: Sequence[RangeErrors | None], count: int) -> RangeErrors | None:
+    """Return errors of several bodies side by side, `share` and `detour_m` (count, bodies)."""
+    known = [part for part in parts if part is not None]
+    if not known:
+        return None
+    rows = [np.minimum(np.arange(count), len(np.asarray(part.share)) - 1) for part in known]
+    each = [part.at(some) for part, some in zip(known, rows, strict=True)]
+    share, detour = (np.stack([getattr(part, name) for part in each], axis=1) for name in ("share", "detour_m"))
+    return replace(known[0], share=share, detour_m=detour)
+
+
+def _heard(innovation: Floats, variance: Floats, errors: Sequence[RangeErrors | None], gate: float) -> Heard:
+    """Return what all filters make of a range: a gate for most, the whole of its error for those who reckon with it."""
+    heard = gated(innovation, variance, gate)
+    for f, known in enumerate(errors):
+        if known is not None:
+            own = weighed(innovation[f], variance[f], known)
+            heard.noise_m[f], heard.variance_m2[f], heard.believed[f] = own.noise_m, own.variance_m2, own.believed
+    return heard
+
+
+def _lost(
+    nis: Floats, runs: Sequence[Run], body: Ints, settings: Settings, began: Ints
+) -> Iterator[tuple[int, int, int]]:
+    """Yield filters (filter, column) that cannot explain half of the latest ranges, and the first of these ranges.
+
+    Half of them are off by more than three standard deviations. `nis` (n, filters, columns) are those of all ranges so
+    far; those before a filter `began` anew do not count, nor do windows that do not reach back for `reopen_s`.
+    """
+    last = len(nis) - 1
+    for k, run in enumerate(runs):
+        time_ns, mine = run.problem.time_ns, np.flatnonzero(body == k)
+        if last >= len(time_ns):
+            continue
+        since_ns = time_ns[last] - int(settings.reopen_s * 1e9)
+        first = int(np.searchsorted(time_ns, since_ns))
+        if time_ns[0] <= since_ns and last + 1 - first >= FEWEST_IN_WINDOW:
+            lost = (np.median(nis[first:, :, mine], axis=0) > 9.0) & (began[:, mine] <= first)
+            yield from ((int(f), int(mine[one]), first) for f, one in np.argwhere(lost))

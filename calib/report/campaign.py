@@ -20,9 +20,7 @@ from calib.estimation.fitting import fit
 from calib.estimation.losses import MIXTURE
 from calib.estimation.passive_listeners import heard_delays
 from calib.estimation.result import FitResult
-from calib.evaluation.consistency import summarize
-from calib.evaluation.localization import localize
-from calib.evaluation.tracking import Localization
+from calib.evaluation.localization import Localization, localize, summarize
 from calib.report.results import Results, check_places, origin_of
 from calib.report.sections import TITLE, document
 from calib.settings import FitSettings

@@ -11,9 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calib.evaluation.consistency import summarize
-from calib.evaluation.onboard_track import OnboardTrack
-from calib.evaluation.tracking import Localization
+from calib.evaluation.localization import Localization, summarize
+from calib.evaluation.onboard import OnboardTrack
 from calib.planning.flight_result import FlightPlan
 from calib.planning.result import NextBest, Plan, PlannedArrangement
 from uwblink.pages.colours import BLUE, GREY, INK, MUTED, VERMILION, WINE, look

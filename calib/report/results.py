@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from calib.doctor.base import Finding
     from calib.estimation.passive_listeners import OverheardDelay
     from calib.estimation.result import FitResult
-    from calib.evaluation.tracking import Localization
+    from calib.evaluation.localization import Localization
 
 
 @dataclass(frozen=True, slots=True)

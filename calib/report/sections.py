@@ -23,12 +23,10 @@ from calib.calibration.model import pair_rows as offset_rows
 from calib.data.sources import Data, each, load_each
 from calib.error_mixture import fit_error_mixtures
 from calib.errors import BadInputError
-from calib.evaluation.consistency import summarize
-from calib.evaluation.error_statistics import ErrorStatistics
-from calib.evaluation.localization import PAPER_RMSE_M
-from calib.evaluation.onboard_track import OnboardTrack
-from calib.evaluation.statistics import CORRECTION_STAGES, Evaluation, pair_rows
-from calib.evaluation.tracking import Localization, Settings
+from calib.evaluation.localization import PAPER_RMSE_M, Localization, summarize
+from calib.evaluation.onboard import OnboardTrack
+from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, Evaluation, pair_rows
+from calib.evaluation.tracking import Settings
 from calib.report.figures import FILTER_NAMES, onboard, rmse_bars, track
 from calib.report.results import Origin, Results, check_places, origin_of
 from calib.report.verdict import left_open, verdict

@@ -13,14 +13,10 @@ from calib.data.samples import sample_flight
 from calib.data.sources import Flight, load_flight
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.fitting import fit
-from calib.evaluation.consistency import summarize
-from calib.evaluation.localization import fixed_std, localize
-from calib.evaluation.localization_display import as_tum, localization_json, localization_text, write_tum
-from calib.evaluation.tracking import Settings
-from calib.evaluation.tracking_filters import AT_ONCE, filter_ranges, run_filters
-from calib.evaluation.tracking_problem import Noise, problems
-from calib.evaluation.tracking_runs import Run
-from calib.report.figures_tracks import rmse_bars
+from calib.evaluation.localization import FixedStd, filter_runs, fixed_std, localize, summarize
+from calib.evaluation.output import as_tum, localization_json, localization_text, write_tum
+from calib.evaluation.tracking import FilterRanges, Run, Settings, run_filters
+from calib.report.figures import rmse_bars
 from uwblink.pages.figures import style
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate
@@ -137,15 +133,18 @@ def test_each_body_and_flight_has_noise_of_its_own(flights):
 
 
 def test_bodies_side_by_side_are_tracked_as_each_alone(flights):
-    # They begin anew, each in its own time, for none is where it thinks to be. The first is judged in two parts.
+    # They begin anew, each in its own time, for none is where it thinks to be.
     calibration = fit(flights["train"].ranges).calibration
-    flight, settings = flights["test1"], Settings(seeds=2, initial_offset_m=(3.0, 0.0, 0.0))
-    applied, runs = calibration.apply(flight.ranges), []
-    for whole, count in zip(problems(flight), (AT_ONCE + 200, 700, 40), strict=True):
-        problem = whole.first(count)
-        known = flight.ranges[problem.rows]
-        ranges = filter_ranges(known, applied, problem.rows, calibration, {"raw": 0.2, "calibrated": 0.1})
-        runs.append(Run(problem, ranges, [Noise.drawn(problem, settings, seed) for seed in (3, 4)]))
+    settings = Settings(seed=3, seeds=2, initial_offset_m=(3.0, 0.0, 0.0))
+    fixed = FixedStd({"raw": 0.2, "calibrated": 0.1}, "given")
+    runs = []
+    for whole, count in zip(filter_runs(flights["test1"], calibration, fixed), (1200, 700, 40), strict=True):
+        some = np.arange(count)
+        ranges = {
+            name: FilterRanges(own.measured_m[:count], own.std_m[:count], own.errors and own.errors.at(some))
+            for name, own in whole.ranges.items()
+        }
+        runs.append(Run(whole.problem.first(count), ranges))
     together = run_filters(runs, settings)
     for run, found in zip(runs, together, strict=True):
         (alone,) = run_filters([run], settings)

@@ -13,11 +13,10 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
 from calib.data.samples import stamped
 from calib.errors import BadInputError, UnanswerableError
-from calib.evaluation.localization_display import onboard_json, onboard_text, write_onboard_tum
-from calib.evaluation.multilateration import multilaterate
-from calib.evaluation.onboard import localize_onboard
-from calib.evaluation.onboard_filter import Noise
-from calib.evaluation.onboard_track import OnboardSettings
+from calib.evaluation.inertial_filter import Noise
+from calib.evaluation.onboard import OnboardSettings, localize_onboard
+from calib.evaluation.output import onboard_json, onboard_text, write_onboard_tum
+from calib.evaluation.range_updates import multilaterate
 from tests.shared_data import shared
 from uwblink.importers import read_source
 from uwblink.recording.contents import Contents

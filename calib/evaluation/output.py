@@ -1,4 +1,4 @@
-"""A localization on one screen, as JSON, and as trajectories in files."""
+"""A localization as text, as JSON, and as trajectories in TUM files."""
 
 from __future__ import annotations
 
@@ -6,59 +6,47 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
-from calib.evaluation.consistency import Summary, summarize
-from calib.evaluation.localization import PAPER_RMSE_M
-from calib.evaluation.onboard_track import OnboardSettings, OnboardTrack
-from calib.evaluation.tracking import Localization, Settings, Track
+from calib.evaluation.localization import PAPER_RMSE_M, Localization, Summary, summarize
+from calib.evaluation.onboard import OnboardSettings, OnboardTrack
+from calib.evaluation.tracking import Settings, Track
 from uwblink.arrays import Floats, Ints
 from uwblink.display import printable
 from uwblink.output import write_files
 
-NAMES: Final = {"raw": "raw", "calibrated": "calibrated", "variance": "variance", "robust": "robust"}
-WIDTH: Final = 12
-
 
 def localization_text(found: list[Localization], summary: Summary, settings: Settings) -> str:
     """Return the table that `calib localize` prints, a row a body, and what it rests on."""
-    filters = list(summary.rmse_m)
+    filters, width = list(summary.rmse_m), 12
     first = max(30, *(len(one.source) + len(one.body) + 2 for one in found))
-    lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{NAMES[name]:>{WIDTH}s}" for name in filters)]
+    lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{name:>{width}s}" for name in filters)]
     for one in found:
-        figures = "".join(f"{one.rmse_m[name].mean():{WIDTH}.3f}" for name in filters)
+        figures = "".join(f"{one.rmse_m[name].mean():{width}.3f}" for name in filters)
         lines.append(f"{printable(f'{one.source} {one.body}'):{first}s}{figures}")
-    lines.append(f"{'mean':{first}s}" + "".join(f"{summary.rmse_m[name]:{WIDTH}.3f}" for name in filters))
+    lines.append(f"{'mean':{first}s}" + "".join(f"{summary.rmse_m[name]:{width}.3f}" for name in filters))
     if settings.seeds > 1:
-        spread = "".join(f"{summary.spread_m[name]:{WIDTH}.3f}" for name in filters)
+        spread = "".join(f"{summary.spread_m[name]:{width}.3f}" for name in filters)
         lines.append(f"{f'its spread over {settings.seeds} seeds':{first}s}{spread}")
-    less = "".join(f"{-100 * summary.reduction[name]:+{WIDTH - 2}.0f} %" for name in filters[1:])
-    lines.append(f"{'against raw':{first + WIDTH}s}{less}")
-    return "\n".join([*lines, *_rests_on(found, settings), _consistent(summary)])
-
-
-def _rests_on(found: list[Localization], settings: Settings) -> list[str]:
+    less = "".join(f"{-100 * summary.reduction[name]:+{width - 2}.0f} %" for name in filters[1:])
     fixed = found[0].fixed
     paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())
     what = "simulated flights" if all(one.simulated for one in found) else "other flights"
-    return [
+    lines += [
+        f"{'against raw':{first + width}s}{less}",
         f"process noise: velocity with {settings.velocity_std_mps:g} m/s an axis at {settings.velocity_rate_hz:g} Hz "
         "(a choice, that of a small drone's optical flow; gains depend on it)",
         f"fixed standard deviations, {fixed.source}: raw {fixed.std_m['raw']:.3f} m, calibrated "
         f"{fixed.std_m['calibrated']:.3f} m",
         f"ICRA 2023 has {paper} m for real flights of its own and another filter's noise; these are {what}: metres do "
         "not compare",
-    ]
-
-
-def _consistent(summary: Summary) -> str:
-    return (
         f"with the calibrated variance: NIS {summary.nis:.2f} (1 expected, 95 % bounds {summary.nis_bounds[0]:.2f} to "
         f"{summary.nis_bounds[1]:.2f}), NEES {summary.nees:.2f} (3 expected, {summary.nees_bounds[0]:.2f} to "
-        f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate"
-    )
+        f"{summary.nees_bounds[1]:.2f}), {100 * summary.accepted:.1f} % of the ranges pass the gate",
+    ]
+    return "\n".join(lines)
 
 
 def localization_json(found: list[Localization]) -> dict[str, Any]:

@@ -7,21 +7,20 @@ wanders. Arrays are (headings, ...).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from calib.evaluation.multilateration import Fix
-from calib.evaluation.range_updates import Heard, RangeErrors, weighed
+from calib.evaluation.range_updates import Fix, Heard, RangeErrors, weighed
 from uwblink.arrays import Floats
 
 GRAVITY: Final = 9.81
+"""m/s^2."""
+
 SIZE: Final = 16
-REST_M_S: Final = 0.01
-REST_RAD_S: Final = 0.003
-REST_M_S2: Final = 0.03
-"""Noise of a body at rest."""
+"""Of the state; its parts are sliced by the names below: position, velocity, attitude, biases, height's offset."""
 
 P, V, A, G, F, H = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15
 
@@ -103,21 +102,27 @@ class InertialFilter:
         row[:, P] = towards / distance[:, None]
         if self.inertial:
             row[:, A] = -np.einsum("hi,hij->hj", row[:, P], self.attitude @ _cross(np.tile(arm_m, (len(distance), 1))))
-        innovation = range_m - distance
-        reach = np.einsum("hij,hj->hi", self.covariance, row)
-        variance = np.einsum("hi,hi->h", row, reach) + noise_m**2
-        heard = weighed(innovation, variance, errors)
+        heard = self._weigh(row, range_m - distance, noise_m, errors)
         self.likelihood = self.likelihood + heard.log_density
-        self._correct(reach, variance, heard)
         return heard
 
     def level(self, height_m: float) -> None:
         """Correct by the height above the world's zero, less an offset that the sensor may have."""
-        innovation = height_m - self.place[:, 2] - self.offset
-        reach = self.covariance[:, :, 2] + self.covariance[:, :, H]
-        variance = reach[:, 2] + reach[:, H] + self.noise.height_m**2
+        row = np.zeros((len(self.place), SIZE))
+        row[:, [2, H]] = 1.0
         errors = RangeErrors(share=1e-6, least_m=0.0, detour_m=1.0, outlier=0.05, outlier_m=1.0)
-        self._correct(reach, variance, weighed(innovation, variance, errors))
+        self._weigh(row, height_m - self.place[:, 2] - self.offset, self.noise.height_m, errors)
+
+    def _weigh(self, row: Floats, innovation: Floats, noise_m: float, errors: RangeErrors) -> Heard:
+        """Correct by an observation of one (headings, states) whose errors are not normal alone."""
+        reach = np.einsum("hij,hj->hi", self.covariance, row)
+        variance = np.einsum("hi,hi->h", row, reach) + noise_m**2
+        heard = weighed(innovation, variance, errors)
+        gain = reach / variance[:, None]
+        self._move(gain * heard.noise_m[:, None])
+        change = (heard.variance_m2 - variance)[:, None, None]
+        self.covariance = self.covariance + gain[:, :, None] * gain[:, None, :] * change
+        return heard
 
     def pulled(self, force: Floats, std: float) -> None:
         """Take the mean specific force (3,) for gravity's, but for an acceleration of `std` m/s^2 an axis.
@@ -125,29 +130,24 @@ class InertialFilter:
         Tilt and bias are then known together: what one is off, the other makes up for.
         """
         pull = force - self.force_bias
-        rows = np.zeros((len(self.place), 3, SIZE))
-        rows[:, :, A], rows[:, :, F] = -self.attitude @ _cross(pull), -self.attitude
         world = np.einsum("hij,hj->hi", self.attitude, pull) - (0.0, 0.0, GRAVITY)
-        self._observe(rows, -world, std)
+        self._observe([(A, -self.attitude @ _cross(pull)), (F, -self.attitude)], -world, std)
 
     def slow(self, speed_m_s: float) -> None:
         """Take it that the body is no faster than it may be: what holds it in the room while no range comes."""
-        rows = np.zeros((len(self.place), 3, SIZE))
-        rows[:, :, V] = np.eye(3)
-        self._observe(rows, -self.velocity, speed_m_s)
+        self._observe([(V, np.eye(3))], -self.velocity, speed_m_s)
 
     def rest(self, gyro: Floats, force: Floats) -> None:
-        """Take the body for still: no velocity, no turning, no acceleration."""
-        rows = np.zeros((len(self.place), 3, SIZE))
-        rows[:, :, V] = np.eye(3)
-        self._observe(rows, -self.velocity, REST_M_S)
-        rows = np.zeros_like(rows)
-        rows[:, :, G] = np.eye(3)
-        self._observe(rows, gyro - self.gyro_bias, REST_RAD_S)
-        self.pulled(force, REST_M_S2)
+        """Take the body for still: no velocity (to 1 cm/s), no turning (3 mrad/s), no acceleration (3 cm/s^2)."""
+        self._observe([(V, np.eye(3))], -self.velocity, 0.01)
+        self._observe([(G, np.eye(3))], gyro - self.gyro_bias, 0.003)
+        self.pulled(force, 0.03)
 
-    def _observe(self, rows: Floats, innovation: Floats, std: float) -> None:
-        """Correct by a linear observation of three (headings, 3, states) with plain noise."""
+    def _observe(self, parts: Sequence[tuple[slice, Floats]], innovation: Floats, std: float) -> None:
+        """Correct by a linear observation of three parts of the state (headings, 3, 3 each) with plain noise."""
+        rows = np.zeros((len(self.place), 3, SIZE))
+        for part, slopes in parts:
+            rows[:, :, part] = slopes
         reach = self.covariance @ rows.transpose(0, 2, 1)
         gain = reach @ np.linalg.inv(rows @ reach + std**2 * np.eye(3))
         self._move(np.einsum("hij,hj->hi", gain, innovation))
@@ -162,12 +162,6 @@ class InertialFilter:
             self.covariance[:, part, :] = self.covariance[:, :, part] = 0
         self.covariance[:, P, P] = fix.covariance_m2
         self.covariance[:, V, V] = np.eye(3) * speed_m_s**2
-
-    def _correct(self, reach: Floats, variance: Floats, heard: Heard) -> None:
-        gain = reach / variance[:, None]
-        self._move(gain * heard.noise_m[:, None])
-        change = (heard.variance_m2 - variance)[:, None, None]
-        self.covariance = self.covariance + gain[:, :, None] * gain[:, None, :] * change
 
     def _move(self, by: Floats) -> None:
         self.place, self.velocity = self.place + by[:, P], self.velocity + by[:, V]
