@@ -8,12 +8,11 @@ LONGEST: Final = (
     "tests/loop/test_wire.py",
     "tests/calib/report/test_report.py",
     "tests/uwbsim/sweep/test_sweep.py",
-    "tests/calib/report/test_figure_files.py",
+    "tests/calib/report/test_files.py",
     "tests/loop/test_accuracy.py",
     "tests/uwblink/boards/test_recorder.py",
     "tests/contract/test_habits.py",
     "tests/test_full_disk.py",
-    "tests/calib/report/test_campaign.py",
     "tests/test_bad_input.py",
     "tests/loop/test_icra2023.py",
 )

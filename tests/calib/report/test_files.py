@@ -1,0 +1,236 @@
+"""Reports, plans and figures as files: from Python and from commands, with sections of one's own, on paper."""
+
+import io
+import json
+import re
+import shutil
+from dataclasses import replace
+from functools import partial
+
+import pytest
+from pypdf import PdfReader
+
+import calib
+from calib.data.samples import sample_flight
+from calib.report import Heading, Picture, Table, Text, check_places
+from calib.report.figures import arrangement
+from calib.report.sections import SECTIONS
+from tests import processes
+from uwblink.pages.blocks import Document, write_document
+from uwblink.pages.figures import picture, sheet
+from uwblink.pages.pdf import to_pdf
+from uwblink.recording.file import Recording
+
+FORMS = {f"{width}.{kind}" for width in ("column", "page") for kind in ("pdf", "svg")}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two flights and a calibration of each."""
+    folder = tmp_path_factory.mktemp("reports")
+    for name, seed in (("a", 1), ("b", 2)):
+        flight = sample_flight(seed=seed)
+        with Recording.create(folder / f"{name}.uwb", meta={"planted": flight.planted}) as recording:
+            recording.append_tags(flight.tags)
+            recording.append_poses(flight.poses)
+            recording.append_exchanges(flight.exchanges)
+        calib.fit(flight, loss="huber").calibration.save(folder / f"{name}.json")
+    return folder
+
+
+def run(folder, *words, status=0):
+    done = processes.run("calib", *words, cwd=folder)
+    assert done.returncode == status, done.stderr
+    return done
+
+
+def test_a_campaign_is_what_the_command_makes(folder, tmp_path, monkeypatch):
+    opened, whole = [], Recording.open
+
+    def noted(path, **kwargs):
+        opened.append(path.name)
+        return whole(path, **kwargs)
+
+    monkeypatch.setattr(Recording, "open", noted)
+    told: list[str] = []
+    campaign = calib.run_campaign(folder / "a.uwb", folder / "b.uwb", loss="huber", progress=told.append)
+    assert opened == ["a.uwb", "b.uwb"], "each is opened once, and looked at whole whenever it is opened"
+    assert told == ["loading", "fitting", "examining", "localizing"]
+    assert (len(campaign.refits), len(campaign.tracks)) == (7, 3)
+    assert repr(campaign).splitlines()[-1] == "judged on b.uwb"
+    campaign = replace(campaign, origin=replace(campaign.origin, files={}))
+    campaign.write(tmp_path / "python.html")
+    done = run(folder, "report", "a.uwb", "--tests", "b.uwb", "-o", "command.html", "--loss", "huber", "--json")
+    assert json.loads(done.stdout) == json.loads(json.dumps(campaign.to_dict()))
+    pages = [(tmp_path / "python.html").read_text(), (folder / "command.html").read_text()]
+    # When, by which command, and from which files is not the same.
+    texts = [re.sub(r"<p class='note'>Made.*?</p>|[0-9a-f]{12}|in memory", "", page) for page in pages]
+    assert len({text[: text.index(">Provenance</h2>")] for text in texts}) == 1
+
+
+@pytest.fixture(scope="module")
+def campaign(folder):
+    return calib.run_campaign(calib.load_ranges(folder / "a.uwb"), loss="l2")
+
+
+def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
+    assert campaign.findings == []
+    assert campaign.tracks == []
+    assert campaign.evaluation.overall.full.n == 900
+    (tmp_path / "mine.html").write_text("mine")
+    with pytest.raises(FileExistsError):
+        campaign.write(tmp_path / "r.html", tmp_path / "mine.html")
+    with pytest.raises(calib.BadInputError, match="`figures`"):
+        campaign.write(tmp_path / "r.html", figures=tmp_path / "mine.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.html"]
+
+
+def weather(campaign):
+    return [Heading("Weather"), Text(f"Dry over {len(campaign.judged)} ranges; <wet> tomorrow.")]
+
+
+@pytest.fixture
+def sections():
+    before = dict(SECTIONS)
+    yield SECTIONS
+    SECTIONS.clear()
+    SECTIONS.update(before)
+
+
+def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
+    calib.register_report_section("weather", weather, before="outliers")
+    campaign.write(tmp_path / "r.html", tmp_path / "r.pdf")
+    page = (tmp_path / "r.html").read_text()
+    titles = re.findall("<h2 id='s[0-9]+'>(.*?)</h2>", page)
+    assert titles[titles.index("Weather") + 1] == "Outliers"
+    assert "Dry over 900 ranges; &lt;wet&gt; tomorrow." in page
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(
+    ("name", "section", "before", "parameter"),
+    [
+        ("outliers", weather, "provenance", "name"),
+        ("weather", weather, "nowhere", "before"),
+        ("weather", "text", "provenance", "section"),
+    ],
+)
+def test_a_section_that_cannot_be_one_is_refused(name, section, before, parameter, sections):
+    with pytest.raises(calib.BadInputError) as caught:
+        calib.register_report_section(name, section, before=before)
+    assert caught.value.parameter == parameter
+    assert "weather" not in sections
+
+
+@pytest.mark.parametrize("blocks", [None, ["text"], "text"])
+def test_a_section_that_returns_no_blocks_is_named(campaign, tmp_path, blocks, sections):
+    calib.register_report_section("weather", lambda campaign: blocks)
+    with pytest.raises(calib.BadInputError, match="weather"):
+        campaign.write(tmp_path / "r.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["evaluate", "a.uwb", "-c", "b.json"], {"delays", "errors", "bias", "sigma", "residuals", "over-time-1"}),
+        (["localize", "a.uwb", "-c", "b.json", "--seeds", "1"], {"rmse", "track-a-robot1", "track-a-robot3"}),
+        (["compare", "a.json", "b.json"], {"differences", "curves"}),
+    ],
+)
+def test_commands_draw_what_they_find(folder, words, names):
+    shutil.rmtree(folder / "out", ignore_errors=True)
+    run(folder, *words, "--figures", "out")
+    assert {f"{name}-{form}" for name in names for form in FORMS} <= {path.name for path in (folder / "out").iterdir()}
+    again = run(folder, *words, "--figures", "out", status=2)
+    assert re.search("out.*--force", again.stderr)
+    assert len(again.stderr.splitlines()) == 1
+
+
+def test_an_evaluation_is_a_page_with_its_origin_or_a_pdf(folder):
+    run(folder, "evaluate", "a.uwb", "-c", "b.json", "--report", "r.pdf")
+    assert (folder / "r.pdf").read_bytes().startswith(b"%PDF")
+    run(folder, "evaluate", "a.uwb", "-c", "b.json", "--report", "r.html")
+    page = (folder / "r.html").read_text()
+    assert "calib evaluate a.uwb -c b.json --report r.html" in page
+    assert page.count("SHA-256 ") == 2, "of the recording and of the calibration"
+
+
+def test_one_file_does_not_take_the_place_of_another(folder, tmp_path):
+    done = run(folder, "report", "a.uwb", "-o", "same.pdf", "--pdf", "same.pdf", "--loss", "huber", status=2)
+    assert "same.pdf" in done.stderr
+    assert not (folder / "same.pdf").exists()
+    with pytest.raises(calib.BadInputError, match=r"a\.pdf"):
+        check_places(tmp_path / "a.pdf", tmp_path / "a.pdf", None, force=True)
+    pictures = [Picture("same", lambda width: sheet(width)[0], text) for text in ("one", "two")]
+    write_document(Document("", [*pictures]), None, figures=tmp_path / "f")
+    assert {path.name.rpartition("-")[0] for path in (tmp_path / "f").iterdir()} == {"same", "same-2"}
+
+
+def words_of(svg):
+    return re.findall(r"<text[^>]*>([^<]*)</text>", svg)
+
+
+def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_path):
+    words = ("plan", "7,12,3", "--on", "line", "--arrangements", "2", "--taped", "1")
+    run(tmp_path, *words, "-o", "plan.html", "--figures", "f")
+    page, files = (tmp_path / "plan.html").read_text(), {path.name for path in (tmp_path / "f").iterdir()}
+    assert files == {f"{name}-{form}" for name in ("arrangement-A", "arrangement-B", "more") for form in FORMS}
+    drawn = [words_of((tmp_path / "f" / f"arrangement-{name}-page.svg").read_text()) for name in "AB"]
+    # Once on the string, once below their bars.
+    assert all(words.count(tag) == 2 for words in drawn for tag in ("7", "12", "3"))
+    assert sum("distance to tape" in words for words in drawn) == 1
+    assert "open" in drawn[0]
+    assert {"Step 2: arrangement B", "before it"} <= set(drawn[1])
+    assert "Step 2: arrangement B" in page
+    assert "calib survey A.uwb B.uwb --known known.toml" in page
+    done = run(tmp_path, *words, "-o", "plan.html", status=2)
+    assert "plan.html" in done.stderr
+    assert (tmp_path / "plan.html").read_text() == page
+    in_space = words_of(
+        picture(partial(arrangement, plan=calib.plan(5, on="space", arrangements=1), number=0), "svg").decode()
+    )
+    assert "height (m)" in in_space
+    assert in_space.count("5") >= 3
+
+
+def test_a_planned_flight_has_its_path_its_intervals_and_what_brings_more(tmp_path):
+    words = ["plan", "2", "--on", "flight", "--seconds", "8", "--rate", "40", "--anchors", "11,12,13,14"]
+    run(tmp_path, *words, "--anchor-places", "sought", "--poses-until", "4", "-o", "plan.html")
+    text = (tmp_path / "plan.html").read_text(encoding="utf-8")
+    assert {"anchor12", "stays open", "+ the places of the anchors, measured"} <= set(words_of(text))
+    assert "Fit delays, curve and trajectories together." in text
+
+
+def paper(*blocks):
+    read = PdfReader(io.BytesIO(to_pdf(Document("A report", list(blocks)), {})))
+    return [page.extract_text() for page in read.pages]
+
+
+def table(rows, above=()):
+    return Table(["pair", "mean"], [[f"row-{k}", "1.0"] for k in range(rows)], list(above), total=True)
+
+
+# So many lines that the table ends shortly below the page, begins shortly above its end, or has room enough.
+@pytest.mark.parametrize("filled", [18, 24, 44])
+@pytest.mark.parametrize("told", [[], [Text("What the table shows.")]])
+def test_on_paper_a_table_is_not_parted_and_stands_below_its_heading(filled, told):
+    lines = [Text(f"A line of text, the {k}th.") for k in range(filled)]
+    text = paper(*lines, Heading("Before"), *told, table(16, [("", 1), ("raw", 1)]))
+    ends = [k for k, one in enumerate(text) if "row-0 " in one or "row-15" in one]
+    assert len(ends) == 1, "all rows stand on one page"
+    assert sum(one.count("Before") for one in text) == 1
+    if not told:
+        assert "Before" in text[ends[0]]
+
+
+def test_on_paper_a_long_table_goes_on_from_where_it_stands_and_a_wide_one_is_cut():
+    first, *others = paper(Text("A line of text."), Heading("Before"), table(120))
+    assert "row-0 " in first
+    assert len(others) == 2
+    assert all("pair" in page for page in others), "headings come again"
+    wide = Table(["pair", *(f"column-{k}" for k in range(20))], [["1-2", *(f"cell-{k}" for k in range(20))]])
+    (text,) = paper(wide)
+    assert re.findall(r"(?:column|cell)-\d+", text).count("column-19") == 1
+    assert len(set(re.findall(r"cell-\d+", text))) == 20
+    assert text.count("1-2") >= 2, "each part has the first column"
