@@ -172,7 +172,7 @@ def words_of(svg):
 
 
 def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_path):
-    words = ("plan", "7,12,3", "--on", "line", "--arrangements", "2", "--taped", "1")
+    words = ("plan", "survey", "7,12,3", "--on", "line", "--arrangements", "2", "--taped", "1")
     run(tmp_path, *words, "-o", "plan.html", "--figures", "f")
     page, files = (tmp_path / "plan.html").read_text(), {path.name for path in (tmp_path / "f").iterdir()}
     assert files == {f"{name}-{form}" for name in ("arrangement-A", "arrangement-B", "more") for form in FORMS}
@@ -195,8 +195,8 @@ def test_a_plan_has_a_picture_of_each_arrangement_with_tapes_and_intervals(tmp_p
 
 
 def test_a_planned_flight_has_its_path_its_intervals_and_what_brings_more(tmp_path):
-    words = ["plan", "2", "--on", "flight", "--seconds", "8", "--rate", "40", "--anchors", "11,12,13,14"]
-    run(tmp_path, *words, "--anchor-places", "sought", "--poses-until", "4", "-o", "plan.html")
+    words = ["plan", "flight", "2", "--duration", "8", "--rate", "40", "--anchor-tags", "11,12,13,14"]
+    run(tmp_path, *words, "--anchors", "sought", "--poses-until", "4", "-o", "plan.html")
     text = (tmp_path / "plan.html").read_text(encoding="utf-8")
     assert {"anchor12", "stays open", "+ the places of the anchors, measured"} <= set(words_of(text))
     assert "Fit delays, curve and trajectories together." in text
