@@ -21,13 +21,6 @@ with interrupts_held():  # an interrupt within this import ends the process in C
 STORAGE_VERSION: Final = "v1.5.0"
 """Storage of new files: that of the lowest version in pyproject.toml, so that every allowed version reads them."""
 
-_CLOSED: Final[dict[str, Any]] = {
-    "autoinstall_known_extensions": False,
-    "autoload_known_extensions": False,
-    "allow_community_extensions": False,
-    "allow_persistent_secrets": False,
-    "storage_compatibility_version": STORAGE_VERSION,
-}
 _LOCKED: Final = {"enable_external_access": False, "lock_configuration": True}
 """The second makes all settings last, so it comes last."""
 
@@ -54,7 +47,13 @@ def connect(
         "threads": threads,
         "temp_directory": temporary,
     }
-    config = _CLOSED | {name: value for name, value in limits.items() if value is not None}
+    config: dict[str, Any] = {name: value for name, value in limits.items() if value is not None} | {
+        "autoinstall_known_extensions": False,
+        "autoload_known_extensions": False,
+        "allow_community_extensions": False,
+        "allow_persistent_secrets": False,
+        "storage_compatibility_version": STORAGE_VERSION,
+    }
     place = ":memory:" if path is None else str(path)
     named, within = [str(each) for each in paths], [str(each.absolute()) for each in folders]
     if path is not None and not named and not within:

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 __all__: Final = ["as_html", "as_text", "cut", "excerpt", "first_few", "printable"]
 
 SHOWN_ROWS: Final = 6
+"""Rows of a table, and items of a list, that fit beside a headline on a small terminal."""
+
 WIDTH: Final = 79
-LONGEST_CELL: Final = 20
+"""Columns of a terminal that are used: one less than the usual 80, as some break lines at the last."""
 
 
 def printable(value: Any) -> str:
@@ -64,4 +66,4 @@ def first_few(items: Iterable[str], most: int = SHOWN_ROWS) -> str:
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float | np.floating) else cut(printable(value), LONGEST_CELL)
+    return f"{value:.4g}" if isinstance(value, float | np.floating) else cut(printable(value), 20)

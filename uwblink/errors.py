@@ -1,8 +1,5 @@
 """Everything `uwblink` raises on bad input, each also the standard type a caller would expect."""
 
-LONGEST_TEXT = 2000
-"""Characters of an error; more than a screen of them nobody reads."""
-
 
 class OfParameter(Exception):  # noqa: N818 - the base of the bases
     """Base of the errors of all three packages: `parameter` names the parameter that is at fault, where it is one.
@@ -13,9 +10,10 @@ class OfParameter(Exception):  # noqa: N818 - the base of the bases
 
     def __init__(self, text: str, *, parameter: str | None = None) -> None:
         """Say what, where and what to do; a parameter's name goes before the text."""
-        # A text quotes what others wrote, names and cells of any length: what to do stands behind that.
-        if len(text) > LONGEST_TEXT:
-            text = f"{text[: LONGEST_TEXT * 3 // 4]} ... {text[-LONGEST_TEXT // 4 :]}"
+        # A text quotes what others wrote, names and cells of any length: more than a screen of it nobody reads, and
+        # what to do stands behind that.
+        if len(text) > 2000:
+            text = f"{text[:1500]} ... {text[-500:]}"
         super().__init__(f"`{parameter}`: {text}" if parameter else text)
         self.parameter = parameter
 

@@ -13,7 +13,7 @@ from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
 from uwblink.importers.motion_capture import add_poses
 from uwblink.recording.file import Recording
-from uwblink.recording.tags import load_tags
+from uwblink.recording.tags import load_places
 from uwbsim.scenario.loading import load
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +41,7 @@ def test_served_boards_calibrate_like_simulated_ones(tmp_path):
     from calib.estimation.fitting import fit
 
     scenario = load(TRAIN, ["run.duration_s=25"])
-    tags = load_tags(TRAIN)
+    tags, _ = load_places(TRAIN)
     counts = Progress()
     with served(uwbsim.Server.extended(scenario, 300.0)) as server:
         server.write_poses(tmp_path / "poses.csv")

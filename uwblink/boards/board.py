@@ -36,13 +36,8 @@ from uwblink.wire.messages import (
     TestsDone,
 )
 
-KEPT_REPORTS: Final = 10_000
-CIR_S: Final = 0.2
 PROTOCOL_FLAGS: Final = {"ss": False, "ds": True}
 """The protocols of the boards, and their flag in C05."""
-
-ONCE: Final = (Broadcast, Bootloader)
-"""What is not said a second time when no answer came: it may have been done."""
 
 Reply = TypeVar("Reply", bound=Message)
 
@@ -78,7 +73,7 @@ class Board:
         """Talk over an open transport, or go on with its `connection`; `open` is for a port by name."""
         self._transport = transport
         self._connection = connection or Connection(transport.name, answer_s)
-        self._reports: deque[Event] = deque(maxlen=KEPT_REPORTS)
+        self._reports: deque[Event] = deque(maxlen=10_000)
         self._id: int | None = None
 
     @classmethod
@@ -126,8 +121,8 @@ class Board:
             return self._exchange(command)
         except NoAnswerError as error:
             self._revive(error)
-            if isinstance(command, ONCE):
-                raise
+            if isinstance(command, Broadcast | Bootloader):
+                raise  # it may have been done, and is not to be done twice
         return self._exchange(command)
 
     def range(
@@ -150,10 +145,10 @@ class Board:
     def cir(self, target: int, *, protocol: str = "ds") -> tuple[RangeReport, Cir]:
         """Range with another board and return its report and the channel impulse response of the last frame."""
         report = self.range(target, protocol=protocol, get_cir=True)
-        for event in self.reports(CIR_S):
+        for event in self.reports(0.2):
             if isinstance(event, Cir):
                 return report, event
-        raise NoAnswerError(f"{self.name}: no channel impulse response within {CIR_S * 1e3:.0f} ms of the range")
+        raise NoAnswerError(f"{self.name}: no channel impulse response within 200 ms of the range")
 
     def set_passive(self, on: bool) -> None:
         """Listen to the exchanges of others, or stop to; forgotten at a power cycle."""

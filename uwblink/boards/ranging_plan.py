@@ -34,7 +34,6 @@ from uwblink.recording.schema import Tag
 from uwblink.recording.tags import is_board_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 
-PROTOCOLS: Final = ("ds", "ss")
 FILE_KEYS: Final = (
     FileKey("pairs", '"all" or [[initiator, target], ...]', '"all"', "Who ranges with whom, in turns."),
     FileKey("rate_hz", "number, Hz, above 0", "as fast as the boards answer", "Exchanges a second in total."),
@@ -48,7 +47,7 @@ FILE_KEYS: Final = (
     FileKey("tags[].lever_arm_m", "3 numbers, m", "[0.0, 0.0, 0.0]", "Where its antenna sits in the body's frame."),
     *DELAY_KEYS,
 )
-KEYS: Final = tuple(name.removesuffix("[]") for name in heads(FILE_KEYS))
+"""The keys of a plan's file, for its reader and the reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +78,8 @@ class RangingPlan:
         """Check what was given."""
         if self.rate_hz is not None and not (is_number(self.rate_hz) and self.rate_hz > 0):
             raise PlanError(f"rate_hz: found {self.rate_hz!r}, expected a positive number")
-        if self.protocol not in PROTOCOLS:
-            raise PlanError(f"protocol: found {self.protocol!r}, allowed: {', '.join(PROTOCOLS)}")
+        if self.protocol not in ("ds", "ss"):
+            raise PlanError(f"protocol: found {self.protocol!r}, allowed: ds, ss")
         for pair in () if self.pairs == "all" else self.pairs:
             if not (isinstance(pair, tuple) and len(pair) == 2 and all(map(is_board_id, pair)) and pair[0] != pair[1]):
                 raise PlanError(f'pairs: found {pair!r:.60}, expected "all" or pairs of two different ids')
@@ -125,11 +124,11 @@ def load_plan(path: Path) -> RangingPlan:
     """Read a plan; raises `PlanError` that names the key."""
     file = TomlReader(path, PlanError)
     table = file.table
-    file.known(table, KEYS)
+    file.known(table, (name.removesuffix("[]") for name in heads(FILE_KEYS)))
     rate = table.get("rate_hz")
     file.check("rate_hz", rate, rate is None or (is_number(rate) and rate > 0), "a positive number")
     flags = {name: table.get(name, False) for name in ("target_reports", "get_cir")}
-    protocol = file.choice("protocol", table.get("protocol", "ds"), PROTOCOLS)
+    protocol = file.choice("protocol", table.get("protocol", "ds"), ("ds", "ss"))
     for name, value in flags.items():
         file.check(name, value, isinstance(value, bool), "true or false")
     pairs = _pairs(path, table.get("pairs", "all"))

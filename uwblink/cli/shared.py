@@ -27,17 +27,6 @@ FLAGS: Final = {"map_file": "--map", "tags_from": "--tags", "duration_s": "--dur
 Flags = Mapping[str, str]
 """What stands for a parameter on a command line, by its name, where it is spelt otherwise."""
 
-BESIDE: Final = ("numpy", "scipy", "duckdb", "pydantic", "simpy", "matplotlib")
-"""Distributions on whose versions results, files and figures depend."""
-
-_PARAMETER: Final = re.compile(r"`([a-z_]+)`")
-
-SECOND: Final = 2
-"""The interrupt that is not taken."""
-
-MISTAKE: Final = 2
-"""Exit status of a command that cannot do what it was told."""
-
 
 def new_app(text: str) -> typer.Typer:
     """Return a command without sub-commands yet, whose help begins with `text`, and which knows `--version`."""
@@ -63,7 +52,8 @@ def _versions(command: str) -> Iterator[str]:
 
     yield f"{command.split()[-1]} {__version__}"
     found = [f"Python {platform.python_version()}"]
-    for name in BESIDE:
+    # Results, files and figures depend on their versions.
+    for name in ("numpy", "scipy", "duckdb", "pydantic", "simpy", "matplotlib"):
         with suppress(PackageNotFoundError):
             found.append(f"{name} {version(name)}")
     yield ", ".join(found)
@@ -93,7 +83,7 @@ def run(
                     raise
                 typer.echo(f"error: {one_line(with_flags(text, FLAGS | dict(flags)))}", err=True)
                 found = (number for kind, number in (statuses or {}).items() if isinstance(error, kind))
-                status = next(found, MISTAKE)
+                status = next(found, 2)
     if interrupted():
         # Whatever a library made of it: an error of its own, or nothing at all.
         typer.echo("interrupted", err=True)
@@ -127,7 +117,7 @@ def _noted_interrupts() -> Iterator[Callable[[], bool]]:
 
     def note(number: int, frame: Any) -> None:
         asked.append(number)
-        if len(asked) != SECOND:  # which would interrupt the tidying up; a third ends what hangs
+        if len(asked) != 2:  # which would interrupt the tidying up; a third ends what hangs
             signal.default_int_handler(number, frame)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -140,7 +130,7 @@ def _noted_interrupts() -> Iterator[Callable[[], bool]]:
 
 def with_flags(text: str, flags: Flags = FLAGS) -> str:
     """Return a text with flags in place of the parameters in backticks: `force` becomes --force."""
-    return _PARAMETER.sub(lambda found: flags.get(found[1], f"--{found[1].replace('_', '-')}"), text)
+    return re.sub(r"`([a-z_]+)`", lambda found: flags.get(found[1], f"--{found[1].replace('_', '-')}"), text)
 
 
 def print_json(document: Any) -> None:

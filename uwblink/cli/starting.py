@@ -15,20 +15,14 @@ from typing import Any, Final, NoReturn
 INTERRUPTED: Final = 130
 """Exit status of a command that Ctrl-C ended before it was done, as shells have it."""
 
-COLLECT_AFTER: Final = 50_000
-"""New objects between two searches for cycles. Importing and drawing make many objects that stay, and spent a tenth of
-their time on being searched every 700."""
-
-THREADS: Final = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What libraries of linear algebra are told by how many threads they may take; they look when NumPy is imported."""
-
 
 def start(command: Callable[[], NoReturn]) -> NoReturn:
     """Import and run a command; until it answers Ctrl-C itself, that is one line and status 130."""
     before = signal.signal(signal.SIGINT, _leave)
-    gc.set_threshold(COLLECT_AFTER)
+    # Importing and drawing make many objects that stay: searched for cycles every 700, they cost a tenth of the time.
+    gc.set_threshold(50_000)
     # Matrices are small here, and threads that wait for large ones do so by counting: a tenth of a command's time.
-    for name in THREADS:
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # read when NumPy is imported
         os.environ.setdefault(name, "1")
     try:
         command()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,6 @@ from uwblink.errors import ImportTableError
 from uwblink.recording.schema import POSE, Poses, Tag
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges, raw_range
-
-ROWS_AT_ONCE: Final = 32_768
-"""Ranges whose distances are computed together, so that intermediate results stay in the processor's cache."""
 
 
 class Track:
@@ -154,8 +151,9 @@ def distances_m(poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, tar
     """
     tracks = tracks_of(poses, tags) if isinstance(poses, Poses) else poses
     found = np.empty(len(time_ns))
-    for begin in range(0, len(time_ns), ROWS_AT_ONCE):
-        rows = slice(begin, begin + ROWS_AT_ONCE)
+    # 32768 at once, so that intermediate results stay in the processor's cache.
+    for begin in range(0, len(time_ns), 32_768):
+        rows = slice(begin, begin + 32_768)
         (x, y, z), other = (_antennas(tracks, tags, ids[rows], time_ns[rows]) for ids in (target, initiator))
         x -= other[0]
         y -= other[1]

@@ -33,9 +33,6 @@ from uwblink.text_files import require_regular
 if TYPE_CHECKING:
     from uwblink.recording.summary import Summary
 
-COPYING_MB: Final = 300
-"""Memory for a file that is written again; without a limit, it would be the size of the file."""
-
 WANTED: Final = ".wanted"
 BEGUN: Final = ".partial-begun"
 READY: Final = ".snapshot"
@@ -225,7 +222,9 @@ class Recording(Tables):
         """
         known_tables(without)
         entries = {} if "meta" in without else self.meta()
-        with type(self).create(path, meta=entries | dict(meta or {}), force=force, memory_mb=COPYING_MB) as written:
+        entries |= dict(meta or {})
+        # Without a limit of memory, it would be the size of the file.
+        with type(self).create(path, meta=entries, force=force, memory_mb=300) as written:
             for table in TABLES:
                 if table != "meta" and table not in without:
                     written._store.take(self._store, table)

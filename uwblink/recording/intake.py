@@ -59,8 +59,10 @@ COLUMNS: Final = (
 _ROWS: Final = "SELECT table_name, estimated_size FROM system.main.duckdb_tables() WHERE NOT internal"
 """The query for how many rows its tables have."""
 
-_TABLES: Final = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".jsonl", ".ndjson")
-IMPORTED_AS: Final = {**dict.fromkeys(_TABLES, "csv"), **dict.fromkeys((".bag", ".mcap", ".db3"), "bag")}
+IMPORTED_AS: Final = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".gz", ".parquet", ".jsonl", ".ndjson"), "csv"),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), "bag"),
+}
 """Endings of files in other formats, and the importer that reads them."""
 
 

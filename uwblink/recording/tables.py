@@ -40,9 +40,6 @@ Columns = dict[str, NDArray[Any]]
 ROWS_AT_ONCE: Final = 131_072
 """Exchanges of a block: a little more than a row group of DuckDB (122880)."""
 
-_EMPTY: Final = {"BIGINT": np.int64, "BOOLEAN": np.bool_, "DOUBLE": np.float64, "USMALLINT": np.uint16}
-"""Types of the columns of a table that a file does not have."""
-
 
 class Tables:
     """Reads and appends; each method raises `RecordingError` where it cannot.
@@ -237,7 +234,8 @@ class Tables:
         known_tables([table])
         present = self._store.columns().get(table)
         if present is None:
-            return {name: np.empty(0, dtype=_EMPTY.get(kind, object)) for name, kind in TABLES[table].items()}
+            types = {"BIGINT": "i8", "BOOLEAN": "?", "DOUBLE": "f8", "USMALLINT": "u2"}
+            return {name: np.empty(0, dtype=types.get(kind, "O")) for name, kind in TABLES[table].items()}
         names = ", ".join(f'"{name}"' for name in TABLES[table] if name in present)
         return self._store.read(f"SELECT {names} FROM {table} {_within(start_ns, end_ns)} ORDER BY rowid")  # noqa: S608 - keys of TABLES
 

@@ -10,16 +10,7 @@ from uwblink.recording.schema import Tag
 from uwblink.text_files import TomlReader, is_number
 
 LARGEST_BOARD_ID: Final = 254
-PLAN_KEYS: Final = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "antenna_delays")
-"""What a ranging plan has beside its tags: a plan says where tags sit, too."""
-
-
-def load_tags(path: Path) -> tuple[Tag, ...]:
-    """Read the `[[tags]]` of a plan or a scenario; raises `PlanError`."""
-    tags = read_tags(_file_of_tags(path))
-    if not tags:
-        raise PlanError(f"{path}: holds no [[tags]] with id, body and lever_arm_m")
-    return tags
+"""255 is no board's: the firmware's ids have eight bits."""
 
 
 def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, float, float]]]:
@@ -70,7 +61,9 @@ def _file_of_tags(path: Path) -> TomlReader:
     """Return a reader of a plan, a scenario, or a file of tags and anchors."""
     file = TomlReader(path, PlanError, "file of tags (.toml)")
     if not _is_scenario(file):
-        file.known(file.table, ("tags", "anchors", *PLAN_KEYS))
+        # A ranging plan says where tags sit, too.
+        plan = ("pairs", "rate_hz", "protocol", "target_reports", "get_cir", "antenna_delays")
+        file.known(file.table, ("tags", "anchors", *plan))
     return file
 
 

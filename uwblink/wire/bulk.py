@@ -17,13 +17,18 @@ from uwblink.twr import STAMPS, Exchanges
 from uwblink.wire.codec import Decoder, Event
 from uwblink.wire.messages import REPORTS, RangeReport
 
-_ID: Final = rb"(?:25[0-5]|2[0-4][0-9]|1[0-9][0-9]|[1-9]?[0-9])"
-_STAMP: Final = rb"(?:0|[1-9][0-9]{0,9}+)"
-_NUMBER: Final = rb"-?(?:0|[1-9][0-9]{0,9}+)\.[0-9]{4}"
-_LINE: Final = rb"[RS]05\|" + rb"\|".join([_ID, _NUMBER, *[_STAMP] * 6, *[_NUMBER] * 4]) + rb"\r\n"
-RUN: Final = re.compile(rb"(?:" + _LINE + rb")++")
+
+def _run_of_reports() -> re.Pattern[bytes]:
+    board, stamp = rb"(?:25[0-5]|2[0-4][0-9]|1[0-9][0-9]|[1-9]?[0-9])", rb"(?:0|[1-9][0-9]{0,9}+)"
+    number = rb"-?(?:0|[1-9][0-9]{0,9}+)\.[0-9]{4}"
+    line = rb"[RS]05\|" + rb"\|".join([board, number, *[stamp] * 6, *[number] * 4]) + rb"\r\n"
+    return re.compile(rb"(?:" + line + rb")++")
+
+
+RUN: Final = _run_of_reports()
+"""Well-formed reports one after the other; stamps may still have more than 32 bits."""
+
 FIELDS: Final = tuple(RangeReport.FIELDS)
-INITIATOR_REPORT: Final = b"R05"
 
 
 class ColumnDecoder:
@@ -86,7 +91,7 @@ def exchanges_of(rows: list[tuple[int, int, RangeReport]]) -> Exchanges:
 
 
 def _values(reports: list[RangeReport]) -> Floats:
-    return np.array([[r.KEY == INITIATOR_REPORT, *(getattr(r, name) for name in FIELDS)] for r in reports], dtype=float)
+    return np.array([[r.KEY == b"R05", *(getattr(r, name) for name in FIELDS)] for r in reports], dtype=float)
 
 
 def _exchanges(time_ns: Ints, board: Ints, values: Floats) -> Exchanges:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from uwblink.errors import FrameError
-from uwblink.wire.fields import BAR, ID, INT, LONGEST_TEXT, Kind, Malformed, NeedMore
+from uwblink.wire.fields import ID, INT, LONGEST_TEXT, Kind, Malformed, NeedMore
 from uwblink.wire.messages import (
     COMMANDS,
     TEXTS,
@@ -30,8 +30,6 @@ Event = Message | TextLine | Skipped
 LONGEST_LINE: Final = 8192
 """A CIR with five digits a tap has about 6100 bytes; nothing is longer."""
 
-TAP: Final = re.compile(rb"0|[1-9][0-9]{0,4}")
-
 
 def encode(message: Message) -> bytes:
     """Return a command or report as the bytes on the wire; raises `FrameError` naming the field."""
@@ -46,7 +44,7 @@ def encode(message: Message) -> bytes:
     if isinstance(message, Cir):
         parts += [b"%d" % part for part in divmod(message.first_path_milli, 1000)]
         parts += [b"%d" % tap for tap in message.magnitudes]
-    return BAR.join(parts) + _terminator(message.KEY)
+    return b"|".join(parts) + _terminator(message.KEY)
 
 
 def _terminator(key: bytes) -> bytes:
@@ -135,7 +133,7 @@ class Decoder:
         """Return the message or text at a place and where it ends, or say why there is none."""
         key = buffer[at : at + 3]
         kind = self._table.get(key)
-        if kind is not None and (clean or buffer[at + 3 : at + 4] == BAR):
+        if kind is not None and (clean or buffer[at + 3 : at + 4] == b"|"):
             return self._message(kind, buffer, at)
         for text in self._texts:
             if buffer.startswith(text, at):
@@ -151,14 +149,14 @@ class Decoder:
         end = buffer.find(self._terminator, at + 3, at + LONGEST_LINE)
         if end < 0:
             raise Malformed if len(buffer) - at >= LONGEST_LINE else NeedMore
-        return _from_parts(kind, buffer[at + 3 : end].split(BAR)), end + len(self._terminator)
+        return _from_parts(kind, buffer[at + 3 : end].split(b"|")), end + len(self._terminator)
 
     def _counted(self, kind: type[Message], buffer: bytes, at: int) -> tuple[Message, int]:
         """Read a message whose fields hold arbitrary bytes, one field after the other."""
         values, at = [], at + 3
         for number, field in enumerate(kind.FIELDS.values(), start=1):
-            at = _expect(buffer, at, BAR)
-            end = self._field_end(field, buffer, at, BAR if number < len(kind.FIELDS) else self._terminator)
+            at = _expect(buffer, at, b"|")
+            end = self._field_end(field, buffer, at, b"|" if number < len(kind.FIELDS) else self._terminator)
             values.append(field.read(buffer[at:end]))
             at = end
         return kind(*values), _expect(buffer, at, self._terminator)
@@ -204,6 +202,7 @@ def _cir(parts: list[bytes]) -> Cir:
         raise Malformed
     whole, milli = INT.read(parts[2]), INT.read(parts[3])
     taps = parts[4:]
-    if not 0 <= milli < 1000 or not 0 <= whole < Cir.TAPS + 8 or not all(map(TAP.fullmatch, taps)):
+    tap = re.compile(rb"0|[1-9][0-9]{0,4}")
+    if not 0 <= milli < 1000 or not 0 <= whole < Cir.TAPS + 8 or not all(map(tap.fullmatch, taps)):
         raise Malformed
     return Cir(ID.read(parts[0]), ID.read(parts[1]), 1000 * whole + milli, tuple(map(int, taps)))

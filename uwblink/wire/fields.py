@@ -15,10 +15,11 @@ from typing import Any, Final
 
 from uwblink.errors import FrameError
 
-BAR: Final = b"|"
 LONGEST_TEXT: Final = 199
-LONGEST_BYTES: Final = 1000
+"""Bytes of a text that the boards' buffer takes (firmware wire format, 1.2)."""
+
 LONGEST_BROADCAST: Final = 92
+"""Bytes of a frame of the radio, without header and checksum (firmware wire format, 1.3)."""
 
 
 class Malformed(Exception):  # noqa: N818 - a signal inside the codec, not an error for users
@@ -42,13 +43,9 @@ class Kind:
     size: Callable[[bytes, int], int] | None = None
 
 
-_FLOAT: Final = re.compile(rb"-?(0|[1-9][0-9]{0,9})\.[0-9]{4}")
-_INTEGER: Final = re.compile(rb"0|-?[1-9][0-9]{0,9}")
-
-
 def _integer(low: int, high: int) -> Kind:
     def read(text: bytes) -> int:
-        if not _INTEGER.fullmatch(text) or not low <= int(text) <= high:
+        if not re.fullmatch(rb"0|-?[1-9][0-9]{0,9}", text) or not low <= int(text) <= high:
             raise Malformed
         return int(text)
 
@@ -92,7 +89,7 @@ def _write_text(value: str) -> bytes:
 
 
 def _read_printed(text: bytes) -> float:
-    if not _FLOAT.fullmatch(text):
+    if not re.fullmatch(rb"-?(0|[1-9][0-9]{0,9})\.[0-9]{4}", text):
         raise Malformed
     return float(text)
 
@@ -156,4 +153,4 @@ PRINTED: Final = Kind("printed number", _read_printed, write_printed)
 PRINTED_OR_ZERO: Final = Kind("printed number or 0", _read_printed_or_zero, _write_printed_or_zero)
 RAW_FLOAT: Final = Kind("four-byte float", _read_raw_float, _write_raw_float, _four)
 BROADCAST: Final = _bytes(LONGEST_BROADCAST)
-BYTES: Final = _bytes(LONGEST_BYTES)
+BYTES: Final = _bytes(1000)  # more than any frame, so that the end of damage is found

@@ -369,19 +369,16 @@ def register_message(kind: type[Message]) -> None:
     table[kind.KEY] = kind
 
 
-_WITH_CRLF: Final = (
-    "COMMANDED TASK FAILED AFTER 5 ATTEMPTS.",
-    "TWR FAIL: The target ID is the same as the initiator's ID.",
-    "WARNING 0xB: TWR message is firing an interrupt when it shouldn't be.",
-    "WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.",
+TEXTS: Final = (
+    b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n",
+    b"TWR FAIL: The target ID is the same as the initiator's ID.\r\n",
+    b"WARNING 0xB: TWR message is firing an interrupt when it shouldn't be.\r\n",
+    b"WARNING 0xC: TWR message is firing an interrupt when it shouldn't be.\r\n",
+    b"Unrecognized UWB message type received.",
+    b"ERROR: Requested to send message over UWB that is too long.",
+    b"No next key character found.",
+    b"Failed to detect USB command terminator char! Trying my best",
+    b"USB Buffer full! Message rejected to prevent overflow.",
+    b"UWB tag initialized and configured. \n",
 )
-_BARE: Final = (
-    "Unrecognized UWB message type received.",
-    "ERROR: Requested to send message over UWB that is too long.",
-    "No next key character found.",
-    "Failed to detect USB command terminator char! Trying my best",
-    "USB Buffer full! Message rejected to prevent overflow.",
-    "UWB tag initialized and configured. \n",
-)
-TEXTS: Final = tuple(t.encode() for t in (*(line + "\r\n" for line in _WITH_CRLF), *_BARE))
 """The lines of text of the firmware, byte for byte; some end without a line end."""

@@ -5,7 +5,7 @@ import pytest
 from uwblink.boards.ranging_plan import RangingPlan, load_plan
 from uwblink.errors import PlanError
 from uwblink.recording.schema import Tag
-from uwblink.recording.tags import load_tags
+from uwblink.recording.tags import load_places
 
 
 def written(tmp_path, text):
@@ -67,7 +67,7 @@ def test_an_absent_tag_is_named():
 
 
 def test_tags_come_from_a_scenario_too(tmp_path):
-    assert load_tags(written(tmp_path, "[run]\nseed = 1\n[[tags]]\nid = 4\nbody = 'x'\nskew_ppm = 3\n")) == (
+    assert load_places(written(tmp_path, "[run]\nseed = 1\n[[tags]]\nid = 4\nbody = 'x'\nskew_ppm = 3\n"))[0] == (
         Tag(4, "x", (0.0, 0.0, 0.0)),
     )
 
