@@ -12,7 +12,7 @@ class ScenarioError(UwbsimError, ValueError):
 
 
 class UnanswerableError(ScenarioError):
-    """A good recording that does not say enough for a twin: exit status 1."""
+    """A sound recording with too little data for a twin: exit status 1."""
 
 
 class ParameterError(ScenarioError):

@@ -79,7 +79,7 @@ Payload = PollPayload | ResponsePayload | FinalPayload | DataPayload
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Receptions:
-    """A frame at all boards, shape (tags,), whoever listens.
+    """A frame at all boards, shape (tags,), whether it listens or not.
 
     Power at the antenna, whether it is strong enough and not lost, its stamp (ticks, not wrapped), and what is printed
     of it.
@@ -149,7 +149,7 @@ class Radios:
         return _on_grid(received + latency - ANTENNA_DELAY_TICKS) + self.tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
-        """Return the transmit stamps of a frame that is to leave a while after the stamp `reference`.
+        """Return the transmit stamps of a frame that is to leave some time after the stamp `reference`.
 
         The chip's, which ignores the low nine bits of the time at which it is told to send; and the one that the
         firmware works out and sends, with a constant of its build.
@@ -227,7 +227,7 @@ class BoardAir:
     """The medium. Frames are announced when it is decided to send them, and arrive when they end."""
 
     def __init__(self, env: simpy.Environment, radios: Radios) -> None:
-        """Begin with nothing on the air and no board."""
+        """`radios` compute how frames are received."""
         self.env, self.physics = env, radios
         self.radios: dict[int, Radio] = {}
         self._frames: list[Frame] = []
@@ -294,7 +294,7 @@ class Radio:
     """The radio of a board. `since` is when (ns) its receiver was switched on, None while it is off."""
 
     def __init__(self, air: BoardAir, board: int, interrupt: Callable[[Received | None], None]) -> None:
-        """Be off; `interrupt` gets what arrives while nobody waits for it, None for a damaged frame."""
+        """`interrupt` gets what arrives while no task waits for it, None for a damaged frame."""
         self._air, self._board, self._interrupt = air, board, interrupt
         self.since: int | None = None
         self.masked = False
@@ -353,7 +353,7 @@ class Radio:
         return received
 
     def take(self, received: Received | None) -> None:
-        """Have received a frame, None if it was damaged: whoever waits gets it, otherwise it interrupts."""
+        """Take a received frame, None if damaged: a waiting task gets it, otherwise it interrupts."""
         waiting, self._waiting = self._waiting, None
         self.since = None
         if waiting is not None:

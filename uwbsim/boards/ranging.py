@@ -243,7 +243,7 @@ def overhear(board: VirtualBoard, poll: Received) -> Steps:
     """Follow the exchange that a poll begins, and print it; nothing, or zeros, where a frame does not come."""
     wish, initiator, target = poll.frame.payload, poll.frame.sender, poll.frame.receiver
     if not isinstance(wish, PollPayload) or target is None:
-        raise TypeError("an exchange begins with a poll for somebody")
+        raise TypeError("an exchange begins with a poll for a board")
     heard = [poll]
     for payload, sender, receiver, patience in _sequence(wish, initiator, target):
         came = yield from board.radio.wait(patience)

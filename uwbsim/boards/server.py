@@ -54,7 +54,7 @@ def stays_s(scenario: Scenario) -> list[tuple[float, float]]:
 class LivePoses:
     """Writes what motion capture sees, with its rate, noise, latency and gaps, as `uwblink poses` reads it.
 
-    Rows are written whole, so that whoever reads the file meanwhile finds complete lines.
+    Rows are written whole, so that a reader of the file finds complete lines meanwhile.
     """
 
     def __init__(self, world: World, path: Path, epoch_ns: int) -> None:
@@ -67,7 +67,7 @@ class LivePoses:
         self._file.flush()
 
     def write_until(self, time_ns: int) -> None:
-        """Append what motion capture has told by a time of the world."""
+        """Append the poses that motion capture has delivered by a time of the world."""
         mocap = self._world.scenario.mocap
         latency_ns = round(mocap.latency_ms * 1e6)
         end = math.floor((time_ns - latency_ns) * mocap.rate_hz / NS_PER_S) + 1
@@ -159,8 +159,9 @@ class Server:
     ) -> None:
         """Open one pseudo-terminal a tag; raises `PortError` where a link cannot be made.
 
-        With a `speed` below 1 the boards' time passes that much slower than the wall clock's. `tell` is told in a line
-        what went wrong that does not end the serving: a board's own program failed, poses cannot be written any more.
+        With a `speed` below 1 the boards' time passes that much slower than the wall clock's. `tell` is called with
+        a line about each failure that does not end the serving: a board's own program failed, or poses cannot be
+        written any more.
         """
         self._speed, self._tell = speed, tell
         self._faults = faults or Faults()
@@ -188,7 +189,7 @@ class Server:
 
     @staticmethod
     def extended(scenario: Scenario, duration_s: float | None) -> Scenario:
-        """Return a scenario that lasts as long as it is to be served; two hours where nobody says for how long.
+        """Return a scenario that lasts as long as it is to be served; two hours where no duration is given.
 
         Then bodies hold their place.
         """
@@ -224,7 +225,7 @@ class Server:
             heapq.heappop(self._timed)[2]()
 
     def announce(self, tell: Callable[[str], object]) -> None:
-        """Have `tell` told in a line when boards that are carried from place to place stand, and until when."""
+        """Call `tell` with a line when boards that are carried from place to place stand still, and until when."""
         stays = stays_s(self.bench.radios.scenario)
         for number, (begin_s, end_s) in enumerate(stays, start=1):
             until = "stay there" if math.isinf(end_s) else f"stand until {end_s:g} s"

@@ -34,7 +34,7 @@ class UsbLink:
     that found the bus busy."""
 
     def __init__(self, env: simpy.Environment, send: Callable[[bytes], None]) -> None:
-        """Be plugged in; `send` takes the bytes of a transfer at its time."""
+        """`send` takes the bytes of a transfer at its time."""
         self._env, self._send = env, send
         self._packets: list[bytes] = []
         self._busy_until = 0
@@ -114,7 +114,7 @@ class Bench:
         self.radios = Radios(scenario, lost_share)
         self.air = BoardAir(self.env, self.radios)
         self.crashed: Callable[[VirtualBoard, Exception], None] | None = None
-        """Told when a board's own program raises, and the board hangs then; without it, the exception is raised."""
+        """Called when a board's own program raises; the board hangs then. Without it, the exception is raised."""
         self.boards = {tag.id: VirtualBoard(self, tag.id) for tag in scenario.tags}
 
     def advance(self, time_ns: int) -> None:
@@ -215,7 +215,7 @@ class VirtualBoard:
             released.succeed()
 
     def _interrupted(self, received: Received | None) -> None:
-        """Deal with a frame for which nobody was waiting; what takes time keeps the processor from the USB task."""
+        """Handle a frame that no task was waiting for; what takes time keeps the processor from the USB task."""
         steps = received_by(self, received)
         if steps is None:
             return

@@ -31,7 +31,7 @@ MOST_TRANSFERS: Final = 20_000
 
 
 class VirtualPorts:
-    """The ports of a scenario's boards. Time passes only while somebody reads or waits.
+    """The ports of a scenario's boards. Time passes only while a caller reads or waits.
 
     `names` are what `open` takes, by tag; `lost_share` of all frames on the air are lost besides the weak ones.
 

@@ -173,7 +173,7 @@ def validate(
     allow_files: AllowFiles = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say what a scenario will do, without running it."""
+    """Summarise what a scenario will do, without running it."""
     import uwbsim
 
     found = uwbsim.preview(uwbsim.load(scenario, overrides or (), allow_files=allow_files or ()))

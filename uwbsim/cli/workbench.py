@@ -59,7 +59,7 @@ def compare(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Range with every protocol in the same random world, and say what each knows and costs."""
+    """Simulate ranges of every protocol in the same random world, and compare their errors and costs."""
     import uwbsim
     from uwblink.output import check_folder
     from uwbsim.pages import FILES, write_comparison
@@ -145,7 +145,7 @@ def predict(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say mean and standard deviation of a range without simulating any."""
+    """Predict the bias and standard deviation of a range analytically."""
     import uwbsim
 
     found = uwbsim.predict_state(

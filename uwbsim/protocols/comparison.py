@@ -89,7 +89,7 @@ class Comparison:
 
     @cached_property
     def winners(self) -> list[dict[str, Any]]:
-        """Say for some delays of the scheduled reply which protocol errs least, as a calibration leaves it."""
+        """Return which protocol errs least at some delays of the scheduled reply, after a calibration."""
         return winners(self.scenario, self.protocols)
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def compare(
     count: int = 1_000_000,
     progress: Callable[[float], None] | None = None,
 ) -> Comparison:
-    """Range `count` times with each protocol in one random world, with the same noise; say how raw ranges err.
+    """Range `count` times with each protocol in one random world, with the same noise; return how raw ranges err.
 
     `scenario` is whatever `load` takes, or a `Scenario`; `protocols` are names or rows of `PROTOCOLS`, None for all,
     those included that were registered. `progress` is called with the done fraction, 0 to 1. Raises `ParameterError`
@@ -204,7 +204,7 @@ def costs(scenario: Scenario, protocol: RangingProtocol, scheduled_s: float | No
 
 
 def winners(scenario: Scenario, protocols: Sequence[RangingProtocol]) -> list[dict[str, Any]]:
-    """Say which protocol wins at which delay of the scheduled reply, as a calibration leaves it, by prediction.
+    """Return which protocol wins at which delay of the scheduled reply after a calibration, by prediction.
 
     By `rmse`, a single range; by `per_second`, the mean of as many as one pair has in a second of its own
     (`Prediction.mean_of`), which is what counts where the air is full and ranges are averaged.

@@ -25,7 +25,7 @@ from uwbsim.world.reception import arrive
 from uwbsim.world.world import World
 
 STATES: Final = 16_384
-"""So many states of the world are sampled; it is also the length of the pieces that fit into a core's cache."""
+"""States of the world that are sampled; it is also the length of the pieces that fit into a core's cache."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

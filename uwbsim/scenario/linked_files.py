@@ -1,7 +1,7 @@
 """Files that a scenario names: antenna tables, trajectories, plans. Their contents take the place of their names.
 
 Names are relative to the scenario's folder, and lead to regular files in it or below, whatever links stand there: who
-runs the scenario of a stranger has named no other file.
+runs an untrusted scenario opens no other file.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path
     except (OSError, RuntimeError, ValueError) as error:  # a circle of links, a NUL
         raise ScenarioError(f"{where}, but there is no such file beside the scenario") from error
     if not inside:
-        # Whether there is such a file is nobody's business either.
+        # The message does not reveal whether the file exists.
         raise ScenarioError(f"{where}, which is not below the naming file's folder; `allow_files` names other folders")
     if not place.exists():
         raise ScenarioError(f"{where}, but there is no such file beside the scenario")

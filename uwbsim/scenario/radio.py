@@ -68,7 +68,7 @@ The boards of these flights had dt32/dt53 of 305 us to 1539 us.
 class IndependentMultipath(Section):
     """The positive tail, drawn for each exchange alone: with `probability` it travels an exponential excess distance.
 
-    All pairs are alike, nothing lasts, and neither power nor impulse response tells such an exchange from others.
+    All pairs are alike, nothing lasts, and neither power nor impulse response differs from that of other exchanges.
     """
 
     model: Literal["independent"] = Field("independent", description="Drawn for each exchange alone.")
@@ -190,7 +190,7 @@ class GeometricMultipath(Section):
     tap, or at `radio.sensitivity_dbm`.
 
     `scatter_loss_db` and `decay_ns` were chosen so that rooms have the total less first-path powers of MILUV's recorded
-    responses (median 7.5 dB); these also say 18 dB for `radio.dynamic_range_db`, and 12 for `threshold_to_noise`.
+    responses (median 7.5 dB); they also suggest 18 dB for `radio.dynamic_range_db`, and 12 for `threshold_to_noise`.
     """
 
     model: Literal["geometric"] = Field(description="One impulse response from geometry.")

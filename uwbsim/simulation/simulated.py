@@ -102,10 +102,8 @@ def write(
         recording.append_poses(simulated.poses)
         recording.append_exchanges(simulated.exchanges)
         recording.append_faults(simulated.faults)
-        recording.append_columns("overheard", simulated.overheard)
-        recording.append_columns("temperature", simulated.temperature)
-        recording.append_columns("imu", simulated.imu)
-        recording.append_columns("height", simulated.height)
+        for table in ("overheard", "temperature", "imu", "height"):
+            recording.append_columns(table, getattr(simulated, table))
         recording.append_cirs(simulated.cirs)
         recording.append_frames(frames)
 

@@ -189,7 +189,7 @@ class Workers:
     """Raised by the future of a chunk whose worker died."""
 
     def __init__(self, size: int, work: Work) -> None:
-        """Begin without chunks."""
+        """`size` is how many chunks are worked on at once."""
         self.size, self._work = size, work
         self._running: dict[Any, Chunk] = {}
 
@@ -269,7 +269,7 @@ class Cluster(Workers):
     """A Dask cluster by the address of its scheduler; `distributed` moves the work of a dead worker to another."""
 
     def __init__(self, address: str, work: Work) -> None:
-        """Connect; raises `ParameterError` where nobody answers within ten seconds."""
+        """Connect; raises `ParameterError` where no scheduler answers within ten seconds."""
         work.check()
         self._address = address
         try:
@@ -331,7 +331,7 @@ def _end_with(held: Connection) -> None:
 
 @contextmanager
 def _inherited() -> Iterator[None]:
-    """Have processes that are started begin with one thread each in linear algebra, and without Ctrl-C.
+    """Start processes with one thread each in linear algebra, and with Ctrl-C blocked.
 
     A terminal sends that to all of them, and it is this process that answers.
     """

@@ -28,7 +28,7 @@ LONGEST_DOCUMENT: Final = 100_000
 
 
 class Store:
-    """Results by number, committed as they come: whoever is killed loses what was not committed, and nothing else."""
+    """Results by number, committed as they come: a killed sweep loses what was not committed, and nothing else."""
 
     def __init__(self, connection: Any, path: Path) -> None:
         """Wrap an open database; use `create` or `open`."""
@@ -56,7 +56,7 @@ class Store:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open a store, which may be a stranger's; raises `TableError` where the file is none, or more than that."""
+        """Open a store from an untrusted file; raises `TableError` where it is no store, or its rows are too long."""
         db = _connect(path)
         try:
             with _reading(path), interrupted_after(longest_read_s(path.stat().st_size), db.interrupt):
@@ -142,7 +142,7 @@ def _connect(path: Path) -> Any:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Say of which store results cannot be read."""
+    """Turn an error of reading into one that names the store."""
     import duckdb
 
     try:
@@ -155,7 +155,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Say of which store results cannot be written."""
+    """Turn an error of writing into one that names the store."""
     import duckdb
 
     try:

@@ -49,8 +49,8 @@ def run_sweep(
 
     Runs of kind `compare` compare protocols; those of kind `calibrate` simulate a flight and have `evaluate(flight)`
     return its figures, a mapping of column to number, text or None. Where that is not given it is what an installed
-    distribution offers as entry point `calibrate` of the group `uwbcal.evaluators`. The work is done by so many
-    `workers` (processes; None: all cores), or by the Dask cluster whose `scheduler` has this address; both import
+    distribution offers as entry point `calibrate` of the group `uwbcal.evaluators`. The work is done by
+    `workers` processes (None: all cores), or by the Dask cluster whose `scheduler` has this address; both import
     `evaluate` by its name. `progress` is called with the done fraction, 0 to 1.
 
     Raises `ScenarioError` where the folder holds another sweep's results, or the same one's without `resume`, and

@@ -35,11 +35,6 @@ class KnownDevices:
     calibration: Calibration
     bias: Spline
 
-    @property
-    def delays_ns(self) -> Mapping[int, float]:
-        """Return the delays by tag."""
-        return self.calibration.delays_ns
-
     def corrected_m(self, exchanges: Exchanges) -> Floats:
         """Return calibrated ranges in metres (n,); raises `ScenarioError` for tags that the calibration lacks."""
         from calib import Ranges
@@ -49,9 +44,9 @@ class KnownDevices:
 
     def require(self, tags: list[int]) -> None:
         """Raise `ScenarioError` where it does not know all of some tags."""
-        missing = [tag for tag in tags if tag not in self.delays_ns]
+        missing = [tag for tag in tags if tag not in self.calibration.delays_ns]
         if missing:
-            known = ", ".join(map(str, sorted(self.delays_ns)))
+            known = ", ".join(map(str, sorted(self.calibration.delays_ns)))
             raise ScenarioError(
                 f"{self.where}: no delay for tag {', '.join(map(str, missing))} of the recording; it knows {known}; "
                 "fit one from a recording with all tags"

@@ -22,7 +22,7 @@ SAMPLED: Final = 10_000
 """Readings of which the noise is taken in each round, at most: known to 1 % then."""
 
 OUTLIER: Final = 5.0
-"""Readings further off than so many standard deviations do not count."""
+"""Readings further off than this many standard deviations are left out."""
 
 KINDS: Final = 2
 """Of readings, each with a bias of its own: ratios and carriers."""
@@ -136,7 +136,7 @@ class _Search:
             block = slice(k * knots, (k + 1) * knots)
             normal[block, block] += self.stiffness / (walk**2 * self.step_s)
         # The mean of the rates at the start is zero, tightly; clocks are thought to run 5 ppm faster at first; and a
-        # bias that nothing tells is zero.
+        # bias that no reading determines is zero.
         start = np.arange(tags) * knots
         normal[np.ix_(start, start)] += 1e6
         warm = np.arange(tags * knots, tags * (knots + 1))

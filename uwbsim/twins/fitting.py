@@ -217,7 +217,7 @@ class Twin:
     table: dict[str, Any]
 
     def compare(self, seeds: int | None = None, progress: Callable[[float], None] | None = None) -> list[Compared]:
-        """Simulate the twin with so many seeds, and compare it with the recording, distribution by distribution.
+        """Simulate the twin with a number of seeds, and compare it with the recording, distribution by distribution.
 
         Without `seeds` there are as many as make the simulated exchanges some times the measured ones.
         """

@@ -127,7 +127,7 @@ def effective_size(value: Floats, group: Ints) -> float:
 
 
 def some_rows(count: int, most: int) -> Ints:
-    """Return `most` of so many rows, in their order and by chance: every k-th would leave pairs out that take turns."""
+    """Return `most` of `count` rows, chosen at random, in order: every k-th would leave out pairs that take turns."""
     if count <= most:
         return np.arange(count)
     return np.sort(stream(0, "some rows", count).choice(count, most, replace=False))
@@ -172,7 +172,7 @@ class Flight:
     `time_s` counts from `origin_ns`; `ends` are places in `tags` of initiator and target, (2, n), `pair` the places of
     both in `pairs`, whichever began; `towards` are unit vectors to the other end in the frames of the two bodies,
     (2, n, 3). `residual_m` is calibrated range less distance; `ratio_ppm` by how much the initiator's clock is faster
-    than the target's as dt64/dt53 says, NaN where the protocol has no such.
+    than the target's as dt64/dt53 says, NaN where the protocol has no third message.
     """
 
     tags: tuple[Tag, ...]

@@ -13,10 +13,10 @@ from uwbsim.twins.flight import Flight, bulk_spread, effective_size, lasting
 from uwbsim.world.radio import ANTENNAS, harmonics
 
 MIN_LOG_SPREAD: Final = 0.05
-"""Standard deviation of log10(distance) below which nothing is told of path loss: distances within some 12 %."""
+"""Standard deviation of log10(distance) below which path loss is not determined: distances within 12 %."""
 
 MIN_REFLECTED: Final = 5.0
-"""Reflected exchanges, by their probabilities, below which nothing is told of their losses."""
+"""Reflected exchanges, by their probabilities, below which their losses are not determined."""
 
 LEVELS: Final = 41
 """Quantiles of fading that a scenario gets, and so the fewest readings that they are taken of."""

@@ -2,7 +2,7 @@
 
 The shape of the residuals together is a normal core and a positive tail (an exponential detour on top of the core).
 That is fitted as if exchanges were independent, which is consistent whether they are or not; how long reflections last,
-and so how much the shares of pairs can be trusted, is told by autocovariances alone.
+and so how much the shares of pairs can be trusted, follows from autocovariances alone.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _mixture(error: Floats, white: Floats) -> tuple[float, float, float, float]:
 
 
 def _is_a_tail(error: Floats, white: Floats, mean: float, direct: float, excess: float, share: float) -> bool:
-    """Say whether the tail explains more than a core alone, beyond what a few of its exchanges could by chance."""
+    """Return whether the tail explains more than a core alone, beyond what a few of its exchanges could by chance."""
     core, alone = np.hypot(white, direct), max(float(np.std(error)), SHORTEST_CORE_M)
     # Detours shorter than the spread of the core cannot be told from it.
     if excess < float(np.median(core)):

@@ -237,7 +237,7 @@ def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[st
         "id": tag.tag,
         "body": tag.body,
         "lever_arm_m": list(tag.lever_arm_m),
-        "delay_ns": known.delays_ns[tag.tag],
+        "delay_ns": known.calibration.delays_ns[tag.tag],
         "skew_ppm": float(np.clip(clocks.skew_ppm[k], -100, 100)),
         "drift_ppm_per_sqrt_s": float(clocks.walk_ppm_per_sqrt_s[k]),
         "tx_power_db": float(powers.tx_db[k]),

@@ -82,7 +82,7 @@ class Ends:
     `antennas_m` where their antennas are, (n, 3) each, and `rotations` how they are turned, body to world, (n, 3, 3)
     each. `shadows` are the bodies that may stand in between; `phases` (tags, harmonics) those of the tags' shadowing;
     `states` the reflections that last by pair, `levels` fading and outages of pairs, `responses` those from geometry,
-    where the scenario has such.
+    where the scenario has them.
     `distance_m` and `gain_db`, (n,) each, follow from these: the lengths of the straight lines, and what the sender's
     power and the two antennas together add along them. The first end sends.
     """
@@ -274,7 +274,7 @@ def _states(link: Link, ends: Ends) -> Link:
 
 
 def _response(link: Link, ends: Ends) -> Link:
-    """Read all that geometry does off one response: instead of the effects above, which leave such links alone."""
+    """Read all that geometry does off one response: the effects above skip links that have one."""
     if ends.responses is None:
         return link
     read = ends.responses.at(ends.places, ends.time_s)

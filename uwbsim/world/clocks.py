@@ -77,7 +77,7 @@ class ClockNoise:
 
     @classmethod
     def of(cls, seed: int, tags: tuple[Tag, ...], duration_s: float) -> Self | None:
-        """Return the noise of tags' clocks over a while, None where none of them has any."""
+        """Return the noise of tags' clocks over a duration, None where none of them has any."""
         if not any(tag.white_ppm_sqrt_s or tag.flicker_ppm for tag in tags):
             return None
         drawn = [stream(seed, "clock noise", tag.id) for tag in tags]

@@ -1,4 +1,4 @@
-"""Responses of pairs of tags from geometry, ahead of time: one every few milliseconds, for whoever asks about a link.
+"""Responses of pairs of tags from geometry, computed ahead: one every few milliseconds.
 
 Flights, listeners and the workbench ask for many links at once, served boards for one sender at an instant; all have
 the response of the nearest step, so all have the same.
@@ -27,7 +27,7 @@ from uwbsim.world.impulse_response import Detected, Sensing, detect
 from uwbsim.world.trajectories import Trajectory
 
 CHUNK: Final = 2048
-"""So many links at once: fewer take longer each, more do not fit into a core's cache."""
+"""Links computed at once: fewer take longer each, more do not fit into a core's cache."""
 
 COLUMNS: Final = ("excess_m", "power_dbm", "total_dbm", "noise_s")
 
@@ -86,7 +86,7 @@ class GeometricResponses:
             self.keys, self.columns = keys[order], np.hstack([self.columns, self._compute(missing)])[:, order]
 
     def look_ahead(self, sender: int, time_s: float) -> None:
-        """Compute what all tags will hear of one for the next few steps, for whoever asks for one instant at a time."""
+        """Compute what all tags will hear of a sender in the next few steps, for calls instant by instant."""
         # Who goes from instant to instant does not come back far: few responses are kept.
         ahead, most_kept = 16, 5_000
         here = np.arange(len(self.around.scenario.tags))

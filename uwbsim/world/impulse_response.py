@@ -40,7 +40,7 @@ LARGEST_TAP: Final = 32_767
 """Taps are 16 bits wide."""
 
 BEFORE: Final = 6
-"""Taps before the direct path's edge; so many of them are enough for its pulse."""
+"""Taps before the direct path's edge; the pulse reaches back no further."""
 
 TAPS: Final = 64
 """Taps in which a first path is looked for: 17 m."""

@@ -7,7 +7,6 @@ distribution and no draw of it, calls `arrive`, on which `receive` is built.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -26,14 +25,7 @@ from uwbsim.world.radio import (
     reception_noise_s,
     reported_dbm,
 )
-
-
-class Links(Protocol):
-    """What knows how far apart tags are and how strongly they hear each other: a `World`, or `SampledWorld` of one."""
-
-    def link(self, initiator: Ints, target: Ints, time: Ints) -> Link:
-        """Return what reaches one tag from another (n,) at true times (n,)."""
-        ...
+from uwbsim.world.world import SampledWorld, World
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +73,7 @@ class Medium:
     """
 
     scenario: Scenario
-    links: Links
+    links: World | SampledWorld
     clocks: Clocks
     delays: AntennaDelays = field(init=False)
     tx_register: Ints = field(init=False)
@@ -121,7 +113,7 @@ class Medium:
         return Reception(stamp=(reading + shift + SUBTICKS // 2) // SUBTICKS, link=link)
 
     def heard(self, power_dbm: Floats, fading: Floats | float = 0.0) -> Bools:
-        """Say which frames are strong enough; `fading` is standard normal, and makes the edge soft."""
+        """Return which frames are strong enough; `fading` is standard normal, and makes the edge soft."""
         radio = self.scenario.radio
         return np.asarray(power_dbm + fading * radio.power_noise_db >= radio.sensitivity_dbm)
 

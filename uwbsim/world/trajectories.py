@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
 from uwblink.arrays import Floats
 from uwbsim.random_streams import stream
-from uwbsim.scenario.bodies import Carried, Figure, Height, Imu, RandomFlight, Recorded, Static, Waypoints
+from uwbsim.scenario.bodies import Carried, Figure, Imu, RandomFlight, Recorded, Static, Waypoints
 from uwbsim.scenario.devices import Body
 from uwbsim.scenario.model import Scenario
 from uwbsim.tables import Columns, in_time_order
@@ -197,28 +196,37 @@ _MAKERS: Final[dict[type, Callable[[Any, float, Draw], Trajectory]]] = {
 
 
 def inertial_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) -> Columns:
-    """Return the columns of the table `imu`, in order of time; none where no body has such a sensor."""
-    parts = [_imu_of(scenario, body, trajectories[body.name], body.imu) for body in scenario.bodies if body.imu]
+    """Return the columns of the table `imu`, in order of time; no columns where no body has the sensor."""
+    parts = []
+    for body in scenario.bodies:
+        if (imu := body.imu) is not None:
+            time_s, columns = _times(scenario, body, imu.rate_hz)
+            rng = stream(scenario.run.seed, "imu", body.name)
+            gyro, force = true_motion(trajectories[body.name], time_s)
+            gyro = gyro + _errors(rng, imu, "gyro", len(time_s))
+            force = force + _errors(rng, imu, "force", len(time_s)) + imu.vibration_mps2 * rng.normal(size=force.shape)
+            columns |= dict(zip(("wx", "wy", "wz", "ax", "ay", "az"), np.hstack([gyro, force]).T, strict=True))
+            parts.append(columns)
     return in_time_order(parts)
 
 
 def height_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) -> Columns:
-    """Return the columns of the table `height`, in order of time; none where no body has such a sensor."""
-    parts = [
-        _heights_of(scenario, body, trajectories[body.name], body.height) for body in scenario.bodies if body.height
-    ]
+    """Return the columns of the table `height`, in order of time; no columns where no body has the sensor."""
+    parts = []
+    for body in scenario.bodies:
+        if (sensor := body.height) is not None:
+            time_s, columns = _times(scenario, body, sensor.rate_hz)
+            rng = stream(scenario.run.seed, "height", body.name)
+            height = trajectories[body.name].position_m(time_s)[:, 2] + rng.normal(0.0, sensor.bias_m)
+            parts.append(columns | {"height_m": height + rng.normal(0.0, sensor.noise_m, len(time_s))})
     return in_time_order(parts)
 
 
-def _imu_of(scenario: Scenario, body: Body, path: Trajectory, imu: Imu) -> Columns:
-    time_s, time_ns = _times(scenario, imu.rate_hz)
-    rng = stream(scenario.run.seed, "imu", body.name)
-    gyro, force = true_motion(path, time_s)
-    gyro = gyro + _errors(rng, imu, "gyro", len(time_s))
-    force = force + _errors(rng, imu, "force", len(time_s)) + imu.vibration_mps2 * rng.normal(size=force.shape)
-    columns: Columns = {"time_ns": time_ns, "body": np.full(len(time_ns), body.name)}
-    columns |= dict(zip(("wx", "wy", "wz"), gyro.T, strict=True))
-    return columns | dict(zip(("ax", "ay", "az"), force.T, strict=True))
+def _times(scenario: Scenario, body: Body, rate_hz: float) -> tuple[Floats, Columns]:
+    """Return when a sensor reads, in seconds, and the first two columns of its table."""
+    count = int(np.ceil(scenario.run.duration_s * rate_hz)) + 1
+    time_ns = np.rint(np.arange(count) * NS_PER_S / rate_hz).astype(np.int64)
+    return time_ns / NS_PER_S, {"time_ns": time_ns, "body": np.full(len(time_ns), body.name)}
 
 
 def true_motion(path: Trajectory, time_s: Floats) -> tuple[Floats, Floats]:
@@ -238,18 +246,3 @@ def _errors(rng: np.random.Generator, imu: Imu, which: str, count: int) -> Float
     root = np.sqrt(imu.rate_hz)
     wander = np.cumsum(rng.normal(0.0, found.wander / root, (count, 3)), axis=0)
     return np.asarray(rng.normal(0.0, found.bias, 3) + wander + rng.normal(0.0, found.noise * root, (count, 3)))
-
-
-def _heights_of(scenario: Scenario, body: Body, path: Trajectory, sensor: Height) -> Columns:
-    time_s, time_ns = _times(scenario, sensor.rate_hz)
-    rng = stream(scenario.run.seed, "height", body.name)
-    height = (
-        path.position_m(time_s)[:, 2] + rng.normal(0.0, sensor.bias_m) + rng.normal(0.0, sensor.noise_m, len(time_s))
-    )
-    return {"time_ns": time_ns, "body": np.full(len(time_ns), body.name), "height_m": height}
-
-
-def _times(scenario: Scenario, rate_hz: float) -> tuple[Floats, NDArray[np.int64]]:
-    count = int(np.ceil(scenario.run.duration_s * rate_hz)) + 1
-    time_ns = np.rint(np.arange(count) * NS_PER_S / rate_hz).astype(np.int64)
-    return time_ns / NS_PER_S, time_ns

@@ -5,11 +5,8 @@ import pytest
 from scipy.optimize import minimize
 
 import uwbsim
-from uwblink import PROTOCOLS, Board, raw_range
-from uwblink.wire.codec import Decoder
-from uwblink.wire.messages import REPORTS, Overheard
-from uwbsim.protocols.conditions import conditions_of
-from uwbsim.protocols.monte_carlo import range_errors_m
+from tests.uwbsim.world.helpers import autocorrelation
+from uwblink import raw_range
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 from uwbsim.world.world import SampledWorld, World
 
@@ -169,11 +166,6 @@ def of_pair(flight, target):
     return rows, (raw_range(flight.exchanges) - flight.truth_m)[rows]
 
 
-def autocorrelation(values, lag):
-    centred = values - values.mean()
-    return np.mean(centred[lag:] * centred[:-lag]) / np.mean(centred**2)
-
-
 def test_excess_lasts_as_long_as_geometry_does(slow_flight):
     """2 mm on, waves add up as before; a second and 20 cm on, nearly three wavelengths, they do not."""
     for target in (2, 3, 4):
@@ -225,46 +217,6 @@ def test_scatterers_stay_where_they_are_and_more_of_them_leave_the_first_there()
     assert np.all((many.place_m >= 0) & (many.place_m <= np.array([8.0, 6.0, 3.0])))
 
 
-def four_ways(**more):
-    """A room with everything, in which a listener and a served board take part; nothing moves."""
-    shadow = {"semi_axes_m": [0.3, 0.3, 1.0], "loss_db_per_m": 20.0}
-    post = {"name": "post", "motion": {"model": "static", "position_m": [3.0, 2.9, 1.1]}, "shadow": shadow}
-    world = scenario(
-        places=(A, B, (6.5, 1.0, 0.8)),
-        bodies=[post],
-        obstacles=[{"min_m": [2.0, 2.4, 0.0], "max_m": [2.2, 4.0, 2.5], "material": "drywall"}],
-        radio={"antenna": "dipole", "skew_noise_ppm": 0.0},
-        **(CLUTTER | more),
-    )
-    tags = [tag.model_copy(update={"passive": tag.id == 3}) for tag in world.tags]
-    return world.model_copy(update={"tags": tuple(tags)})
-
-
-def served(world):
-    ports = uwbsim.VirtualPorts(world)
-    Board(ports.port(3)).set_passive(True)
-    report = Board(ports.port(1)).range(2)
-    ports.bench.advance(int(ports.bench.env.now) + 50_000_000)
-    heard = b"".join(data for _, tag, data in ports.transfers if tag == 3)
-    (overheard,) = (event for event in Decoder(REPORTS).feed(heard) if isinstance(event, Overheard))
-    return report, overheard
-
-
-def test_flights_boards_listeners_and_workbench_have_the_same_response():
-    world = four_ways()
-    flight, (report, overheard), conditions = uwbsim.simulate(world), served(world), conditions_of(world)
-    power, excess = flight.exchanges.fpp1_dbm[0], raw_range(flight.exchanges) - flight.truth_m
-    assert abs(np.mean(excess)) > 0.005
-    np.testing.assert_allclose(flight.exchanges.fpp1_dbm, power, atol=1e-9)
-    np.testing.assert_allclose(conditions.power_dbm, power, atol=1e-9)
-    errors = range_errors_m(PROTOCOLS["ds"], conditions, 1, 500)
-    assert np.mean(errors) == pytest.approx(np.mean(excess), abs=0.003)
-    assert report.range_m == pytest.approx(flight.truth_m[0] + np.mean(excess), abs=0.012)
-    assert report.fpp1_dbm == pytest.approx(power, abs=2e-4)
-    for name in ("fpp1_dbm", "fpp2_dbm"):
-        assert getattr(overheard, name) == pytest.approx(flight.overheard[name][0], abs=2e-4)
-
-
 def test_what_is_asked_one_at_a_time_and_all_at_once_is_the_same_draw_for_draw():
     """While a tag moves: flights ask for many links, served boards for one sender at an instant."""
     world = World.of(scenario(places=(A, B, (6.5, 1.0, 0.8)), motion=SLOW, **CLUTTER))
@@ -279,7 +231,8 @@ def test_what_is_asked_one_at_a_time_and_all_at_once_is_the_same_draw_for_draw()
 
 
 def test_links_are_the_same_both_ways_but_for_who_sends_stronger():
-    world = World.of(four_ways())
+    thin = {"min_m": [2.0, 2.4, 0.0], "max_m": [2.2, 4.0, 2.5], "material": "drywall"}
+    world = World.of(scenario(obstacles=[thin], radio={"antenna": "dipole"}, **CLUTTER))
     now = np.array([SUBTICKS_PER_SECOND // 2])
     there, back = world.link(ZERO, ONE, now), world.link(ONE, ZERO, now)
     assert there.power_dbm[0] == back.power_dbm[0]

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import uwbsim
-from uwblink import PROTOCOLS, Board, raw_range
+from tests.uwbsim.world.helpers import served
+from uwblink import PROTOCOLS, raw_range
 from uwblink.ticks import METRES_PER_TICK
-from uwblink.wire.codec import Decoder
-from uwblink.wire.messages import REPORTS, Overheard
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
 from uwbsim.protocols.prediction import predict
@@ -19,6 +18,12 @@ PLACES = {"a": (0.0, 0.0, 1.0), "b": (4.0, 0.5, 1.2), "c": (1.5, 3.0, 0.8), "pos
 # Wide enough that the delayed transmissions of the firmware, 512 ticks apart, shift by whole steps.
 TICKS, LOSS_DB = 512, 3.0
 TAG_OF_LOSS = 2
+GEOMETRIC = {
+    "room.reflection_loss_db": None,
+    "radio.multipath": {"model": "geometric", "scatterers": 32, "stamp_noise": False},
+    "radio.rx_noise_ps": 0.0,
+    "room.roughness_mm": 0.0,
+}
 
 
 def scenario(**more):
@@ -40,17 +45,6 @@ def scenario(**more):
         },
         more,
     )
-
-
-def served(world):
-    """Range once; return what the initiator and the listener print."""
-    ports = uwbsim.VirtualPorts(world)
-    Board(ports.port(3)).set_passive(True)
-    report = Board(ports.port(1)).range(2)
-    ports.bench.advance(int(ports.bench.env.now) + 50_000_000)
-    heard = b"".join(data for _, tag, data in ports.transfers if tag == 3)
-    (overheard,) = (event for event in Decoder(REPORTS).feed(heard) if isinstance(event, Overheard))
-    return report, overheard
 
 
 @pytest.fixture
@@ -121,7 +115,9 @@ def test_it_shows_in_the_workbench_draw_for_draw(without, louder):
 
 
 @pytest.mark.parametrize(
-    "more", [{}, {"obstacles": []}, {"room.reflection_loss_db": None}, {"bodies.3.shadow": None}], ids=str
+    "more",
+    [{}, {"obstacles": []}, {"room.reflection_loss_db": None}, {"bodies.3.shadow": None}, GEOMETRIC],
+    ids=str,
 )
 def test_flights_boards_listeners_and_workbench_agree_on_every_power(more):
     """Each part of the world is taken away in turn, so that none of the four can leave it out."""
@@ -132,7 +128,12 @@ def test_flights_boards_listeners_and_workbench_agree_on_every_power(more):
     np.testing.assert_allclose(conditions.power_dbm, power, atol=1e-9)
     assert report.fpp1_dbm == pytest.approx(power, abs=2e-4)
     assert overheard.fpp1_dbm == pytest.approx(flight.overheard["fpp1_dbm"][0], abs=2e-4)
-    if more:
+    if more is GEOMETRIC:
+        excess = np.mean(raw_range(flight.exchanges) - flight.truth_m)
+        assert abs(excess) > 0.005
+        assert np.mean(range_errors_m(PROTOCOLS["ds"], conditions, 1, 500)) == pytest.approx(excess, abs=0.003)
+        assert report.range_m == pytest.approx(flight.truth_m[0] + excess, abs=0.012)
+    elif more:
         whole = uwbsim.simulate(scenario()).exchanges.fpp1_dbm[0]
         assert power - whole > 0.5 or more == {"room.reflection_loss_db": None}
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import uwbsim
-from uwblink import PROTOCOLS, Board, raw_range
-from uwblink.wire.codec import Decoder
-from uwblink.wire.messages import REPORTS, Overheard
+from tests.uwbsim.world.helpers import autocorrelation, served
+from uwblink import PROTOCOLS, raw_range
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.prediction import predict
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
@@ -50,11 +49,6 @@ def scenario(duration_s=10.0, rate_hz=150.0, get_cir=False, passive=(), who=tupl
 def by_pair(flight, pair):
     rows = (flight.exchanges.initiator == pair[0]) & (flight.exchanges.target == pair[1])
     return rows, (raw_range(flight.exchanges) - flight.truth_m)[rows]
-
-
-def autocorrelation(values, lag):
-    centred = values - values.mean()
-    return np.mean(centred[lag:] * centred[:-lag]) / np.mean(centred**2)
 
 
 @pytest.fixture(scope="module")
@@ -150,16 +144,6 @@ def test_served_boards_and_listeners_meet_the_same_paths_as_flights():
     assert reports[0].range_m - reports[1].range_m == pytest.approx(excess, abs=0.01)
     assert reports[1].fpp1_dbm - reports[0].fpp1_dbm == pytest.approx(FIRST_DB, abs=2e-4)
     assert passive[1].fpp2_dbm - passive[0].fpp2_dbm == pytest.approx(FIRST_DB, abs=2e-4)
-
-
-def served(world):
-    ports = uwbsim.VirtualPorts(world)
-    Board(ports.port(3)).set_passive(True)
-    report = Board(ports.port(1)).range(2)
-    ports.bench.advance(int(ports.bench.env.now) + 50_000_000)
-    printed = b"".join(data for _, tag, data in ports.transfers if tag == 3)
-    (overheard,) = (event for event in Decoder(REPORTS).feed(printed) if isinstance(event, Overheard))
-    return report, overheard
 
 
 def test_the_workbench_counts_them_as_errors():
