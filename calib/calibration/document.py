@@ -375,7 +375,7 @@ def _group(read: Reader) -> TagGroup:
 def _pair_offsets(read: Reader) -> Iterator[tuple[tuple[int, int], PairOffset]]:
     for name, inner in read.each("pair_offsets"):
         if not _is_pair(name):
-            raise BadInputError(f"pair_offsets: found {name[:40]!r}, expected two tag ids, as in 1-2")
+            raise read.wrong("pair_offsets", "two tag ids as keys, as in 1-2")
         first, second = sorted(map(int, name.split("-")))
         yield (first, second), PairOffset(inner.number("offset_m", METRES), inner.number("std_m", STD_M))
 

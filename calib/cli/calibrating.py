@@ -68,8 +68,8 @@ def add_to(app: typer.Typer) -> None:
 def fit(
     recordings: Recordings,
     output: NewCalibration,
+    *,
     settings: FitSettings,
-    flight: FlightSettings,
     truth: Annotated[
         str,
         typer.Option(
@@ -79,6 +79,7 @@ def fit(
             **choice("recorded", "ranges"),
         ),
     ] = "recorded",
+    flight: FlightSettings,
     trim_static: TrimStatic = False,
     as_json: AsJson = False,
     force: Force = False,

@@ -57,22 +57,20 @@ class _Shared:
         parse=_whole,
         metavar="TAG,TAG...",
     )
-    rate_hz: float | None = setting(
-        None, "Exchanges per second, all pairs together (Hz); 50, of a flight 80 by default.", flag="--rate"
-    )
     taped: int | None = setting(None, "Number of distances that will be measured with a tape.")
-    tape_sigma_m: float | None = setting(
-        None, "Standard deviation of such a distance (m); 0.005, of a flight 0.01 by default.", flag="--tape-sigma"
-    )
-    reflected: float | None = setting(
-        None, "Share of reflected pairs, of a flight of reflected ranges; 0, of a flight 0.08 by default."
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyPlanSettings(_Shared):
     """What `calib plan survey` passes on to `calib.plan`."""
 
+    rate_hz: float | None = setting(
+        None, "Exchanges per second, all pairs together (Hz); 50 by default.", flag="--rate"
+    )
+    tape_sigma_m: float | None = setting(
+        None, "Standard deviation of a distance by tape (m); 0.005 by default.", flag="--tape-sigma"
+    )
+    reflected: float | None = setting(None, "Share of pairs that are reflected; 0 by default.")
     arrangements: int | None = setting(None, "Number of arrangements; by default as many as are worth it.")
     anchor_sigma_m: float | None = setting(
         None, "Standard deviation of known positions (m); 0.01 by default.", flag="--anchor-sigma"
@@ -86,6 +84,13 @@ class SurveyPlanSettings(_Shared):
 class FlightPlanSettings(_Shared):
     """What `calib plan flight` passes on to `calib.plan_flight`."""
 
+    rate_hz: float | None = setting(
+        None, "Exchanges per second, all pairs together (Hz); 80 by default.", flag="--rate"
+    )
+    tape_sigma_m: float | None = setting(
+        None, "Standard deviation of a distance by tape (m); 0.01 by default.", flag="--tape-sigma"
+    )
+    reflected: float | None = setting(None, "Share of ranges that are reflected; 0.08 by default.")
     seconds: float | None = setting(None, "Duration in seconds; 60 by default.", flag="--duration")
     speed_m_s: float | None = setting(None, "Mean speed of the robots (m/s); 1 by default.", flag="--robot-speed")
     apart_m: float | None = setting(
