@@ -3,7 +3,7 @@
 import pytest
 
 from uwblink.boards.connection import FENCE, Connection
-from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
+from uwblink.errors import NoAnswerError, RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
 
@@ -44,25 +44,6 @@ def test_lines_of_bystanders_and_other_reports_do_not_end_it():
     assert connection.receive(REPORT, 0.003)[1].reply is not None
 
 
-def test_a_report_of_another_target_is_late_and_not_taken():
-    connection = asked()
-    assert connection.receive(OTHER, 0.001)[1] is None
-    assert connection.late == 1
-    assert connection.receive(REPORT, 0.003)[1].reply.neighbour == 2
-
-
-def test_a_single_sided_report_does_not_answer_a_double_sided_command():
-    single = b"R05|2|3.8601|2795254324|1672694065|1771014196|2893576102|0|0|-87.6187|-88.0293|-3.5203|3.5054\r\n"
-    connection = asked()
-    assert connection.receive(single, 0.001)[1] is None
-
-
-def test_the_board_s_line_of_failure_is_quoted():
-    outcome = asked().receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.043)[1]
-    assert isinstance(outcome.error, RangingFailedError)
-    assert "COMMANDED TASK FAILED AFTER 5 ATTEMPTS." in str(outcome.error)
-
-
 def test_a_line_of_failure_does_not_end_a_command_that_cannot_fail():
     connection = asked(m.GetId())
     assert connection.receive(b"COMMANDED TASK FAILED AFTER 5 ATTEMPTS.\r\n", 0.001)[1] is None
@@ -84,10 +65,3 @@ def test_time_runs_out_once_and_leaves_a_doubt_that_a_fence_settles():
     assert outcome.reply == m.IdleSet()
     assert any(isinstance(e, m.RangeReport) for e in events)
     assert not connection.doubtful
-
-
-def test_a_board_is_left_alone_after_an_impulse_response_was_asked_for():
-    connection = asked(m.RangeCommand(2, get_cir=True))
-    connection.receive(REPORT, 1.0)
-    assert connection.ready_s(1.0) == pytest.approx(0.030)
-    assert connection.ready_s(1.05) == 0

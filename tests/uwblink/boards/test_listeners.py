@@ -123,19 +123,3 @@ def test_one_damaged_line_is_one_fault(tmp_path):
     done = uwblink.record(ports.names.values(), tmp_path / "f.uwb", plan, duration_s=4.0, using=ports)
     assert done.exchanges == done.tried == 20
     assert done.faults == {"garbage": 20}
-
-
-def test_a_board_that_is_unplugged_is_taken_back(tmp_path):
-    ports = VirtualPorts(bench_scenario())
-    listener = Everything()
-    board = ports.bench.boards[2]
-    ports.bench.env.timeout(10**9).callbacks.append(lambda _: board.power_off())
-    ports.bench.env.timeout(2 * 10**9).callbacks.append(lambda _: board.power_cycle())
-    done = recorded(tmp_path / "f.uwb", ports, listener, passive=True)
-    assert done.faults["unplugged"] == done.faults["replugged"] == 1
-    kinds = {f.kind: (f.time_ns * 1e-9) for f in listener.faults}
-    assert kinds["unplugged"] == pytest.approx(1.0, abs=0.1)
-    assert kinds["replugged"] == pytest.approx(2.2, abs=0.3)
-    times = [t.time_ns * 1e-9 for t in listener.turns if t.pair == (1, 3) and t.report]
-    assert sum(1.1 < t < 1.9 for t in times) > 20, "the others go on meanwhile"
-    assert board.passive is False, "listening ends with the recording"

@@ -40,14 +40,19 @@ def test_an_arrangement_is_marked_from_beginning_to_end(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("known", "order", "message"),
-    [("plane", (30, 10, 20), "order"), ("line", (10, 20), "each of the boards at the")],
+    ("given", "named"),
+    [
+        ({"arrangement": "A", "known": "plane", "order": (30, 10, 20)}, "order"),
+        ({"arrangement": "A", "known": "line", "order": (10, 20)}, "each of the boards at the"),
+        ({"known": "line"}, "known"),
+        ({"arrangement": "A", "known": "ring"}, "known"),
+    ],
 )
-def test_an_order_is_that_of_all_boards_on_a_line(tmp_path, known, order, message):
+def test_what_cannot_be_known_of_an_arrangement_is_refused(tmp_path, given, named):
     ports = VirtualPorts(bench_scenario())
-    names, out = ports.names.values(), tmp_path / "a.uwb"
-    with pytest.raises(PlanError, match=message):
-        record(names, out, RangingPlan(), using=ports, arrangement="A", known=known, order=order)
+    with pytest.raises(PlanError, match=named):
+        record(ports.names.values(), tmp_path / "a.uwb", RangingPlan(), using=ports, **given)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_plan_that_seats_other_boards_is_refused_before_anything_is_recorded(tmp_path):
@@ -66,13 +71,6 @@ def test_an_order_that_is_none_is_one_line(tmp_path, known):
         recording.append_arrangements([Arrangement("A", 0, 1, known)])
         with pytest.raises(RecordingError, match="known: found"):
             recording.arrangements()
-
-
-def test_what_is_known_is_known_of_an_arrangement(tmp_path):
-    ports = VirtualPorts(bench_scenario())
-    for known, name in (("line", None), ("ring", "A")):
-        with pytest.raises(PlanError, match="known"):
-            record(ports.names.values(), tmp_path / "a.uwb", RangingPlan(), using=ports, arrangement=name, known=known)
 
 
 def test_what_the_boards_said_is_in_the_file_and_decodes_to_the_same(tmp_path):

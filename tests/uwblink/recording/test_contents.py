@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.uwblink.recording.test_copy import full, rows  # noqa: F401 - a fixture
-from uwblink.errors import ArgumentError, RecordingExistsError, RecordingMissingError
+from uwblink.errors import ArgumentError, RecordingExistsError
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow, Poses, Tag
 from uwblink.twr import COLUMNS, Exchanges
@@ -119,8 +119,3 @@ def test_it_prints_itself_on_a_screen():
 def test_what_cannot_be_selected_says_so(wrong, expected):
     with pytest.raises(ArgumentError, match=expected):
         made().select(**wrong)
-
-
-def test_what_is_not_there_says_so(tmp_path):
-    with pytest.raises(RecordingMissingError, match="no such recording"):
-        load(tmp_path / "no.uwb")

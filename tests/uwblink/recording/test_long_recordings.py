@@ -106,16 +106,6 @@ def test_clocks_of_pairs_are_the_same_from_blocks(written):
         assert clock_skews(recording.exchange_blocks(33)) == clock_skews(whole)
 
 
-def test_stretches_cover_each_time_once(written):
-    whole = exchanges(5)
-    with Recording.open(written(whole)) as recording:
-        spans = recording.stretches(50)
-        parts = [recording.exchanges_between(*span) for span in spans]
-    assert [len(part) for part in parts] == [50] * 14
-    assert [end for _, end in spans[:-1]] == [start for start, _ in spans[1:]]
-    np.testing.assert_array_equal(np.concatenate([part.tx1 for part in parts]), whole.tx1)
-
-
 def test_a_recording_without_exchanges_has_no_stretches(tmp_path):
     with Recording.create(tmp_path / "empty.uwb") as recording:
         assert recording.stretches(50) == []

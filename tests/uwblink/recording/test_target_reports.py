@@ -1,6 +1,5 @@
 """One exchange is one exchange, whoever reported it."""
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -137,18 +136,3 @@ def test_a_recorder_compares_the_two_reports_as_they_come():
     assert check.add(1, REPORT) is None
     assert check.add(2, as_target(later)) is None
     assert check.add(1, later) is None
-
-
-def test_half_a_million_reports_take_a_second():
-    count = 250_000
-    rng = np.random.default_rng(1)
-    columns: dict[str, Any] = {n: rng.integers(0, 2**32, count) for n in COLUMNS}
-    columns |= {"initiator": np.full(count, 1), "target": np.full(count, 2), "reporter": np.full(count, 1)}
-    columns |= {"protocol": np.full(count, "ds"), "time_ns": np.arange(count) * 5_000_000}
-    one = uwblink.Exchanges(bits=32, **columns)
-    two = replace(one, reporter=one.target)
-    both_reports = joined(one, two)
-    start = time.process_time()
-    found = single_reports(both_reports)
-    assert found.repeated == count
-    assert time.process_time() - start < 1.5

@@ -198,7 +198,3 @@ def test_the_command_sends_datagrams_and_prints_no_ranges(ear):
     for _ in range(int(count)):
         series |= set(json.loads(ear.recv(65536))["ranges"])
     assert series == {"1_2", "1_3", "2_3"}
-
-
-def test_the_front_door_and_the_room_offer_the_same():
-    assert uwblink.stream is __import__("uwblink.streaming", fromlist=["stream"]).stream

@@ -1,7 +1,6 @@
 """Bytes to columns: the fast way and the message decoder agree on everything."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -71,14 +70,6 @@ def test_damaged_reports(reports, data):
 @given(st.lists(st.binary(max_size=60), max_size=6))
 def test_arbitrary_bytes(pieces):
     agree(pieces)
-
-
-@pytest.mark.parametrize(("stamp", "good"), [(2**32 - 1, True), (2**32, False)])
-def test_a_stamp_of_more_than_32_bits_is_no_report(stamp, good):
-    line = b"R05|2|3.0550|%d|1|2|3|4|5|-87.4977|-87.5239|-3.4971|3.5222\r\n" % stamp
-    decoder = by_columns([line])
-    assert len(decoder.exchanges()) == good
-    assert decoder.decoder.skipped_bytes == (0 if good else len(line))
 
 
 def test_the_time_of_an_exchange_is_that_of_its_poll():
