@@ -7,7 +7,6 @@ stamp of the third message are in the initiator's clock, the others in the targe
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
@@ -108,7 +107,9 @@ class Exchanges:
             "target", chosen["target"], chosen["target"] == chosen["initiator"], "another tag than the initiator"
         )
         names = arrays.words("protocol", _protocol_of(protocol, tx3, rx3), count)
-        messages = _messages(names)
+        messages = np.zeros(count, dtype=np.int64)
+        for row, rows in _rows_by_protocol(names):
+            messages[rows] = len(row.messages)
         given = {"tx1": tx1, "rx1": rx1, "tx2": tx2, "rx2": rx2, "tx3": tx3, "rx3": rx3}
         hint = f"; stamps of {BITS[-1]} bits need bits={BITS[-1]}" if bits < BITS[-1] else ""
         for name, values in given.items():
@@ -175,19 +176,9 @@ def _protocol_of(protocol: ArrayLike | None, tx3: ArrayLike | None, rx3: ArrayLi
 
 
 def names_in(words: NDArray[np.str_]) -> list[str]:
-    """Return the words that occur in a column (n,), in order; mostly it is one, which takes no sorting."""
-    if len(words) and bool(np.all(words == words[0])):
-        return [str(words[0])]
-    return [str(word) for word in np.unique(words)]
-
-
-def _messages(names: NDArray[np.str_]) -> Ints:
-    """Return how many messages the protocol of each row has, (n,); raises `ArgumentError` for an unknown one."""
-    known, place = np.unique(names, return_inverse=True)
-    for name in known.tolist():
-        if name not in PROTOCOLS:
-            raise ArgumentError(f"protocol: found {name[:40]!r}, allowed: {', '.join(PROTOCOLS)}")
-    return np.array([len(PROTOCOLS[name].messages) for name in known.tolist()], dtype=np.int64)[place]
+    """Return the words that occur in a column (n,), in order."""
+    coded = arrays.few_words(words)
+    return sorted(map(str, np.unique(words) if coded is None else coded[0]))
 
 
 def intervals(exchanges: Exchanges) -> Intervals:
@@ -199,7 +190,7 @@ def intervals(exchanges: Exchanges) -> Intervals:
     """
     e, bits = exchanges, exchanges.bits
     target_sends = np.zeros(len(e), dtype=bool)
-    for row, rows in _rows_by_protocol(e):
+    for row, rows in _rows_by_protocol(e.protocol):
         target_sends[rows] = row.third_sender == "target"
     before_tx3 = np.where(target_sends, e.tx2, e.rx2)
     before_rx3 = np.where(target_sends, e.rx2, e.tx2)
@@ -225,7 +216,7 @@ def time_of_flight(exchanges: Exchanges) -> Floats:
     """
     spans = intervals(exchanges)
     flight = np.full(len(exchanges), np.nan)
-    for row, rows in _rows_by_protocol(exchanges):
+    for row, rows in _rows_by_protocol(exchanges.protocol):
         flight[rows] = row.flight_ticks(_pick(spans, rows)) * TICK_S
     bare = without_stamps(exchanges)
     return np.where(bare, exchanges.range_m / SPEED_OF_LIGHT, flight) if bare.any() else flight
@@ -255,7 +246,7 @@ def delay_weights(exchanges: Exchanges) -> tuple[Floats, Floats]:
     spans = intervals(exchanges)
     initiator = np.full(len(exchanges), np.nan)
     target = np.full(len(exchanges), np.nan)
-    for row, rows in _rows_by_protocol(exchanges):
+    for row, rows in _rows_by_protocol(exchanges.protocol):
         initiator[rows], target[rows] = row.delay_weights(_pick(spans, rows))
     return initiator, target
 
@@ -275,28 +266,14 @@ def truncate4(values: Floats) -> Floats:
     return np.trunc(scaled + np.copysign(1e-6, scaled)) / 1e4
 
 
-def _rows_by_protocol(exchanges: Exchanges) -> list[tuple[RangingProtocol, Bools]]:
-    """Return each protocol that occurs, and its rows; looks for plug-ins only where the rows so far do not suffice."""
-    names, left = exchanges.protocol, len(exchanges)
-    found: list[tuple[RangingProtocol, Bools]] = []
-    for row in _candidates(names):
-        mask = names == row.name
-        if mask.any():
-            found.append((row, mask))
-            left -= int(np.count_nonzero(mask))
-        if not left:
-            return found
-    if left:
-        strange = sorted(set(np.unique(names).tolist()) - set(PROTOCOLS))
-        raise ArgumentError(f"protocol: found {strange[0]!r}, allowed: {', '.join(PROTOCOLS)}")
+def _rows_by_protocol(names: NDArray[np.str_]) -> list[tuple[RangingProtocol, Bools]]:
+    """Return each protocol that occurs and its rows; looks for plug-ins only where a name is not known so far."""
+    found = []
+    for name in names_in(names):
+        if name not in PROTOCOLS:
+            raise ArgumentError(f"protocol: found {name[:40]!r}, allowed: {', '.join(PROTOCOLS)}")
+        found.append((PROTOCOLS[name], np.asarray(names == name)))
     return found
-
-
-def _candidates(names: NDArray[np.str_]) -> Iterator[RangingProtocol]:
-    """Yield the rows of `PROTOCOLS`, that of the first exchange first: mostly it is that of all, and one will do."""
-    known = PROTOCOLS.known()
-    yield from sorted(known, key=lambda row: bool(len(names)) and row.name != names[0])
-    yield from (row for row in PROTOCOLS.values() if row not in known)
 
 
 def _pick(spans: Intervals, rows: Bools) -> Intervals:

@@ -178,7 +178,8 @@ class Board:
         while True:
             while self._reports:
                 yield self._reports.popleft()
-            if not self._listen(timeout_s):
+            self._pass(timeout_s, until_report=True)
+            if not self._reports:
                 return
 
     def _revive(self, error: NoAnswerError) -> None:
@@ -212,28 +213,18 @@ class Board:
     def _keep(self, events: list[Event], reply: Message | None) -> None:
         self._reports.extend(e for e in events if e is not reply and not isinstance(e, Skipped))
 
-    def _listen(self, timeout_s: float) -> bool:
-        """Wait for the next report; False when none came in time."""
-        until_s = self._transport.now_s() + timeout_s
-        while (left_s := until_s - self._transport.now_s()) > 0:
-            events, _ = self._connection.receive(self._transport.read(left_s), self._transport.now_s())
-            self._keep(events, None)
-            if self._reports:
-                return True
-        return False
-
     def _settle(self) -> None:
         """Wait until the board may be asked; an impulse response that comes in postpones that."""
         self._pass(0.0)
         while (wait_s := self._connection.ready_s(self._transport.now_s())) > 0:
             self._pass(wait_s)
 
-    def _pass(self, seconds: float) -> None:
+    def _pass(self, seconds: float, *, until_report: bool = False) -> None:
         """Let time pass, and keep what the board says meanwhile; even no time takes in what has come."""
         until_s = self._transport.now_s() + seconds
         while True:
             data = self._transport.read(max(until_s - self._transport.now_s(), 0.0))
             events, _ = self._connection.receive(data, self._transport.now_s())
             self._keep(events, None)
-            if self._transport.now_s() >= until_s:
+            if self._transport.now_s() >= until_s or (until_report and self._reports):
                 return

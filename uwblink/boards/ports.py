@@ -121,13 +121,8 @@ class SerialPort:
         """Return what came, at once if there is any, empty when the time is over; raises `PortLostError`."""
         if self.fileno is None:
             return self._read_pyserial(timeout_s)
-        ready, _, _ = select.select([self.fileno], [], [], max(timeout_s, 0.0))
-        return self.read_ready() if ready else b""
-
-    def read_ready(self) -> bytes:
-        """Return what is there, after the descriptor was found readable; raises `PortLostError`."""
-        if self.fileno is None:
-            return self._read_pyserial(0)
+        if not select.select([self.fileno], [], [], max(timeout_s, 0.0))[0]:
+            return b""
         try:
             data = os.read(self.fileno, 65_536)
         except BlockingIOError:

@@ -73,7 +73,7 @@ def run(
     """
     mistakes: tuple[type[Exception], ...] = (UwblinkError, *errors)
     status = 0
-    with _noted_interrupts() as interrupted, _plain_warnings():
+    with interrupts(at_once=True) as interrupted, _plain_warnings():
         try:
             app(args=list(sys.argv[1:] if arguments is None else arguments))
         except (Exception, KeyboardInterrupt, SystemExit) as error:
@@ -110,24 +110,6 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-@contextmanager
-def _noted_interrupts() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C and a polite kill interrupt, and remember that one did; both leave nothing half written behind."""
-    asked: list[int] = []
-
-    def note(number: int, frame: Any) -> None:
-        asked.append(number)
-        if len(asked) != 2:  # which would interrupt the tidying up; a third ends what hangs
-            signal.default_int_handler(number, frame)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def with_flags(text: str, flags: Flags = FLAGS) -> str:
     """Return a text with flags in place of the parameters in backticks: `force` becomes --force."""
     return re.sub(r"`([a-z_]+)`", lambda found: flags.get(found[1], f"--{found[1].replace('_', '-')}"), text)
@@ -139,16 +121,20 @@ def print_json(document: Any) -> None:
 
 
 @contextmanager
-def interrupts() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and a polite kill into a question to ask; a second one interrupts."""
+def interrupts(*, at_once: bool = False) -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C and a polite kill into a question to ask; a second one interrupts.
+
+    With `at_once` the first one interrupts, too, and the question is whether one did. The second one then is not taken:
+    it would interrupt the tidying up. A third one ends what hangs.
+    """
     asked: list[int] = []
 
-    def ask(number: int, _frame: Any) -> None:
+    def note(number: int, _frame: Any) -> None:
         asked.append(number)
-        if len(asked) > 1:
+        if len(asked) != (2 if at_once else 1):
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(asked)
     finally:
