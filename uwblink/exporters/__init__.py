@@ -11,8 +11,7 @@ from typing import Any, Final
 from uwblink.errors import ArgumentError, RecordingError, RecordingExistsError, UwblinkError
 from uwblink.exporters.mcap import write_mcap
 from uwblink.exporters.rosbag2 import write_rosbag2
-from uwblink.exporters.tables import write_csv, write_parquet
-from uwblink.exporters.tum import write_tum
+from uwblink.exporters.tables import write_csv, write_parquet, write_tum
 from uwblink.output import place_beside, take_name
 from uwblink.plugins import NAME, Registry
 from uwblink.recording.intake import check_name

@@ -1,97 +1,148 @@
 """A recording as one MCAP file of JSON messages for Foxglove and PlotJuggler: poses, frames, ranges, readings, faults.
 
-Poses, frames and logs have the schemas that Foxglove knows.
+The schemas are also those of the messages on a WebSocket; poses, frames and logs have those that Foxglove knows.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from heapq import merge
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 from mcap.writer import Writer
 
 from uwblink.arrays import Floats
 from uwblink.errors import RecordingError
-from uwblink.exporters.corrections import corrections
-from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
 from uwblink.recording.contents import READING_MB, Contents, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
 
 WORLD: Final = "world"
-WARNING: Final = 3
-"""The level of a foxglove.Log that faults have."""
+RANGE: Final = "uwb.Range"
+ENDS: Final = ("time_ns", "initiator", "target")
+READINGS: Final = {
+    "imu": ("body", "wx", "wy", "wz", "ax", "ay", "az"),
+    "height": ("body", "height_m"),
+    "temperature": ("tag", "temperature_c", "supply_v"),
+}
+"""Tables of readings, with whose they are and what is in them."""
 
-NUMBERS: Final = ("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
+TimedRow = tuple[int, str, Any, Any]
+"""Time in nanoseconds, table, whose row it is, and its values; of ranges their index, of faults the fault."""
 
-Message = tuple[int, str, str, dict[str, Any]]
-"""Time in nanoseconds, topic, schema, content."""
+
+def _object(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+_NUMBER, _INTEGER, _TEXT, _FLAG = ({"type": kind} for kind in ("number", "integer", "string", "boolean"))
+_TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
+_VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
+_QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_MEASURED: Final = ("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
+_CORRECTED: Final = ("corrected_m", "sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
+SCHEMAS: Final[dict[str, dict[str, Any]]] = {
+    "foxglove.PoseInFrame": _object(
+        timestamp=_TIME, frame_id=_TEXT, pose=_object(position=_VECTOR, orientation=_QUATERNION)
+    ),
+    "foxglove.FrameTransform": _object(
+        timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_QUATERNION
+    ),
+    "foxglove.Log": _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER),
+    RANGE: _object(
+        timestamp=_TIME, initiator=_INTEGER, target=_INTEGER, protocol=_TEXT,
+        **dict.fromkeys(("range_m", *_CORRECTED, *_MEASURED[1:]), _NUMBER), clamped=_FLAG, outlier=_FLAG,
+    ),
+    "uwb.Imu": _object(timestamp=_TIME, angular_velocity=_VECTOR, linear_acceleration=_VECTOR),
+    "uwb.Height": _object(timestamp=_TIME, height_m=_NUMBER),
+    "uwb.Temperature": _object(timestamp=_TIME, temperature_c=_NUMBER, supply_v=_NUMBER),
+}  # fmt: skip
+"""What messages hold, as JSON Schema; what is not known is left out of a message."""
+
+
+def stamped(time_ns: int, content: dict[str, Any]) -> dict[str, Any]:
+    """Return a message with its time, which Foxglove wants as seconds and nanoseconds."""
+    sec, nsec = divmod(time_ns, 1_000_000_000)
+    return {"timestamp": {"sec": sec, "nsec": nsec}} | content
+
+
+def timed_rows(held: Contents) -> Iterator[TimedRow]:
+    """Yield poses, ranges, readings and faults of a piece of a recording in order of time."""
+    poses, e = held.poses, held.exchanges
+    columns = (poses.time_ns, poses.body, poses.position_m, poses.quaternion)
+    posed = zip(*(column.tolist() for column in columns), strict=True)
+    order = np.argsort(e.time_ns, kind="stable")
+    ends = zip(e.initiator[order].tolist(), e.target[order].tolist(), strict=True)
+    parts: list[Iterator[TimedRow]] = [
+        ((time_ns, "poses", body, place) for time_ns, body, *place in posed),
+        ((t, "ranges", of, k) for t, of, k in zip(e.time_ns[order].tolist(), ends, order.tolist(), strict=True)),
+    ]
+    parts += [_readings(table, getattr(held, table)) for table in READINGS]
+    parts.append((f.time_ns, "faults", f.board, f) for f in sorted(held.faults, key=lambda fault: fault.time_ns))
+    return merge(*parts, key=lambda row: row[0])
+
+
+def _readings(table: str, columns: Any) -> Iterator[TimedRow]:
+    rows = zip(*(columns[name].tolist() for name in ("time_ns", *READINGS[table])), strict=True) if columns else ()
+    return ((time_ns, table, whose, values) for time_ns, whose, *values in rows)
+
+
+def fits_exchanges(held: Contents) -> bool:
+    """Return whether ranges were corrected, and the table of that is that of the exchanges, row by row."""
+    return bool(held.corrected) and all(
+        np.array_equal(held.corrected[name], getattr(held.exchanges, name)) for name in ENDS
+    )
 
 
 def write_mcap(recording: Path, folder: Path) -> dict[str, int]:
     """Write `recording.mcap`; returns its messages. Times before 1970 cannot be written and raise `RecordingError`."""
+    count = 0
     with Recording.open(recording, memory_mb=READING_MB) as opened, (folder / "recording.mcap").open("wb") as file:
-        count = _write(recording, file, _messages(opened))
+        writer = Writer(file)
+        writer.start(library="uwbcal")
+        schemas = {
+            name: writer.register_schema(name, "jsonschema", json.dumps(layout).encode())
+            for name, layout in SCHEMAS.items()
+        }
+        channels: dict[str, int] = {}
+        for time_ns, topic, schema, content in _messages(opened):
+            if time_ns < 0:
+                raise RecordingError(f"{recording}: has times before 1970, which MCAP cannot hold")
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "json", schemas[schema])
+            try:
+                data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
+            except ValueError as error:
+                raise RecordingError(
+                    f"{recording}: {topic}: holds a number that is none, which JSON cannot say"
+                ) from error
+            writer.add_message(channels[topic], time_ns, data, time_ns, count & 0xFFFFFFFF)
+            count += 1
+        writer.finish()  # type: ignore[no-untyped-call]  # the library does not say what it returns
     return {"recording.mcap": count}
 
 
-def _messages(recording: Recording) -> Iterator[Message]:
+def _messages(recording: Recording) -> Iterator[tuple[int, str, str, dict[str, Any]]]:
+    """Yield time in nanoseconds, topic, schema, and content."""
     for held in pieces(recording):
         (by_poses,) = distances_by_poses_m(recording, [held.exchanges])
-        parts = (_poses(held), _ranges(held, by_poses), _imu(held), _heights(held), _temperatures(held), _faults(held))
-        yield from merge(*parts, key=lambda message: message[0])
+        ranges = _ranges(held, by_poses)
+        for time_ns, table, whose, values in timed_rows(held):
+            for message in _ENCODERS[table](whose, ranges(values) if table == "ranges" else values):
+                yield time_ns, *message
 
 
-def _write(recording: Path, file: BinaryIO, messages: Iterator[Message]) -> int:
-    writer = Writer(file)
-    writer.start(library="uwbcal")
-    schemas = {
-        name: writer.register_schema(name, "jsonschema", json.dumps(layout).encode())
-        for name, layout in SCHEMAS.items()
-    }
-    channels: dict[str, int] = {}
-    count = 0
-    for time_ns, topic, schema, content in messages:
-        if time_ns < 0:
-            raise RecordingError(f"{recording}: has times before 1970, which MCAP cannot hold")
-        if topic not in channels:
-            channels[topic] = writer.register_channel(topic, "json", schemas[schema])
-        try:
-            data = json.dumps(stamped(time_ns, content), allow_nan=False).encode()
-        except ValueError as error:
-            raise RecordingError(f"{recording}: {topic}: holds a number that is none, which JSON cannot say") from error
-        writer.add_message(channels[topic], time_ns, data, time_ns, count & 0xFFFFFFFF)
-        count += 1
-    writer.finish()  # type: ignore[no-untyped-call]  # the library does not say what it returns
-    return count
-
-
-def _vector(x: float, y: float, z: float) -> dict[str, float]:
-    return {"x": x, "y": y, "z": z}
-
-
-def _poses(held: Contents) -> Iterator[Message]:
-    poses = held.poses
-    columns = (poses.time_ns.tolist(), poses.body.tolist(), poses.position_m.tolist(), poses.quaternion.tolist())
-    for time_ns, body, place, (x, y, z, w) in zip(*columns, strict=True):
-        position, attitude = _vector(*place), {"x": x, "y": y, "z": z, "w": w}
-        pose = {"position": position, "orientation": attitude}
-        yield time_ns, f"/poses/{body}", "foxglove.PoseInFrame", {"frame_id": WORLD, "pose": pose}
-        frames = {"parent_frame_id": WORLD, "child_frame_id": body}
-        yield time_ns, "/tf", "foxglove.FrameTransform", frames | {"translation": position, "rotation": attitude}
-
-
-def _ranges(held: Contents, by_poses: Floats) -> Iterator[Message]:
+def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]:
+    """Return what gives the content of one range; `corrected_m` and so on where ranges were corrected."""
     e = replace(held.exchanges, truth_m=np.where(np.isfinite(held.exchanges.truth_m), held.exchanges.truth_m, by_poses))
-    names = ("initiator", "target", "protocol", *NUMBERS)
-    columns = {name: getattr(e, name).tolist() for name in names} | corrections(held)
-    for k in np.argsort(e.time_ns, kind="stable").tolist():
-        row = {name: column[k] for name, column in columns.items()}
-        yield int(e.time_ns[k]), f"/ranges/{row['initiator']}_{row['target']}", RANGE, _known(row)
+    columns = {name: getattr(e, name).tolist() for name in ("initiator", "target", "protocol", *_MEASURED)}
+    if fits_exchanges(held):
+        columns["range_m"] = held.corrected["raw_m"].tolist()  # as it was measured
+        columns |= {n: column.tolist() for n, column in held.corrected.items() if n not in (*ENDS, "raw_m")}
+    return lambda k: _known({name: column[k] for name, column in columns.items()})
 
 
 def _known(row: dict[str, Any]) -> dict[str, Any]:
@@ -99,35 +150,37 @@ def _known(row: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in row.items() if not isinstance(value, float) or np.isfinite(value)}
 
 
-def _imu(held: Contents) -> Iterator[Message]:
-    if held.imu:
-        columns = [held.imu[name].tolist() for name in ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")]
-        for time_ns, body, *values in zip(*columns, strict=True):
-            turn, pull = (_known(_vector(*part)) for part in (values[:3], values[3:]))
-            yield time_ns, f"/imu/{body}", "uwb.Imu", {"angular_velocity": turn, "linear_acceleration": pull}
+def _vector(values: list[float]) -> dict[str, float]:
+    return dict(zip("xyzw", values, strict=False))
 
 
-def _heights(held: Contents) -> Iterator[Message]:
-    if held.height:
-        for time_ns, body, height in zip(
-            *(held.height[n].tolist() for n in ("time_ns", "body", "height_m")), strict=True
-        ):
-            yield time_ns, f"/height/{body}", "uwb.Height", _known({"height_m": height})
+Encoded = list[tuple[str, str, dict[str, Any]]]
 
 
-def _temperatures(held: Contents) -> Iterator[Message]:
-    if held.temperature:
-        names = ("time_ns", "tag", "temperature_c", "supply_v")
-        for time_ns, tag, celsius, volts in zip(*(held.temperature[n].tolist() for n in names), strict=True):
-            yield (
-                time_ns,
-                f"/temperature/{tag}",
-                "uwb.Temperature",
-                _known({"temperature_c": celsius, "supply_v": volts}),
-            )
+def _of_pose(body: str, values: Any) -> Encoded:
+    position, attitude = map(_vector, values)
+    pose = {"frame_id": WORLD, "pose": {"position": position, "orientation": attitude}}
+    frames = {"parent_frame_id": WORLD, "child_frame_id": body, "translation": position, "rotation": attitude}
+    return [(f"/poses/{body}", "foxglove.PoseInFrame", pose), ("/tf", "foxglove.FrameTransform", frames)]
 
 
-def _faults(held: Contents) -> Iterator[Message]:
-    for fault in sorted(held.faults, key=lambda fault: fault.time_ns):
-        text = {"message": f"{fault.kind}: {fault.detail}", "name": fault.board, "file": "", "line": 0}
-        yield fault.time_ns, "/faults", "foxglove.Log", {"level": WARNING, **text}
+def _of_imu(body: str, values: Any) -> Encoded:
+    turn, pull = (_known(_vector(part)) for part in (values[:3], values[3:]))
+    return [(f"/imu/{body}", "uwb.Imu", {"angular_velocity": turn, "linear_acceleration": pull})]
+
+
+def _of_fault(board: str, fault: Any) -> Encoded:
+    text = {"message": f"{fault.kind}: {fault.detail}", "name": board, "file": "", "line": 0}
+    return [("/faults", "foxglove.Log", {"level": 3, **text})]  # a warning
+
+
+_ENCODERS: Final[dict[str, Callable[[Any, Any], Encoded]]] = {
+    "poses": _of_pose,
+    "ranges": lambda ends, row: [(f"/ranges/{ends[0]}_{ends[1]}", RANGE, row)],
+    "imu": _of_imu,
+    "height": lambda body, values: [(f"/height/{body}", "uwb.Height", _known({"height_m": values[0]}))],
+    "temperature": lambda tag, values: [
+        (f"/temperature/{tag}", "uwb.Temperature", _known(dict(zip(READINGS["temperature"][1:], values, strict=True))))
+    ],
+    "faults": _of_fault,
+}

@@ -9,30 +9,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from heapq import merge
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
+from uwblink.arrays import Floats
 from uwblink.errors import RecordingError
-from uwblink.exporters.corrections import variances
+from uwblink.exporters.mcap import WORLD, fits_exchanges, timed_rows
 from uwblink.recording.contents import READING_MB, Contents, pieces
 from uwblink.recording.file import Recording
-
-WORLD: Final = "world"
-WARN: Final = 30
-"""The level of a Log that faults have."""
-
-ALL_ROUND_RAD: Final = 2 * np.pi
-FARTHEST_M: Final = 300.0
-"""What DW1000 boards reach in the open."""
-
-UNKNOWN: Final = np.array([-1.0] + [0.0] * 8)
-"""A covariance of what an Imu does not measure, by the definition of the message."""
-
-Message = tuple[int, str, str, Any]
-"""Time in nanoseconds, topic, type, message."""
 
 
 def write_rosbag2(recording: Path, folder: Path) -> dict[str, int]:
@@ -77,13 +63,31 @@ class _Messages:
     def __init__(self, types: Any) -> None:
         self._types = types
 
-    def all(self, held: Contents) -> Iterator[Message]:
-        """Yield all messages of a piece of a recording in order of time."""
-        parts = (
-            self.poses(held), self.ranges(held), self.imu(held), self.heights(held), self.temperatures(held),
-            self.faults(held),
-        )  # fmt: skip
-        return merge(*parts, key=lambda row: row[0])
+    def all(self, held: Contents) -> Iterator[tuple[int, str, str, Any]]:
+        """Yield time in nanoseconds, topic, type and message of a piece of a recording, in order of time."""
+        ranges, variances = held.exchanges.range_m, _variances(held)
+        for time_ns, table, whose, values in timed_rows(held):
+            if table == "poses":
+                yield from self._poses(time_ns, whose, *values)
+            elif table == "ranges":
+                message = self._range(time_ns, f"uwb_{whose[0]}", float(ranges[values]), float(variances[values]))
+                yield time_ns, f"/uwb/range_{whose[0]}_{whose[1]}", "sensor_msgs/msg/Range", message
+            elif table == "imu":
+                yield time_ns, f"/imu/{topic_name(whose)}", "sensor_msgs/msg/Imu", self._imu(time_ns, whose, values)
+            elif table == "height":
+                message = self._range(time_ns, whose, values[0], 0.0)
+                yield time_ns, f"/height/{topic_name(whose)}", "sensor_msgs/msg/Range", message
+            elif table == "temperature":
+                message = self._new("sensor_msgs/Temperature", self._header(time_ns, f"uwb_{whose}"), values[0], 0.0)
+                yield time_ns, f"/temperature/uwb_{whose}", "sensor_msgs/msg/Temperature", message
+            else:
+                said = (30, whose, f"{values.kind}: {values.detail}", "", "", 0)  # a warning
+                yield (
+                    time_ns,
+                    "/faults",
+                    "rcl_interfaces/msg/Log",
+                    self._new("rcl_interfaces/Log", self._stamp(time_ns), *said),
+                )
 
     def _new(self, kind: str, *values: Any) -> Any:
         package, name = kind.split("/")
@@ -95,62 +99,33 @@ class _Messages:
     def _stamp(self, time_ns: int) -> Any:
         return self._new("builtin_interfaces/Time", *divmod(time_ns, 1_000_000_000))
 
-    def _vector(self, values: list[float]) -> Any:
-        return self._new("geometry_msgs/Vector3", *values)
-
-    def poses(self, held: Contents) -> Iterator[Message]:
-        poses = held.poses
-        columns = (poses.time_ns, poses.body, poses.position_m, poses.quaternion)
-        for time_ns, body, place, turn in zip(*(column.tolist() for column in columns), strict=True):
-            attitude = self._new("geometry_msgs/Quaternion", *turn)
-            header = self._header(time_ns, WORLD)
-            pose = self._new("geometry_msgs/Pose", self._new("geometry_msgs/Point", *place), attitude)
-            stamped = self._new("geometry_msgs/PoseStamped", header, pose)
-            yield time_ns, f"/poses/{topic_name(body)}", "geometry_msgs/msg/PoseStamped", stamped
-            moved = self._new("geometry_msgs/Transform", self._vector(place), attitude)
-            transform = self._new("geometry_msgs/TransformStamped", header, body, moved)
-            yield time_ns, "/tf", "tf2_msgs/msg/TFMessage", self._new("tf2_msgs/TFMessage", [transform])
-
-    def ranges(self, held: Contents) -> Iterator[Message]:
-        e = held.exchanges
-        order = np.argsort(e.time_ns, kind="stable")
-        columns = (column[order].tolist() for column in (e.time_ns, e.initiator, e.target, e.range_m, variances(held)))
-        for time_ns, initiator, target, range_m, variance in zip(*columns, strict=True):
-            message = self._range(time_ns, f"uwb_{initiator}", range_m, variance)
-            yield time_ns, f"/uwb/range_{initiator}_{target}", "sensor_msgs/msg/Range", message
+    def _poses(
+        self, time_ns: int, body: str, place: list[float], turn: list[float]
+    ) -> Iterator[tuple[int, str, str, Any]]:
+        attitude, header = self._new("geometry_msgs/Quaternion", *turn), self._header(time_ns, WORLD)
+        pose = self._new("geometry_msgs/Pose", self._new("geometry_msgs/Point", *place), attitude)
+        stamped = self._new("geometry_msgs/PoseStamped", header, pose)
+        yield time_ns, f"/poses/{topic_name(body)}", "geometry_msgs/msg/PoseStamped", stamped
+        moved = self._new("geometry_msgs/Transform", self._new("geometry_msgs/Vector3", *place), attitude)
+        transform = self._new("geometry_msgs/TransformStamped", header, body, moved)
+        yield time_ns, "/tf", "tf2_msgs/msg/TFMessage", self._new("tf2_msgs/TFMessage", [transform])
 
     def _range(self, time_ns: int, frame: str, range_m: float, variance: float) -> Any:
+        # A field of view all round, and the 300 m that DW1000 boards reach in the open.
         header = self._header(time_ns, frame)
-        return self._new("sensor_msgs/Range", header, 0, ALL_ROUND_RAD, 0.0, FARTHEST_M, range_m, variance)
+        return self._new("sensor_msgs/Range", header, 0, 2 * np.pi, 0.0, 300.0, range_m, variance)
 
-    def imu(self, held: Contents) -> Iterator[Message]:
-        if not held.imu:
-            return
-        names = ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")
-        level = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
-        unsaid = np.zeros(9)
-        for time_ns, body, *values in zip(*(held.imu[name].tolist() for name in names), strict=True):
-            turn, pull = self._vector(values[:3]), self._vector(values[3:])
-            header = self._header(time_ns, body)
-            message = self._new("sensor_msgs/Imu", header, level, UNKNOWN, turn, unsaid, pull, unsaid)
-            yield time_ns, f"/imu/{topic_name(body)}", "sensor_msgs/msg/Imu", message
+    def _imu(self, time_ns: int, body: str, values: list[float]) -> Any:
+        turn, pull = (self._new("geometry_msgs/Vector3", *part) for part in (values[:3], values[3:]))
+        level, unsaid = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.zeros(9)
+        # -1 stands first in the covariance of what an Imu does not measure, by the definition of the message.
+        unmeasured = np.array([-1.0] + [0.0] * 8)
+        return self._new("sensor_msgs/Imu", self._header(time_ns, body), level, unmeasured, turn, unsaid, pull, unsaid)
 
-    def heights(self, held: Contents) -> Iterator[Message]:
-        if held.height:
-            columns = (held.height[name].tolist() for name in ("time_ns", "body", "height_m"))
-            for time_ns, body, height_m in zip(*columns, strict=True):
-                message = self._range(time_ns, body, height_m, 0.0)
-                yield time_ns, f"/height/{topic_name(body)}", "sensor_msgs/msg/Range", message
 
-    def temperatures(self, held: Contents) -> Iterator[Message]:
-        if held.temperature:
-            columns = (held.temperature[name].tolist() for name in ("time_ns", "tag", "temperature_c"))
-            for time_ns, tag, celsius in zip(*columns, strict=True):
-                message = self._new("sensor_msgs/Temperature", self._header(time_ns, f"uwb_{tag}"), celsius, 0.0)
-                yield time_ns, f"/temperature/uwb_{tag}", "sensor_msgs/msg/Temperature", message
-
-    def faults(self, held: Contents) -> Iterator[Message]:
-        for fault in sorted(held.faults, key=lambda fault: fault.time_ns):
-            text = f"{fault.kind}: {fault.detail}"
-            log = self._new("rcl_interfaces/Log", self._stamp(fault.time_ns), WARN, fault.board, text, "", "", 0)
-            yield fault.time_ns, "/faults", "rcl_interfaces/msg/Log", log
+def _variances(held: Contents) -> Floats:
+    """Return the variances of ranges (n,), reflections counted in where that is known; 0 where nothing is."""
+    if not fits_exchanges(held):
+        return np.zeros(len(held.exchanges))
+    total, noise = held.corrected["sigma_total_m"], held.corrected["sigma_m"]
+    return np.asarray(np.nan_to_num(np.where(np.isfinite(total), total, noise) ** 2))

@@ -1,4 +1,4 @@
-"""Every table of a recording as a file of its own: CSV and Parquet, which `uwblink import exported` takes back.
+"""Every table of a recording as a CSV or Parquet file, which `uwblink import exported` takes back; bodies as TUM.
 
 CSV cannot tell a list or bytes from text, so impulse responses are written as `[1, 2]` and bytes as hexadecimal digits.
 A missing value is an empty cell; text is quoted, so that an empty one is not missing.
@@ -8,31 +8,28 @@ A missing value is an empty cell; text is quoted, so that an empty one is not mi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from uwblink.arrays import Floats
 from uwblink.database import check_log, connect, log_of
 from uwblink.errors import RecordingError, first_line
-from uwblink.recording.contents import distances_by_poses_m
+from uwblink.recording.contents import READING_MB, distances_by_poses_m, pieces
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
+from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM, Poses
 
 if TYPE_CHECKING:
     import duckdb
-
-MEMORY_MB: Final = 400
-"""What DuckDB may keep of the file that it reads; what it writes comes on top of that."""
 
 CSV_CELLS: Final = {"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"}
 
 
 def write_csv(recording: Path, folder: Path) -> dict[str, int]:
     """Write a CSV file a table, with a header; returns the rows by file. Raises `RecordingError`."""
-    return _write(recording, folder, "csv", "FORMAT csv, HEADER true, NULLSTR '', FORCE_QUOTE ({words})", CSV_CELLS)
+    return _write(recording, folder, "csv", "FORMAT csv, HEADER true, NULLSTR ''", CSV_CELLS)
 
 
 def write_parquet(recording: Path, folder: Path) -> dict[str, int]:
@@ -46,37 +43,27 @@ def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapp
     with Recording.open(recording) as opened:
         # What every reader checks is checked here too, before the file is read past it.
         counts = {table: opened.count(table) for table in TABLES}
-        by_poses = [np.empty(0), *distances_by_poses_m(opened, opened.exchange_blocks())] if counts["poses"] else []
-    paths = {table: folder / f"{table}.{suffix}" for table in TABLES}
-    wanted = {table: paths[table] for table in TABLES if counts[table] or table == "exchanges"}
-    try:
-        _copy(recording, folder, wanted, options, cells, by_poses)
-    except duckdb.Error as error:
-        raise RecordingError(f"{recording}: cannot be exported ({first_line(error)})") from error
-    return {path.name: counts[table] for table, path in paths.items() if path.exists()}
-
-
-def _copy(
-    recording: Path,
-    folder: Path,
-    wanted: Mapping[str, Path],
-    options: str,
-    cells: Mapping[str, str],
-    by_poses: list[Floats],
-) -> None:
-    """Write tables to their paths; raises what DuckDB raises. `by_poses` are true distances, if there are poses."""
+        by_poses = list(distances_by_poses_m(opened, opened.exchange_blocks())) if counts["poses"] else []
+    wanted = {table: folder / f"{table}.{suffix}" for table in TABLES if counts[table] or table == "exchanges"}
     # What a link leads to has its log beside it, not beside the link.
     place = recording.resolve()
     check_log(place)
-    # What one of several threads is behind with, the others keep in memory; one takes no more processor time, and
-    # for 4 million exchanges as CSV 0.29 GB in place of 0.41 GB (2026-11-22).
-    with connect(paths=[place, log_of(place)], folders=[folder], memory_mb=MEMORY_MB, threads=1) as db:
-        db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
-        if by_poses:
-            db.register("truths", {"by_poses": np.concatenate(by_poses)})
-        for table, path in wanted.items():
-            query = _query(db, table, cells, truths=bool(by_poses))
-            db.execute(f"COPY ({query}) TO {_literal(path)} ({_options(options, table)})")
+    try:
+        # What one of several threads is behind with, the others keep in memory; one takes no more processor time, and
+        # for 4 million exchanges as CSV 0.29 GB in place of 0.41 GB (2026-11-22). What is written comes on top of the
+        # memory for what is read.
+        with connect(paths=[place, log_of(place)], folders=[folder], memory_mb=400, threads=1) as db:
+            db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
+            if by_poses:
+                db.register("truths", {"by_poses": np.concatenate(by_poses)})
+            for table, path in wanted.items():
+                words = [f'"{n}"' for n, kind in TABLES[table].items() if kind in ("VARCHAR", "BLOB", "USMALLINT[]")]
+                quoted = f", FORCE_QUOTE ({', '.join(words)})" if words and suffix == "csv" else ""
+                query = _query(db, table, cells, truths=bool(by_poses))
+                db.execute(f"COPY ({query}) TO {_literal(path)} ({options}{quoted})")
+    except duckdb.Error as error:
+        raise RecordingError(f"{recording}: cannot be exported ({first_line(error)})") from error
+    return {path.name: counts[table] for table, path in wanted.items()}
 
 
 def _query(db: duckdb.DuckDBPyConnection, table: str, cells: Mapping[str, str], *, truths: bool) -> str:
@@ -101,11 +88,48 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, cells: Mapping[str, str], 
     return f"SELECT {listed} FROM {source}"  # noqa: S608 - keys of TABLES
 
 
-def _options(options: str, table: str) -> str:
-    words = [f'"{name}"' for name, kind in TABLES[table].items() if kind in ("VARCHAR", "BLOB", "USMALLINT[]")]
-    return options.replace("FORCE_QUOTE ({words})", f"FORCE_QUOTE ({', '.join(words)})" if words else "QUOTE '\"'")
-
-
 def _literal(path: Path) -> str:
     """Return a path as a literal of SQL; statements that name files take no bound values."""
     return "'" + str(path).replace("'", "''") + "'"
+
+
+def write_tum(recording: Path, folder: Path) -> dict[str, int]:
+    """Write the poses of each body, times in seconds with nine decimals; returns the poses by file.
+
+    Letters of a body's name that are not safe in a file's name become "_". Raises `RecordingError`.
+    """
+    with Recording.open(recording, memory_mb=READING_MB) as opened, ExitStack() as files:
+        names = _file_names(body for (body,) in opened.tally("poses", "body"))
+        if not names:
+            raise RecordingError(f"{recording}: holds no poses")
+        out = {body: files.enter_context((folder / name).open("w", encoding="utf-8")) for body, name in names.items()}
+        written = dict.fromkeys(names.values(), 0)
+        for held in pieces(opened):
+            for body in np.unique(held.poses.body).tolist():
+                mine = held.poses[held.poses.body == body]
+                out[body].writelines(_lines(mine))
+                written[names[body]] += len(mine)
+    return written
+
+
+def _file_names(bodies: Iterable[str]) -> dict[str, str]:
+    """Return the name of each body's file, all different."""
+    found: dict[str, str] = {}
+    for body in sorted(bodies):
+        name = "".join(c if c.isalnum() or c in "-_" else "_" for c in body) or "_"
+        while f"{name}.tum" in found.values():
+            name += "_"
+        found[body] = f"{name}.tum"
+    return found
+
+
+def _lines(poses: Poses) -> Iterator[str]:
+    columns = (poses.time_ns.tolist(), poses.position_m.tolist(), poses.quaternion.tolist())
+    for time_ns, place, turn in zip(*columns, strict=True):
+        yield " ".join([_seconds(time_ns), *map(repr, [*place, *turn])]) + "\n"
+
+
+def _seconds(time_ns: int) -> str:
+    """Return nanoseconds as seconds, exactly."""
+    whole, rest = divmod(abs(time_ns), 1_000_000_000)
+    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from uwblink.errors import ArgumentError, PortError
-from uwblink.exporters.schemas import RANGE, SCHEMAS, stamped
+from uwblink.exporters.mcap import RANGE, SCHEMAS, stamped
 from uwblink.streaming.gate import LOOPBACK, Gate, hidden_address
 from uwblink.streaming.sources import StreamedRange
 
