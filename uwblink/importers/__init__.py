@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 
 from uwblink.errors import ArgumentError, ImportTableError
 from uwblink.importers.bags import BAG_SUFFIXES, open_exchange_bag
-from uwblink.importers.exchange_tables import SUFFIXES, open_tables
+from uwblink.importers.exchange_tables import TABLE_SUFFIXES, open_tables
 from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
 from uwblink.importers.motion_capture import add_poses
@@ -101,7 +101,7 @@ def _read_bag(source: Path, map_file: Path | None = None) -> Contents:
 _OWN: Final = (
     Importer(
         "csv",
-        SUFFIXES,
+        TABLE_SUFFIXES,
         read_table,
         "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
         map_help="Names, units and constants (.toml).",

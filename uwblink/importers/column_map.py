@@ -47,20 +47,18 @@ from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
 
 POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in "xyz")
-LEVELS: Final = ("fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2")
 DISTANCES: Final = ("range_m", "gt_range_m", *POSITIONS)
-MESSAGE_NAMES: Final = ("sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp")
 IDS: Final = {"from_id": "who begins each exchange", "to_id": "who answers"}
 ASKED: Final = "?"
 """What `uwblink import guess` writes where somebody has to say it."""
 
-EVENT: Final = "event"
-"""The column that says whether a stamp is of sending or of receiving, in words."""
-
-NAMES: Final = ("time_s", *IDS, *STAMPS, *LEVELS, *DISTANCES, *MESSAGE_NAMES, EVENT)
+NAMES: Final = (
+    "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", *DISTANCES,
+    "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp", "event",
+)  # fmt: skip
+"""The columns of tables; `event` says in words whether a stamp is of sending or of receiving."""
 
 LAYOUTS: Final = ("exchanges", "messages", "stamps", "parts", "ranges")
-COUNTERS: Final = ("wrapped", "signed", "unwrapped")
 STAMP_UNITS: Final = {
     "ticks": 1.0,
     "ps": TICKS_PER_SECOND * 1e-12,
@@ -69,11 +67,8 @@ STAMP_UNITS: Final = {
     "s": float(TICKS_PER_SECOND),
 }
 TIME_UNITS: Final = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-ISO: Final = "iso"
 DISTANCE_UNITS: Final = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "in": 0.0254}
 POWERS: Final = ("fpp1", "fpp2", "rxp1", "rxp2", "fpp", "rxp")
-POWER_UNITS: Final = {"dBm": 1.0, "-dBm": -1.0}
-DELIMITERS: Final = (",", ";", "\t", "|", " ")
 FILE_KEYS: Final = (
     FileKey(
         "layout",
@@ -154,6 +149,7 @@ FILE_KEYS: Final = (
 )
 KEYS: Final = heads(FILE_KEYS)
 REGISTER_MAX: Final = 65_535
+"""Antenna delays have registers of 16 bits (DW1000 User Manual 2.10, sections 7.2.25 and 7.2.40.4)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,7 +186,7 @@ class ColumnMap:
     @property
     def power_sign(self) -> float:
         """What powers are multiplied by."""
-        return POWER_UNITS[self.power_unit or "dBm"]
+        return -1.0 if self.power_unit == "-dBm" else 1.0
 
     def header(self, name: str) -> str:
         """Return what the table calls one of `NAMES`."""
@@ -222,16 +218,16 @@ def load_map(path: Path) -> ColumnMap:
     return ColumnMap(
         layout=file.choice("layout", table.get("layout"), (None, *LAYOUTS)),
         bits=file.choice("bits", table.get("bits"), (None, *BITS)),
-        counter=file.choice("counter", table.get("counter"), (None, *COUNTERS)),
+        counter=file.choice("counter", table.get("counter"), (None, "wrapped", "signed", "unwrapped")),
         protocol=file.choice("protocol", table.get("protocol"), (None, *PROTOCOLS)),
-        delimiter=file.choice("delimiter", table.get("delimiter"), (None, *DELIMITERS)),
+        delimiter=file.choice("delimiter", table.get("delimiter"), (None, ",", ";", "\t", "|", " ")),
         decimal=file.choice("decimal", table.get("decimal"), (None, ".", ",")),
         within_s=float(within),
         columns=columns,
         ticks_per_unit=_ticks_per_unit(file, units.get("stamps", "ticks")),
-        time_unit=file.choice("units.time", units.get("time"), (None, ISO, *TIME_UNITS)),
+        time_unit=file.choice("units.time", units.get("time"), (None, "iso", *TIME_UNITS)),
         distance_unit=file.choice("units.distance", units.get("distance"), (None, *DISTANCE_UNITS)),
-        power_unit=file.choice("units.power", units.get("power"), (None, *POWER_UNITS)),
+        power_unit=file.choice("units.power", units.get("power"), (None, "dBm", "-dBm")),
         constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
         ids=ids,
         antenna_delays=_antenna_delays(file),

@@ -45,7 +45,7 @@ from uwblink.recording.schema import Fault, Poses, Tag
 from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK
 from uwblink.twr import LARGEST_ID, STAMPS, Exchanges, raw_range
 
-SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
+TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 MAX_NAMES_SHOWN: Final = 12
 """Ids that are words and are printed with their numbers; a recording has all, as its tags' bodies."""
 
@@ -66,9 +66,9 @@ def open_tables(
     """
     paths = list(sources)
     if len(paths) == 1 and paths[0].is_dir():
-        paths = sorted(path for path in paths[0].iterdir() if path.name.lower().endswith(SUFFIXES))
+        paths = sorted(path for path in paths[0].iterdir() if path.name.lower().endswith(TABLE_SUFFIXES))
         if not paths:
-            raise ImportTableError(f"{sources[0]}: is a directory without a table ({', '.join(SUFFIXES)})")
+            raise ImportTableError(f"{sources[0]}: is a directory without a table ({', '.join(TABLE_SUFFIXES)})")
     column_map = load_map(map_file) if map_file else ColumnMap()
     if column_map.topics or column_map.each:
         raise ImportTableError(f"{map_file}: topics and each are of bags; {paths[0]} is a table")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.tables import confined
@@ -15,9 +15,6 @@ from uwblink.recording.store import Store
 
 if TYPE_CHECKING:
     import duckdb
-
-SUFFIXES: Final = (".csv", ".parquet")
-_FROM_TEXT: Final = {"BLOB": "unhex({0})"}
 
 
 def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
@@ -40,7 +37,7 @@ def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
 
 
 def _path(folder: Path, table: str) -> Path | None:
-    return next((path for suffix in SUFFIXES if (path := folder / f"{table}{suffix}").is_file()), None)
+    return next((path for suffix in (".csv", ".parquet") if (path := folder / f"{table}{suffix}").is_file()), None)
 
 
 def _take(store: Store, table: str, source: Path) -> None:
@@ -70,7 +67,9 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
         there = [str(row[0]) for row in found]
     cells = {name: f'"{name}"' for name in TABLES[table]}
     if source.suffix == ".csv":
-        texts = {name: _FROM_TEXT.get(kind, "{0}").format(cells[name]) for name, kind in TABLES[table].items()}
+        texts = {
+            name: f"unhex({cells[name]})" if kind == "BLOB" else cells[name] for name, kind in TABLES[table].items()
+        }
         cells = {name: f"CAST({text} AS {TABLES[table][name]})" for name, text in texts.items()}
     if TRUTH_FROM in there and table == "exchanges":
         # Where the distance is that of the poses, which come in, too.

@@ -21,9 +21,7 @@ from uwblink.importers.column_map import (
     ASKED,
     DISTANCE_UNITS,
     DISTANCES,
-    EVENT,
     IDS,
-    ISO,
     LAYOUTS,
     POSITIONS,
     POWERS,
@@ -83,12 +81,12 @@ def guess_map(path: Path) -> Guess:
     with Table(path) as table:
         columns = named_columns(table.names)
         columns = stamp_and_event(table, columns) or columns
-        headers = {name: header for name, header in columns.items() if name != EVENT}
+        headers = {name: header for name, header in columns.items() if name != "event"}
         numbers = table.read(numbers=headers.values(), limit=100_000)[0]
     cells = {name: numbers[header] for name, header in headers.items()}
     if not len(next(iter(cells.values()), np.empty(0))):
         raise ImportTableError(f"{path}: no column whose name is known, or no rows; there are {', '.join(table.names)}")
-    layout = "stamps" if EVENT in columns else _layout(cells)
+    layout = "stamps" if "event" in columns else _layout(cells)
     if layout == "messages" and _only_words(cells, "message") and columns["message"] != "message":
         del columns["message"], cells["message"]  # without a column of that name messages are told by their order
     unplaced = unusable_positions(columns, cells)
@@ -227,7 +225,7 @@ def _distance_units(columns: dict[str, str]) -> set[str]:
 
 def _time_unit(header: str, values: Floats) -> tuple[str, str]:
     if not np.isfinite(values).any():
-        return ISO, "no numbers"
+        return "iso", "no numbers"
     if ended := _suffix(header, ("ns", "us", "ms", "s")):
         return ended, "by the column's name"
     largest = float(np.nanmax(np.abs(values)))

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from uwblink.arrays import Floats
-from uwblink.importers.column_map import EVENT, POSITIONS
+from uwblink.importers.column_map import POSITIONS
 from uwblink.importers.stamps import CLEARLY
 from uwblink.importers.tables import Table
 from uwblink.twr import STAMPS
@@ -163,7 +163,7 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
     rest = {ours: header for ours, header in columns.items() if header not in (stamp, event)}
     if "time_s" not in rest and len(times) > 1:
         rest["time_s"] = next(name for name in times if name != stamp)
-    return rest | {"stamp": stamp, EVENT: event}
+    return rest | {"stamp": stamp, "event": event}
 
 
 def _is_event(table: Table, name: str) -> bool:

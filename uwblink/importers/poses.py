@@ -24,8 +24,6 @@ from uwblink.text_files import read_text, require_regular
 from uwblink.twr import LATEST_NS
 
 NUMBERS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
-EUROC_NUMBERS: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
-SUFFIXES: Final = ("bag", "csv", "db3", "mcap", "tum", "txt")
 
 Place = Callable[[int, str], tuple[int, str]]
 """Returns the line of a pose, the first being 0, and what stands there in a column."""
@@ -61,9 +59,10 @@ def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | 
     """
     require_regular(path, ImportTableError, "file of poses", folders=True)
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
-    if kind not in SUFFIXES:
+    known = ("bag", "csv", "db3", "mcap", "tum", "txt")
+    if kind not in known:
         raise ImportTableError(
-            f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(SUFFIXES)}"
+            f"{path}: found {f'.{kind}' if kind else 'no suffix'}, expected one of .{', .'.join(known)}"
         )
     is_bag = kind in ("bag", "mcap", "db3")
     if topics and not is_bag:
@@ -123,7 +122,9 @@ def _from_table(path: Path, body: str | None) -> Poses:
 
 def _from_lines(path: Path, body: str | None, *, euroc: bool) -> Poses:
     """Return the poses of a TUM or a EuRoC file."""
-    kind, mark, time, names = ("EuRoC", ",", "time_ns", EUROC_NUMBERS) if euroc else ("TUM", None, "time_s", NUMBERS)
+    kind, mark, time, names = "TUM", None, "time_s", NUMBERS
+    if euroc:
+        kind, mark, time, names = "EuRoC", ",", "time_ns", ("x", "y", "z", "qw", "qx", "qy", "qz")
     if body is None:
         raise ImportTableError(f"{path}: a {kind} file does not say whose poses it holds; name it as `body`")
     lines, exact, seconds, values = array("q"), array("q"), array("d"), array("d")

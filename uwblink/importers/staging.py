@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from uwblink.errors import ImportTableError, first_line
-from uwblink.importers.column_map import DISTANCES, EVENT, IDS, ISO, NAMES, POWERS, TIME_UNITS, ColumnMap
+from uwblink.importers.column_map import DISTANCES, IDS, NAMES, POWERS, TIME_UNITS, ColumnMap
 from uwblink.importers.tables import Columns, Table, confined
 from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS
 
@@ -142,9 +142,9 @@ class Staging:
             raise ImportTableError(f"{table.path}: has other columns than {self.paths[0]}, so they are not one table")
         self._headers = headers
         cells = {name: table.number(header) for name, header in headers.items()}
-        if EVENT in cells:
-            first = f"lower(left({table.word(headers[EVENT])}, 1))"
-            cells[EVENT] = f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
+        if "event" in cells:
+            first = f"lower(left({table.word(headers['event'])}, 1))"
+            cells["event"] = f"CASE WHEN {first} IN ('t', 's') THEN 1.0 WHEN {first} = 'r' THEN 2.0 END"
         self._stage("staged", table, cells)
 
     def _stage(self, name: str, table: Table, cells: dict[str, str]) -> None:
@@ -196,7 +196,7 @@ class Staging:
                 # A few ids that are no numbers are faults; more than that say that ids are words.
                 if self._ask(f"count(*) - count(*) FILTER ({_is_id(name)})") > 0.01 * self.offsets[-1]:
                     found[name] = Table.word
-            elif name == "time_s" and (unit == ISO or (unit is None and not self._ask("count(time_s)"))):
+            elif name == "time_s" and (unit == "iso" or (unit is None and not self._ask("count(time_s)"))):
                 found[name] = Table.time_ns
             elif (counted or (name == "time_s" and unit == "ns")) and self._ask(
                 f"count(*) FILTER (abs({name}) >= {2**53})"
