@@ -13,7 +13,7 @@ from calib.calibration.document import FILE_KEYS as CALIBRATION
 from docs.site import commands, doors, file_keys
 from uwblink.boards import ranging_plan
 from uwblink.importers import column_map
-from uwblink.toml import heads
+from uwblink.text_files import heads
 from uwbsim.sweep import design
 
 
