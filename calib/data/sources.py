@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calib.data.clocks import ClockSample, left_skew_of, skew_terms
-from calib.data.planted import check_planted
 from calib.data.ranges import (
     COLUMNS,
     FAINTEST_DBM,
@@ -36,6 +35,7 @@ from calib.data.ranges import (
 )
 from calib.errors import BadInputError, UnanswerableError
 from uwblink.arrays import Floats
+from uwblink.display import printable
 from uwblink.recording.antenna_delays import AntennaDelays, delays_in_meta
 from uwblink.recording.distances import Tracks
 from uwblink.recording.file import Recording
@@ -362,6 +362,43 @@ def _why_no_truth(source: Source) -> str:
         f"its poses cover {spans[0][0]:.1f} to {spans[0][1]:.1f} s, its exchanges {spans[1][0]:.1f} to "
         f"{spans[1][1]:.1f} s after the first pose; shift the poses with 'uwblink poses --offset'"
     )
+
+
+def check_planted(planted: Mapping[str, Any], where: str) -> None:
+    """Raise `BadInputError`, beginning with `where`, for delays that are no numbers by tag and curves that are none."""
+    delays = planted.get("delays_ns", {})
+    if not isinstance(delays, Mapping) or not all(str(tag).isdecimal() for tag in delays):
+        raise _wrong(where, "delays_ns", delays, "numbers by tag")
+    if len(_numbers([*delays.values()])) != len(delays):
+        raise _wrong(where, "delays_ns", delays, "numbers by tag")
+    for name in ("bias_curve", "sigma_curve"):
+        curve = planted.get(name)
+        if curve and not _fits(curve):
+            raise _wrong(where, name, curve, "knots, coefficients and degree of a B-spline")
+
+
+def _fits(curve: Any) -> bool:
+    if not isinstance(curve, Mapping):
+        return False
+    degree = curve.get("degree")
+    knots, coefficients = _numbers(curve.get("knots")), _numbers(curve.get("coefficients"))
+    if not isinstance(degree, int) or not 0 <= degree <= 5:
+        return False
+    sizes = len(coefficients) > degree and len(knots) == len(coefficients) + degree + 1
+    return bool(sizes and (np.diff(knots) >= 0).all() and knots[degree] < knots[-1 - degree])
+
+
+def _numbers(values: ArrayLike | None) -> Floats:
+    """Return a list of numbers as an array, an empty one where one of them is none or beyond 1e9 ns, m or mW."""
+    try:
+        found = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+    return found if found.ndim == 1 and (np.abs(found) <= 1e9).all() else np.empty(0)
+
+
+def _wrong(where: str, key: str, found: object, expected: str) -> BadInputError:
+    return BadInputError(f"{where}: planted: {key}: found {printable(repr(found))[:60]}, expected {expected}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["calib.calibration", "calib.data.planted", "uwblink.recording.intake"]):
+with atheris.instrument_imports(include=["calib.calibration", "calib.data.sources", "uwblink.recording.intake"]):
     from calib.calibration.formats import read_miluv
     from calib.calibration.model import Calibration
-    from calib.data.planted import check_planted
+    from calib.data.sources import check_planted
     from calib.errors import CalibError
     from uwblink.errors import UwblinkError
     from uwblink.recording.intake import decode_json
