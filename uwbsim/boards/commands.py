@@ -79,9 +79,6 @@ if TYPE_CHECKING:
     from uwbsim.boards.virtual_board import VirtualBoard
 
 
-LARGEST: Final = 2**31 - 1
-
-
 def printed_float(value: float) -> bytes:
     """Return a four-byte float as the boards print it.
 
@@ -91,19 +88,16 @@ def printed_float(value: float) -> bytes:
     single = float(np.float32(value)) if math.isfinite(value) else value
     if math.isnan(single):
         return b"0.0000"
-    if abs(single) > LARGEST:
-        return b"%d.0000" % (LARGEST if single > 0 else -LARGEST - 1)
+    if abs(single) > 2**31 - 1:
+        return b"%d.0000" % (2**31 - 1 if single > 0 else -(2**31))
     return write_printed(single)
-
-
-NO_END: Final = b"Failed to detect USB command terminator char! Trying my best"
 
 
 def atoi(text: bytes) -> int:
     """Return the number at the start of a text, 0 where there is none, as C's function does; a larger one saturates."""
     found = re.match(rb"\s*([+-]?)0*(\d+)", text)
     # Eleven digits are beyond the largest number already, and how many more there are does not matter.
-    return max(-LARGEST - 1, min(int(found[1] + found[2][:11]), LARGEST)) if found else 0
+    return max(-(2**31), min(int(found[1] + found[2][:11]), 2**31 - 1)) if found else 0
 
 
 def _flag(text: bytes) -> bool:
@@ -111,8 +105,6 @@ def _flag(text: bytes) -> bool:
 
 
 _UNTIL_BAR: Final[dict[Kind, Callable[[bytes], Any]]] = {INT: atoi, ID: atoi, STAMP: atoi, BOOL: _flag, TEXT: bytes}
-READABLE: Final = (*_UNTIL_BAR, BYTES, BROADCAST, RAW_FLOAT)
-"""The kinds of fields that a command can have."""
 
 
 class Command(NamedTuple):
@@ -144,15 +136,16 @@ class _Unended(Exception):  # noqa: N818 - a signal of the parser, not an error 
 def read_commands(buffer: bytes, known: Container[bytes] = COMMANDS) -> Reading:
     """Take every command out of a buffer; the board executes only the last of them. `known` are the keys it knows."""
     commands: list[Command] = []
+    no_end = b"Failed to detect USB command terminator char! Trying my best"
     while (at := buffer.find(b"C")) >= 0:
         try:
             command, end = _command(buffer, at, known)
         except _Missing as missing:
             # What the firmware does next depends on link addresses; the boards seen survived with an empty buffer.
-            complaints = (*[b"No next key character found."] * missing.fields, NO_END)
+            complaints = (*[b"No next key character found."] * missing.fields, no_end)
             return Reading(tuple(commands), complaints, b"", alive=True)
         except _Unended:
-            return Reading(tuple(commands), (NO_END,), b"", alive=False)
+            return Reading(tuple(commands), (no_end,), b"", alive=False)
         commands.append(command)
         buffer = buffer[end:]
     return Reading(tuple(commands), (), buffer, alive=True)
@@ -212,9 +205,10 @@ def register_command(kind: type[Message], execute: Executor) -> None:
     """
     if COMMANDS.get(kind.KEY) is not kind:
         raise UwbsimError(f"{kind.__name__}: not a command that uwblink knows; register the message there first")
+    readable = (*_UNTIL_BAR, BYTES, BROADCAST, RAW_FLOAT)
     for name, field in kind.FIELDS.items():
-        if field not in READABLE:
-            known = ", ".join(k.name for k in READABLE)
+        if field not in readable:
+            known = ", ".join(k.name for k in readable)
             raise UwbsimError(f"{kind.__name__}.{name}: boards read no {field.name} from the host; they read {known}")
     EXECUTORS[kind.KEY] = execute
 

@@ -39,9 +39,6 @@ if TYPE_CHECKING:
 TO_AIR: Final = 330 * NS_PER_US
 """From the poll of the USB buffer that found a command to the time stamp of its frame: set-up and half a preamble."""
 
-TO_FINAL: Final = 136 * NS_PER_US
-"""From the end of the target's last frame to the start of the initiator's final."""
-
 TO_REPORT: Final = 474 * NS_PER_US
 """From the end of the last frame to the report on the bus: read-out, arithmetic, printing."""
 
@@ -96,11 +93,12 @@ def _report(board: VirtualBoard, poll: Frame, wish: PollPayload, first: Received
     if not isinstance(came, FinalPayload):
         raise TypeError("the last frame of a target is its final")
     mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if wish.double_sided else 0
+    to_final = 136 * NS_PER_US  # from the end of the target's last frame to the start of the final
     if wish.target_reports:
-        yield board.sleep(TO_FINAL)
+        yield board.sleep(to_final)
         final = FinalPayload(mine, first.power_dbm, first.skew_ppm)
         board.radio.send(target, final, board.radio.first_stamp(), poll.excess_m)
-    yield board.sleep(TO_REPORT - (TO_FINAL if wish.target_reports else 0))
+    yield board.sleep(TO_REPORT - (to_final if wish.target_reports else 0))
     powers = came.power_dbm, first.power_dbm, came.skew_ppm, first.skew_ppm
     board.say(range_report(target, _in_order(mine, came.stamps), powers))
     if wish.get_cir:

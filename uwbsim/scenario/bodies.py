@@ -123,16 +123,13 @@ class Errors(NamedTuple):
     noise: float
 
 
-DEGREE: Final = math.pi / 180
-"""In radians."""
-
 GRADES: Final = {
-    "consumer": {"gyro": Errors(0.5 * DEGREE, 0.01 * DEGREE, 0.01 * DEGREE), "force": Errors(0.1, 2e-3, 3e-3)},
-    "industrial": {"gyro": Errors(0.1 * DEGREE, 2e-3 * DEGREE, 5e-3 * DEGREE), "force": Errors(0.03, 5e-4, 1e-3)},
-    "tactical": {"gyro": Errors(5e-3 * DEGREE, 1e-4 * DEGREE, 1e-3 * DEGREE), "force": Errors(0.01, 5e-5, 3e-4)},
+    "consumer": {"gyro": Errors(0.5, 0.01, 0.01), "force": Errors(0.1, 2e-3, 3e-3)},
+    "industrial": {"gyro": Errors(0.1, 2e-3, 5e-3), "force": Errors(0.03, 5e-4, 1e-3)},
+    "tactical": {"gyro": Errors(5e-3, 1e-4, 1e-3), "force": Errors(0.01, 5e-5, 3e-4)},
     "perfect": {"gyro": Errors(0.0, 0.0, 0.0), "force": Errors(0.0, 0.0, 0.0)},
 }
-"""Orders of magnitude of data sheets: phones and small drones, better drones, aircraft."""
+"""Orders of magnitude of data sheets: phones and small drones, better drones, aircraft; the gyroscopes' in degrees."""
 
 
 class Imu(Section):
@@ -166,12 +163,11 @@ class Imu(Section):
     def errors(self, which: str) -> Errors:
         """Return the errors of the "gyro" or of the "force", in SI units."""
         bias, wander, noise = GRADES[self.grade][which]
+        scale, given = 1.0, (self.accel_bias_mps2, self.accel_noise_mps2_per_sqrt_hz)
         if which == "gyro":
-            own = self.gyro_bias_dps, self.gyro_noise_dps_per_sqrt_hz
-            given = [None if value is None else DEGREE * value for value in own]
-        else:
-            given = [self.accel_bias_mps2, self.accel_noise_mps2_per_sqrt_hz]
-        return Errors(bias if given[0] is None else given[0], wander, noise if given[1] is None else given[1])
+            scale, given = math.pi / 180, (self.gyro_bias_dps, self.gyro_noise_dps_per_sqrt_hz)
+        bias, noise = (known if own is None else own for own, known in zip(given, (bias, noise), strict=True))
+        return Errors(scale * bias, scale * wander, scale * noise)
 
 
 class Height(Section):

@@ -51,18 +51,15 @@ def schedule(scenario: Scenario) -> Schedule:
         pairs = np.array([[place[a], place[b]] for a, b in ids], dtype=np.int64)
         return _schedule(start, pairs, pairs[:, 0])
     pairs = np.array([[place[a], place[b]] for a, b in scenario.pairs()], dtype=np.int64)
-    return PLANS[scenario.ranging.plan](scenario, pairs)
-
-
-def _round_robin(scenario: Scenario, pairs: Ints) -> Schedule:
-    """One host, pair after pair, at the rate."""
-    start, turn = _turns(scenario, pairs)
-    return _schedule(start, turn, np.zeros(len(turn), dtype=np.int64))
-
-
-def _tdma(scenario: Scenario, pairs: Ints) -> Schedule:
-    """The same turns, but every initiator has a host of its own, whose clock is off by `sync_error_ms`."""
-    start, turn = _turns(scenario, pairs)
+    if scenario.ranging.plan == "aloha":
+        return _aloha(scenario, pairs)
+    # In turns, at the rate. One host plays them; with tdma each initiator has its own, whose clock is off by
+    # `sync_error_ms`. With a common list each robot begins when it has heard the exchange before its own, which keeps
+    # the order; who is too far away to hear it waits for `list_timeout_ms` more (`Slots.pause`).
+    count = int(scenario.run.duration_s * scenario.ranging.rate_hz)
+    start, turn = np.arange(count) / scenario.ranging.rate_hz, pairs[np.arange(count) % len(pairs)]
+    if scenario.ranging.plan != "tdma":
+        return _schedule(start, turn, np.zeros(count, dtype=np.int64))
     error_s = stream(scenario.run.seed, "sync error").normal(size=len(scenario.tags))
     late = error_s * scenario.ranging.sync_error_s
     return _schedule(np.maximum(start + late[turn[:, 0]], 0), turn, turn[:, 0])
@@ -83,28 +80,6 @@ def _aloha(scenario: Scenario, pairs: Ints) -> Schedule:
     return _schedule(start, turn, turn[:, 0])
 
 
-def _common_list(scenario: Scenario, pairs: Ints) -> Schedule:
-    """Every robot knows the list and begins when it has heard the exchange before its own.
-
-    Who is too far away to hear it waits for `list_timeout_ms` more. The order of the list is kept by the one before.
-    """
-    start, turn = _turns(scenario, pairs)
-    return _schedule(start, turn, np.zeros(len(turn), dtype=np.int64))
-
-
-PLANS: Final[dict[str, Callable[[Scenario, Ints], Schedule]]] = {
-    "round-robin": _round_robin,
-    "tdma": _tdma,
-    "aloha": _aloha,
-    "common-list": _common_list,
-}
-
-
-def _turns(scenario: Scenario, pairs: Ints) -> tuple[Floats, Ints]:
-    count = int(scenario.run.duration_s * scenario.ranging.rate_hz)
-    return np.arange(count) / scenario.ranging.rate_hz, pairs[np.arange(count) % len(pairs)]
-
-
 def _schedule(start_s: Floats, pairs: Ints, host: Ints) -> Schedule:
     order = np.argsort(start_s, kind="stable")
     start = (start_s[order] * SUBTICKS_PER_SECOND).astype(np.int64)
@@ -122,6 +97,7 @@ Powers = Callable[[int, int], Floats]
 
 
 FOREVER: Final = 1 << 62
+"""Later than any instant of a run, in sub-ticks."""
 
 
 @dataclass(frozen=True, slots=True)

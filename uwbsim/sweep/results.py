@@ -23,8 +23,6 @@ TABLES: Final = {
     "identity": {"key": "VARCHAR", "value": "VARCHAR"},
     "results": {"number": "BIGINT", "part": "BIGINT", "document": "VARCHAR"},
 }
-LONGEST_DOCUMENT: Final = 100_000
-"""Letters of a row: fifty times what a run has with a hundred figures, 0.5 GB of the 5000 read at a time."""
 
 
 class Store:
@@ -73,8 +71,10 @@ class Store:
         if not {(table, column) for table, columns in TABLES.items() for column in columns} <= found:
             raise TableError(f"{path}: not a store of results")
         ((longest,),) = db.execute("SELECT coalesce(max(strlen(document)), 0) FROM results").fetchall()
-        if longest > LONGEST_DOCUMENT:
-            raise TableError(f"{path}: a row of {longest} letters, and results have at most {LONGEST_DOCUMENT}")
+        # Fifty times what a run has with a hundred figures; 5000 rows are read at a time, 0.5 GB.
+        most = 100_000
+        if longest > most:
+            raise TableError(f"{path}: a row of {longest} letters, and results have at most {most}")
 
     def __enter__(self) -> Self:
         """Return itself."""

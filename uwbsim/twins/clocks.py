@@ -21,8 +21,6 @@ from uwbsim.twins.flight import Flight, bulk_spread, some_rows
 SAMPLED: Final = 10_000
 """Readings of which the noise is taken in each round, at most: known to 1 % then."""
 
-OUTLIER: Final = 5.0
-"""Readings further off than this many standard deviations are left out."""
 
 KINDS: Final = 2
 """Of readings, each with a bias of its own: ratios and carriers."""
@@ -119,7 +117,8 @@ class _Search:
         for _ in range(40):
             before = np.append(self.noise, self.walk)
             self._solve()
-            self.weight = (np.abs(self.left) < OUTLIER * self.noise[self.kind]).astype(np.float64)
+            # Readings five standard deviations off are left out.
+            self.weight = (np.abs(self.left) < 5 * self.noise[self.kind]).astype(np.float64)
             self._set_noise(self.some)
             self.walk = self._walks()
             if np.max(np.abs(np.log(np.append(self.noise, self.walk) / before))) < 3e-3:

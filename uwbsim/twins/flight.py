@@ -33,8 +33,6 @@ from uwbsim.units import NS
 LONGEST_SHARE: Final = 0.25
 """Share of a flight's length up to which lags count: longer ones have few independent products."""
 
-BLOCK: Final = 2000
-"""Exchanges that stay together where only some are taken, so that short lags stay."""
 
 MIN_EXCHANGES: Final = 100
 """Exchanges below which a flight has no twin: quantiles of residuals would be wrong by a tenth of their spread."""
@@ -213,8 +211,9 @@ class Flight:
         """
         if len(self) <= most:
             return np.arange(len(self))
-        begins = np.linspace(0, len(self) - BLOCK, most // BLOCK).astype(np.int64)
-        return np.unique(begins[:, None] + np.arange(BLOCK))
+        block = 2000
+        begins = np.linspace(0, len(self) - block, most // block).astype(np.int64)
+        return np.unique(begins[:, None] + np.arange(block))
 
     @property
     def interval_s(self) -> float:

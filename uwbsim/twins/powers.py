@@ -18,9 +18,6 @@ MIN_LOG_SPREAD: Final = 0.05
 MIN_REFLECTED: Final = 5.0
 """Reflected exchanges, by their probabilities, below which their losses are not determined."""
 
-LEVELS: Final = 41
-"""Quantiles of fading that a scenario gets, and so the fewest readings that they are taken of."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerFit:
@@ -176,8 +173,9 @@ def _split(sends_db: Floats, reads_db: Floats) -> tuple[float, Floats, Floats, F
 def _levels(both_db: Floats, reflected: Floats, fading_db: float) -> Floats:
     """Return quantiles of fading, from what both ends have in common and noise that is taken out of its spread."""
     direct = both_db[reflected < 0.5]
-    direct = direct if len(direct) >= LEVELS else both_db
-    found = np.quantile(direct, np.linspace(0, 1, LEVELS))
+    levels = 41  # and as many readings at least
+    direct = direct if len(direct) >= levels else both_db
+    found = np.quantile(direct, np.linspace(0, 1, levels))
     middle = float(np.median(direct))
     return np.asarray(middle + (found - middle) * min(fading_db / max(float(np.std(direct)), 1e-9), 1.0))
 

@@ -26,9 +26,6 @@ MIN_SHARE: Final = 1e-4
 SHORTEST_CORE_M: Final = 1e-3
 """A core is not narrower than this, far below a tick (4.7 mm)."""
 
-UNKNOWN_VARIANCE: Final = 1e6
-"""Of what a pair does not tell."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReflectionFit:
@@ -213,7 +210,7 @@ def _lives(flight: Flight, reflected: Floats, life_s: float | None, share: Float
     if life_s is None:
         return np.full(count, np.nan), 0.0
     span = float(flight.time_s[-1])
-    own, noise = np.full(count, np.log(life_s)), np.full(count, UNKNOWN_VARIANCE)
+    own, noise, told = np.full(count, np.log(life_s)), np.full(count, 1e6), np.zeros(count, dtype=bool)
     for k in range(count):
         rows = np.flatnonzero(flight.pair == k)
         spells = 2 * share[k] * (1 - share[k]) * span / life_s
@@ -221,7 +218,6 @@ def _lives(flight: Flight, reflected: Floats, life_s: float | None, share: Float
             continue
         _, mine = lasting(flight.time_s[rows], np.zeros(len(rows), np.int64), reflected[rows], span)
         if mine is not None:
-            own[k], noise[k] = np.log(mine), 2 / spells + 0.01
-    told = noise < UNKNOWN_VARIANCE
+            own[k], noise[k], told[k] = np.log(mine), 2 / spells + 0.01, True
     between = _between(own[told], noise[told]) if np.any(told) else 0.0
     return np.exp(_drawn_together(own, noise, np.log(life_s), between)), float(np.sqrt(between))

@@ -47,8 +47,6 @@ GRID_OCTAVE: Final = 42
 LONGEST_OCTAVE: Final = 59
 """The longest tents are 2^59 sub-ticks, 8810 s: flicker ends below that frequency, white noise goes on."""
 
-PIECE: Final = 2048
-"""Instants of which all octaves are added up at once: as many numbers as fit into a core's cache."""
 
 WALK_STEP_S: Final = 0.1
 """Steps of random walks and temperature: short beside the tens of seconds over which rates change."""
@@ -107,8 +105,9 @@ class ClockNoise:
 
     def _fine(self, tag: Ints, time: Ints) -> Floats:
         """Add up the octaves below the grid, piece by piece."""
-        octaves, cuts = slice(0, GRID_OCTAVE + 1 - SHORTEST_OCTAVE), range(0, max(len(time), 1), PIECE)
-        return np.concatenate([self._tents(tag[k : k + PIECE], time[k : k + PIECE], octaves) for k in cuts])
+        octaves, piece = slice(0, GRID_OCTAVE + 1 - SHORTEST_OCTAVE), 2048  # which fits into a core's cache
+        cuts = range(0, max(len(time), 1), piece)
+        return np.concatenate([self._tents(tag[k : k + piece], time[k : k + piece], octaves) for k in cuts])
 
     def _tents(self, tag: Ints, time: Ints, octaves: slice) -> Floats:
         """Add up the tents of some octaves, (n,), from the shortest to the longest."""

@@ -242,10 +242,6 @@ def antenna_axes(scenario: Scenario, end: Placed) -> Floats:
     return end.rotation[:, :, 2]
 
 
-CROSS_POLAR: Final = 0.1
-"""Share of a field across its polarisation that an antenna receives all the same: chosen, 20 dB down."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Paths:
     """p paths of n links: how much longer than the straight line each is, in metres, and its complex amplitude.
@@ -391,4 +387,5 @@ def _matched(scenario: Scenario, ends: tuple[Placed, Placed], towards: Floats) -
     size = np.sqrt(np.maximum((1 - along[0] ** 2) * (1 - along[1] ** 2), 0))
     match = (np.einsum("nj,nj->n", one, other) - along[0] * along[1]) / np.maximum(size, AXIAL)
     match = np.where(size < AXIAL, 1.0, match)
-    return np.copysign(np.maximum(np.abs(match), CROSS_POLAR), match)
+    # Chosen: across its polarisation an antenna receives a tenth of the field all the same, 20 dB down.
+    return np.copysign(np.maximum(np.abs(match), 0.1), match)

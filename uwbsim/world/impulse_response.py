@@ -45,8 +45,6 @@ BEFORE: Final = 6
 TAPS: Final = 64
 """Taps in which a first path is looked for: 17 m."""
 
-LAST_M: Final = (TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M
-"""Paths that come later than this count for the total power alone."""
 
 REACH: Final = 4
 """Taps on either side of a pulse's peak where it is still there: 1.5e-5 of its height at the fourth."""
@@ -216,7 +214,8 @@ def detect(paths: Paths, sensing: Sensing) -> Detected:
     first = np.floor(arrival - EDGE_TO_PEAK + 1e-6).astype(np.int64)[:, None] + OWN_TAPS
     own = np.take_along_axis(squares, np.clip(first, 0, TAPS - 1), axis=1).sum(axis=1) / _squares(OWN_TAPS)
     total = squares.sum(axis=1) / _squares(np.arange(-8, 9))
-    late = paths.detour_m >= LAST_M
+    # Paths that come after the last tap count for the total power alone.
+    late = paths.detour_m >= (TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M
     if np.any(late):
         total += np.sum(np.abs(np.where(late, paths.amplitude, 0)) ** 2, axis=1)
     noise = sensing.noise_share * np.exp(np.minimum(threshold - top, 0)) * 2
@@ -238,7 +237,7 @@ def accumulate(paths: Paths) -> Floats:
     """
     count, blocks = len(paths.amplitude), TAPS // BLOCK
     place = (BEFORE + EDGE_TO_PEAK + paths.detour_m / TAP_M) * FRACTIONS
-    inside = (paths.detour_m < LAST_M) & (place >= 0)
+    inside = (paths.detour_m < (TAPS - BEFORE - EDGE_TO_PEAK) * TAP_M) & (place >= 0)
     nearest = np.clip(np.rint(place), 0, TAPS * FRACTIONS - 1).astype(np.int32)
     block, within = np.divmod(nearest, BLOCK * FRACTIONS)
     block += np.arange(count, dtype=np.int32)[:, None] * blocks

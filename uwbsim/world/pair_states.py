@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Fading, TwoStateMultipath
-
-MARGIN_S: Final = 60.0
-"""Links are asked for at most this long after the end of a run; beyond it the last state lasts."""
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a pair for a purpose."""
@@ -51,7 +48,8 @@ class Redraws:
         `life_s(ids, draw)` is the mean time between redraws of the pair with these tag ids, and
         `values(ids, draw, count)` draws its states, (..., count).
         """
-        count, span = len(scenario.tags), scenario.run.duration_s + MARGIN_S
+        # Links are asked for a minute after the end of a run at most; beyond it the last state lasts.
+        count, span = len(scenario.tags), scenario.run.duration_s + 60.0
         pair, begins, drawn = np.zeros((count, count), dtype=np.int64), [], []
         for number, (a, b) in enumerate(combinations(range(count), 2)):
             pair[a, b] = pair[b, a] = number

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator
@@ -71,7 +71,15 @@ def sample(
 
     A longer duration continues the same flight.
     """
-    return _MAKERS[type(motion)](motion, duration_s, draw)
+    makers: dict[type, Callable[[Any, float, Draw], Trajectory]] = {
+        Static: _static,
+        Carried: _carried,
+        Waypoints: _waypoints,
+        RandomFlight: _random_flight,
+        Figure: _figure,
+        Recorded: _recorded,
+    }
+    return makers[type(motion)](motion, duration_s, draw)
 
 
 def _static(motion: Static, _duration_s: float, _draw: Draw) -> Trajectory:
@@ -183,16 +191,6 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
     return Trajectory(
         lambda t: np.asarray(path(np.minimum(t, last_s))), lambda t: np.asarray(angles(np.minimum(t, last_s)))
     )
-
-
-_MAKERS: Final[dict[type, Callable[[Any, float, Draw], Trajectory]]] = {
-    Static: _static,
-    Carried: _carried,
-    Waypoints: _waypoints,
-    RandomFlight: _random_flight,
-    Figure: _figure,
-    Recorded: _recorded,
-}
 
 
 def inertial_readings(scenario: Scenario, trajectories: Mapping[str, Trajectory]) -> Columns:

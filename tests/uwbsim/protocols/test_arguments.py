@@ -60,3 +60,9 @@ def test_arguments_that_cannot_be(call, message):
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
     assert "--" not in str(caught.value)
+
+
+@pytest.mark.parametrize("call", [lambda world: compare(world, ["ds"], count=10), lambda world: optimum(world, "ds")])
+def test_a_scenario_that_plans_no_exchange_is_refused(call):
+    with pytest.raises(uwbsim.ScenarioError, match=r"run\.duration_s"):
+        call(uwbsim.load(NOISELESS, {"run.duration_s": 0.001}))
