@@ -9,9 +9,9 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -19,7 +19,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from uwblink.boards.board import Board
-from uwblink.boards.listeners import DelayCheck, Heard, Listener, Progress, WrongDelayError, as_listeners
+from uwblink.boards.listeners import DelayCheck, Heard, Listener, Pair, Progress, WrongDelayError, as_listeners
 from uwblink.boards.ports import Ports, SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.recorder import Recorder
@@ -96,43 +96,23 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
     """
     if not duration_s > 0:
         raise PlanError(f"duration_s: found {duration_s!r}, expected more than 0 seconds")
-    if known not in SHAPES or (known and not arrangement):
-        raise PlanError(
-            f"found {known!r:.40}, allowed: line, plane, of an `arrangement` that has a name", parameter="known"
-        )
-    if order and known != "line":
-        raise PlanError("is the order of boards that are `known` to be on a line", parameter="order")
     path, others, using = Path(output), as_listeners(listeners), using or SerialPorts()
+    mark = Arrangement(arrangement or "", 0, 0, known, tuple(order))
+    _check_arrangement(mark)
     check_output(path, force=force, recording=True)
     found = identify(ports, using)
-    turns = plan.turns(sorted(found))
-    there = ", ".join(map(str, sorted(found)))
-    if order and sorted(order) != sorted(found):
-        text = f"found {', '.join(map(str, order))}, expected each of the boards at the ports, {there}"
-        raise PlanError(text, parameter="order")
-    seats = {tag.tag: tag for tag in plan.tags}
-    if seats and not seats.keys() & found.keys():
-        seated = ", ".join(map(str, sorted(seats)))
-        raise PlanError(
-            f"the plan says where {seated} sit, but the boards at the ports are {there}: is it that of others?"
-        )
+    turns, delays = plan.turns(sorted(found)), plan.programmed(found)
+    _check_boards(found, plan, mark)
     for listener in others:
         listener.on_start(turns)
-    delays = plan.programmed(found)
-    played = {name: getattr(plan, name) for name in ("rate_hz", "protocol", "target_reports", "get_cir")}
-    meta = {
-        "source": "boards",
-        "ports": {str(board): name for board, name in sorted(found.items())},
-        "plan": {"pairs": [list(pair) for pair in turns], **played, "passive": passive},
-        **(meta_of_delays(delays) if plan.antenna_delays else {}),
-    }
+    meta = _meta(found, plan, turns, passive) | (meta_of_delays(delays) if plan.antenna_delays else {})
     try:
         with Recording.create(path, meta=meta, force=force, live=True, memory_mb=FILE_MB) as recording:
+            seats = {tag.tag: tag for tag in plan.tags}
             recording.append_tags(seats.get(b, Tag(b, f"tag{b}", (0.0, 0.0, 0.0))) for b in sorted(found))
             with RecordingWriter(recording) as writer:
-                recorder = Recorder(
-                    found, plan, turns, [writer, DelayCheck(delays), *others], passive=passive, ports=using
-                )
+                told = [writer, DelayCheck(delays), *others]
+                recorder = Recorder(found, plan, turns, told, passive=passive, ports=using)
 
                 def tell(progress: Progress) -> None:
                     progress.waiting, progress.behind_s = writer.waiting, writer.behind_s
@@ -145,12 +125,42 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
                     recorder.close()
             if arrangement:
                 first_ns = recorder.progress.start_ns
-                last_ns = max(using.host_ns(), first_ns + 1)
-                recording.append_arrangements([Arrangement(arrangement, first_ns, last_ns, known, tuple(order))])
+                mark = replace(mark, start_ns=first_ns, end_ns=max(using.host_ns(), first_ns + 1))
+                recording.append_arrangements([mark])
     except WrongDelayError:
         path.unlink(missing_ok=True)  # its `meta` would say wrong antenna delays
         raise
     return recorder.progress
+
+
+def _check_arrangement(mark: Arrangement) -> None:
+    if mark.known not in SHAPES or (mark.known and not mark.name):
+        text = f"found {mark.known!r:.40}, allowed: line, plane, of an `arrangement` that has a name"
+        raise PlanError(text, parameter="known")
+    if mark.order and mark.known != "line":
+        raise PlanError("is the order of boards that are `known` to be on a line", parameter="order")
+
+
+def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
+    """Raise `PlanError` where an order or the places of tags are of other boards than those at the ports."""
+    there, seats = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
+    if mark.order and sorted(mark.order) != sorted(found):
+        text = f"found {', '.join(map(str, mark.order))}, expected each of the boards at the ports, {there}"
+        raise PlanError(text, parameter="order")
+    if seats and not seats & found.keys():
+        seated = ", ".join(map(str, sorted(seats)))
+        raise PlanError(
+            f"the plan says where {seated} sit, but the boards at the ports are {there}: is it that of others?"
+        )
+
+
+def _meta(found: Mapping[int, str], plan: RangingPlan, turns: Iterable[Pair], passive: bool) -> dict[str, Any]:
+    played = {name: getattr(plan, name) for name in ("rate_hz", "protocol", "target_reports", "get_cir")}
+    return {
+        "source": "boards",
+        "ports": {str(board): name for board, name in sorted(found.items())},
+        "plan": {"pairs": [list(pair) for pair in turns], **played, "passive": passive},
+    }
 
 
 def identify(names: Iterable[str], ports: Ports | None = None) -> dict[int, str]:

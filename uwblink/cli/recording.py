@@ -84,7 +84,8 @@ def record(
 ) -> None:
     """Play a ranging plan on boards and record everything they send.
 
-    Ends after --duration, else with Ctrl-C. The page of --live shows ranges that --calibration corrects, too.
+    Ends after --duration, else with Ctrl-C. The page of --live shows ranges that --calibration corrects, too. Without
+    --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
     import uwblink
     from uwblink.errors import PlanError
@@ -145,7 +146,8 @@ def stream(
 ) -> None:
     """Print ranges as they come, one line of JSON each, and send them on.
 
-    Every two boards range, without --plan. Ends after --duration, else with the recording or Ctrl-C.
+    Every two boards range, without --plan. Ends after --duration, else with the recording or Ctrl-C. Without
+    --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
     import uwblink
     from uwblink.boards import Progress
