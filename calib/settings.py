@@ -6,7 +6,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from numbers import Integral
 from pathlib import Path
@@ -215,6 +215,18 @@ class FitSettings:
         fixed = {int(tag): float(delay) for tag, delay in (self.fixed_ns or {}).items()}
         object.__setattr__(self, "fixed_ns", fixed)
         object.__setattr__(self, "groups", {name: tuple(map(int, tags)) for name, tags in (self.groups or {}).items()})
+
+    def changed(self) -> dict[str, Any]:
+        """Return the settings that are not the defaults, as JSON has them: what calibrations and reports repeat."""
+        plain, found = FitSettings(), dict[str, Any]()
+        for name in (one.name for one in fields(self)):
+            value = getattr(self, name)
+            if value == getattr(plain, name):
+                continue
+            if name == "delays_from":
+                value = value if isinstance(value, str) else str(value) if isinstance(value, Path) else "a calibration"
+            found[name] = {str(key): one for key, one in value.items()} if isinstance(value, dict) else value
+        return found
 
 
 def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:

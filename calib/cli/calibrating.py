@@ -315,6 +315,9 @@ def show(
         if name in known.provenance:
             value = known.provenance[name]
             typer.echo(f"  {name}: {', '.join(map(str, value)) if isinstance(value, list) else value}")
+    settings = known.provenance.get("settings")
+    if isinstance(settings, dict):
+        typer.echo(f"  settings: {', '.join(f'{name} = {value}' for name, value in settings.items())}")
     distances = rests_on(known.provenance)
     for line in [f"distances: {distances}"] if distances else _survey_lines(known.provenance.get("rests_on")):
         typer.echo(f"  {line}")

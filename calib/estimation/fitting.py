@@ -124,6 +124,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         problem.let_go()
         let_go(*columns)
         provenance = _provenance(ranges, inliers, fixed, sequential, problem, ended, warnings, reference)
+        if settings.changed():
+            provenance["settings"] = settings.changed()
         provenance["error_std_m"] = {
             "raw": std_of(computed(len(ranges), lambda rows: ranges.raw_m[rows] - ranges.truth_m[rows])),
             "corrected": std_of(residuals),

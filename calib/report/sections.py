@@ -199,13 +199,15 @@ def _determined(results: Results) -> list[Block]:
     else:
         answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags settle every delay."
     counts = [int(np.count_nonzero(rows)) for rows in pairs.values()]
+    changed = calibration.provenance.get("settings", {})
+    settings = f" Settings: {', '.join(f'{name} = {value}' for name, value in changed.items())}." if changed else ""
     return [
         Heading("Is it determined?"),
         Text(
             f"{answer} The rarest pair has {min(counts)} ranges, the most frequent {max(counts)}. The fit "
             f"{results.fit.message}, with the {calibration.loss} loss at a scale of {calibration.scale_ns:.3f} ns; its "
             f"standard errors are a {calibration.provenance.get('standard_errors', 'sandwich')}, so errors that "
-            "persist within a block are not counted as independent ones."
+            "persist within a block are not counted as independent ones." + settings
         ),
         Text(
             "How a delay splits into transmission and reception is not determined: stamps of free-running clocks leave "

@@ -1,5 +1,6 @@
 """The command line names options where the library names parameters, and makes the fit's options of its settings."""
 
+import html
 import re
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from calib.cli.commands import app
 from calib.cli.shared import with_flags
 from calib.settings import LIFTS, FitSettings
 from docs.site.commands import leaves
+from tests import processes
 
 ROOT = Path(__file__).parents[3]
 COMMANDS: Any = typer.main.get_command(app)
@@ -81,5 +83,22 @@ def test_settings_and_keywords_make_the_same_fit():
     flight = calib.sample_flight()
     by_name = calib.fit(flight, loss="huber", fixed_ns={1: -0.3}).calibration
     assert calib.fit(flight, FitSettings(loss="huber"), fixed_ns={1: -0.3}).calibration == by_name
+    assert by_name.provenance["settings"] == {"loss": "huber", "fixed_ns": {"1": -0.3}}
+    assert "settings" not in calib.fit(flight).calibration.provenance
     with pytest.raises(TypeError, match="los"):
         calib.fit(flight, los="huber")
+
+
+def test_commands_and_reports_repeat_the_settings(tmp_path):
+    flight, made = tmp_path / "f.uwb", tmp_path / "c.json"
+    words = ("--loss", "huber", "--fix", "1=-0.3")
+    for line in (
+        ["sample", "-o", flight, "-n", 300],
+        ["fit", flight, "-o", made, *words],
+        ["report", flight, "-o", tmp_path / "r.html", *words],
+    ):
+        done = processes.run("calib", *map(str, line))
+        assert done.returncode == 0, done.stderr
+    repeated = "loss = huber, fixed_ns = {'1': -0.3}"
+    assert f"settings: {repeated}" in processes.run("calib", "show", str(made)).stdout
+    assert f"Settings: {html.escape(repeated)}" in (tmp_path / "r.html").read_text()
