@@ -25,11 +25,10 @@ from uwbsim.simulation.run import simulate
 from uwbsim.tables import write_csv
 from uwbsim.twins.calibration_file import CalibrationSource, KnownDevices, read_calibration
 from uwbsim.twins.clocks import fit_clocks
-from uwbsim.twins.flight import Flight, RecordingSource, effective_size, lag_one, read_flight, some_rows
+from uwbsim.twins.flight import Flight, RecordingSource, effective_size, fit_schedule, lag_one, read_flight, some_rows
 from uwbsim.twins.powers import fit_powers
 from uwbsim.twins.reflections import fit_reflections
 from uwbsim.twins.scenario import Fitted, receive_noise, scenario_text, tables, unknowns
-from uwbsim.twins.schedules import fit_schedule
 
 LEVEL: Final = 0.01
 """Below this probability chance does not explain a difference."""

@@ -18,10 +18,9 @@ from uwbsim.scenario.linked_files import MOST_POSES
 from uwbsim.scenario.radio import Radio, TwoStateMultipath
 from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.twins.clocks import ClockFit
-from uwbsim.twins.flight import Flight, attitude, bulk_spread
+from uwbsim.twins.flight import SHORTEST_LIFE_S, Flight, ScheduleFit, attitude, bulk_spread
 from uwbsim.twins.powers import PowerFit
 from uwbsim.twins.reflections import ReflectionFit
-from uwbsim.twins.schedules import SHORTEST_LIFE_S, ScheduleFit
 from uwbsim.units import NS, NS_PER_S, PS_PER_S
 from uwbsim.world.radio import lifted
 
