@@ -18,7 +18,6 @@ from uwblink.arrays import Ints
 from uwblink.errors import ImportTableError, first_line
 from uwblink.text_files import require_regular
 
-DELIMITERS: Final = (",", ";", "\t", "|", " ")
 PIECE_BYTES: Final = 1 << 20
 """Bytes of a file that are searched for lines at once."""
 
@@ -93,7 +92,7 @@ def _delimiter(lines: list[str]) -> str:
         counts = [len(row) for row in csv.reader(lines[:50], delimiter=mark) if row] or [0]
         return counts[0] > 1, sum(n == counts[0] for n in counts) if counts[0] > 1 else 0, counts[0]
 
-    return max(DELIMITERS, key=quality)
+    return max((",", ";", "\t", "|", " "), key=quality)
 
 
 def check_lines(path: Path, delimiter: str | None = None) -> None:

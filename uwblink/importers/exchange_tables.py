@@ -46,9 +46,6 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK
 from uwblink.twr import LARGEST_ID, STAMPS, Exchanges, raw_range
 
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
-MAX_NAMES_SHOWN: Final = 12
-"""Ids that are words and are printed with their numbers; a recording has all, as its tags' bodies."""
-
 ROW_PERIOD_NS: Final = 1_000_000
 """Between rows of a table that has no times."""
 
@@ -126,8 +123,9 @@ def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None 
 def _notes(staging: Staging) -> list[str]:
     notes, names = [], staging.names
     if names:
-        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(names.items())[:MAX_NAMES_SHOWN])
-        more = f" and {len(names) - MAX_NAMES_SHOWN} more" if len(names) > MAX_NAMES_SHOWN else ""
+        # The first dozen; a recording has all, as its tags' bodies.
+        some = ", ".join(f"{name[:20]} = {number}" for number, name in list(names.items())[:12])
+        more = f" and {len(names) - 12} more" if len(names) > 12 else ""
         notes.append(f"{len(names)} ids are words or too large, and get numbers: {some}{more}")
     if not staging.rows.has("time_s"):
         notes.append("there is no time; rows are put a millisecond apart, in their order")

@@ -21,22 +21,29 @@ from uwblink.twr import STAMPS
 
 OF_MESSAGES: Final = ("tx", "rx", "fpp", "rxp", "skew", "sequence", "message")
 
-_END: Final = r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|dbm|db|ppm))*"
-_ID: Final = r"(_?(id|addr|address|mac|name))?"
-_DEVICE: Final = (
-    r"(tag|node|device|dev|board|robot|agent|anchor|module|modul|radio|unit|uwb|id|addr|address|mac|geraet|knoten)"
-)
-_RANGE: Final = r"(range|dist|distance|abstand|distanz|entfernung)"
-_TRUE: Final = (
-    r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|laser|"
-    r"soll|wahr(er)?|referenz)"
-)
-_FPP: Final = r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path)"
-_RXP: Final = r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)"
-_SKEW: Final = r"(skew|cfo|carrier|clock_?offset)"
-_OF_TIME: Final = r"((t|ts|time|stamp|timestamp|zeit)_)?"
-_FROM: Final = r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)"
-_TO: Final = r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)"
+_WORDS: Final = {
+    "end": (
+        r"(_(raw|ts|stamp|timestamp|time|ticks?|dtu|ps|ns|us|ms|s|sec|m|mm|cm|ft|in|meters?|metres?|"
+        r"dbm|db|ppm))*"
+    ),
+    "id": r"(_?(id|addr|address|mac|name))?",
+    "device": (
+        r"(tag|node|device|dev|board|robot|agent|anchor|module|modul|radio|unit|uwb|id|addr|address|"
+        r"mac|geraet|knoten)"
+    ),
+    "range": r"(range|dist|distance|abstand|distanz|entfernung)",
+    "true": (
+        r"(gt|true|truth|ground_?truth|ref|reference|nominal|mocap|vicon|actual|tape(_?measured?)?|"
+        r"laser|soll|wahr(er)?|referenz)"
+    ),
+    "fpp": r"(fpp?|(fp|first_?path)_?(power|pwr|rssi|level|leistung)|first_?path)",
+    "rxp": r"(rxp|rx_?(power|pwr|level)|rssi|total_?power|pr)",
+    "skew": r"(skew|cfo|carrier|clock_?offset)",
+    "of_time": r"((t|ts|time|stamp|timestamp|zeit)_)?",
+    "from": r"(from|src|source|initiator|tag|my|sender|tx|requester|robot|rover|mobile|node_?a|id_?1)",
+    "to": r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|beacon|node_?b|id_?2)",
+}
+"""Words that patterns are made of."""
 
 
 def _place(name: str) -> str:
@@ -44,7 +51,8 @@ def _place(name: str) -> str:
 
     A single `x` is that of the initiator, which moves where anchors are called so.
     """
-    (end, axis), (number, words) = name.split("_")[:2], ("1", _FROM) if name.startswith("from") else ("2", _TO)
+    end, axis = name.split("_")[:2]
+    words, number = _WORDS[end], 1 if end == "from" else 2
     true, place = r"((gt|true|truth|ground_?truth|mocap|ref)_?)?", r"(pos(ition)?|loc(ation)?|place|p)?"
     forms = [rf"{true}{words}_?{place}_?{axis}", rf"{true}{place}_?{axis}_?({words}|{number})", rf"p{number}_?{axis}"]
     forms += [rf"{true}{place}_?{axis}"] if end == "from" else []
@@ -56,33 +64,34 @@ _PATTERNS: Final = {
         r"(ros_?|host_?|unix_?|utc_?|mess_?)?"
         r"(time|timestamp|stamp|t|datetime|date(_?time)?|epoch|zeit|zeitstempel|uhrzeit|datum)(_(utc|iso))?"
     ),
-    "from_id": rf"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|quelle|von|id_?(from|von)|id_?1){_ID}",
+    "from_id": r"(from|src|source|initiator|tag|my|sender|tx|requester|node_?a|quelle|von|id_?(from|von)|id_?1){id}",
     "to_id": (
         r"(to|dst|dest|destination|target|responder|anchor|neighbou?r|receiver|rx|node_?b|ziel|an|nach|anker|"
-        rf"empf(ae|a)nger|id_?(to|an|nach)|id_?2){_ID}"
+        r"empf(ae|a)nger|id_?(to|an|nach)|id_?2){id}"
     ),
-    "tx1": _OF_TIME + r"(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
-    "rx1": _OF_TIME + r"(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
-    "tx2": _OF_TIME + r"(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
-    "rx2": _OF_TIME + r"(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
-    "tx3": _OF_TIME + r"(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
-    "rx3": _OF_TIME + r"(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
-    "fpp1": rf"{_FPP}_?1",
-    "fpp2": rf"{_FPP}_?2?",
-    "rxp1": rf"{_RXP}_?1",
-    "rxp2": rf"{_RXP}_?2?",
-    "skew1": rf"{_SKEW}_?1",
-    "skew2": rf"{_SKEW}_?2?",
-    "gt_range_m": rf"{_TRUE}_?{_RANGE}?|{_RANGE}_?{_TRUE}",
-    "range_m": rf"(device_?|measured?_?|uwb_?|est(imated)?_?)?{_RANGE}",
+    "tx1": r"{of_time}(tx_?1|t_?1|poll_?(tx|sent)|tx_?poll)",
+    "rx1": r"{of_time}(rx_?1|t_?2|poll_?(rx|received)|rx_?poll)",
+    "tx2": r"{of_time}(tx_?2|t_?3|resp(onse)?_?(tx|sent)|tx_?resp(onse)?)",
+    "rx2": r"{of_time}(rx_?2|t_?4|resp(onse)?_?(rx|received)|rx_?resp(onse)?)",
+    "tx3": r"{of_time}(tx_?3|t_?5|(final|report)_?(tx|sent)|tx_?(final|report))",
+    "rx3": r"{of_time}(rx_?3|t_?6|(final|report)_?(rx|received)|rx_?(final|report))",
+    "fpp1": r"{fpp}_?1",
+    "fpp2": r"{fpp}_?2?",
+    "rxp1": r"{rxp}_?1",
+    "rxp2": r"{rxp}_?2?",
+    "skew1": r"{skew}_?1",
+    "skew2": r"{skew}_?2?",
+    "gt_range_m": r"{true}_?{range}?|{range}_?{true}",
+    "range_m": r"(device_?|measured?_?|uwb_?|est(imated)?_?)?{range}",
     "sequence": r"(seq|sequence|exchange|laufnummer)(_?(no|num|nr|number|id))?",
     "message": r"(msg|message|frame|nachricht)(_?(no|num|nr|number|type|id))?",
     "tx": r"tx",
     "rx": r"rx",
-    "fpp": _FPP,
-    "rxp": _RXP,
-    "skew": _SKEW,
+    "fpp": r"{fpp}",
+    "rxp": r"{rxp}",
+    "skew": r"{skew}",
 } | {name: _place(name) for name in POSITIONS}
+"""What columns of ours are called, in terms of `_WORDS`."""
 
 _OF_MESSAGE: Final = {"poll": 1, "resp": 2, "response": 2}
 _AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init": 2, "initiator": 2, "tag": 2}
@@ -99,8 +108,9 @@ def _plain_names(headers: Iterable[str]) -> dict[str, str]:
 
     `resp` is the device where another column is of the initiator, else the message.
     """
-    level, whose = rf"(?P<level>{_FPP}|{_RXP}|{_SKEW})", "|".join(sorted({*_OF_MESSAGE, *_AT_DEVICE}, key=len)[::-1])
-    forms = (rf"{level}_(at_|of_)?(?P<whose>{whose})(?P<end>{_END})", rf"(?P<whose>{whose})_{level}(?P<end>{_END})")
+    level = "(?P<level>{fpp}|{rxp}|{skew})".format_map(_WORDS)
+    end, whose = _WORDS["end"], "|".join(sorted({*_OF_MESSAGE, *_AT_DEVICE}, key=len)[::-1])
+    forms = (rf"{level}_(at_|of_)?(?P<whose>{whose})(?P<end>{end})", rf"(?P<whose>{whose})_{level}(?P<end>{end})")
     names = {header: _plain(header) for header in headers}
     matches = {h: re.fullmatch(forms[0], name) or re.fullmatch(forms[1], name) for h, name in names.items()}
     ends = {match["whose"] for match in matches.values() if match}
@@ -117,10 +127,11 @@ def named_columns(headers: Iterable[str]) -> dict[str, str]:
     called = _plain_names(listed)
     found = _ends(called)
     for ours, pattern in _PATTERNS.items():
+        whole = f"({pattern}){{end}}".format_map(_WORDS)
         # A column is one thing; only the names of messages may repeat those of exchanges, until the layout is known.
         taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
         for header in listed:
-            if re.fullmatch(f"({pattern}){_END}", called[header]) and listed.count(header) == 1 and header not in taken:
+            if re.fullmatch(whole, called[header]) and listed.count(header) == 1 and header not in taken:
                 found[ours] = header
                 break
     return found
@@ -130,7 +141,7 @@ def _ends(called: dict[str, str]) -> dict[str, str]:
     """Return which columns are of the two devices where these are called alike, as `node_i` and `node_j`."""
     letters = (("a", "b"), ("i", "j"), ("1", "2"), ("0", "1"), ("one", "two"))
     for both, form in product(letters, ("{0}_?{1}", "{0}{2}_{1}", "{0}_?{1}{2}")):
-        patterns = [form.format(f"({_DEVICE})", letter, _ID) for letter in both]
+        patterns = [form.format(_WORDS["device"], letter, _WORDS["id"]) for letter in both]
         ends = [[header for header, name in called.items() if re.fullmatch(one, name)] for one in patterns]
         stems = [{called[header][:2] for header in headers} for headers in ends]
         if all(len(headers) == 1 for headers in ends) and stems[0] == stems[1]:
@@ -147,7 +158,7 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
         return None
     single = {name: _plain(name) for name in table.names if table.names.count(name) == 1}
     kinds = r"(event|direction|dir|kind|type|action|edge|what|tx_?or_?rx|tx_?rx)"
-    clock = rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){_END}"
+    clock = rf"((device|dw|dw1000|raw|chip|uwb)_?)?(stamp|timestamp|time|ticks?|counter|t){_WORDS['end']}"
     event = next(
         (name for name, plain in single.items() if re.fullmatch(kinds, plain) and _is_event(table, name)), None
     )

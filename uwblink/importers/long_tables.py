@@ -15,9 +15,7 @@ from uwblink.importers.staging import StagedRows, Staging, Watch
 from uwblink.importers.usable_rows import ENDS, Condition, Faults
 from uwblink.twr import STAMPS
 
-_NEEDED: Final = {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message"), "parts": ()}
 _PAIR: Final = "CAST(least(from_id, to_id) AS UINTEGER) * 65536 + greatest(from_id, to_id)"
-_LINK: Final = "CAST(from_id AS UINTEGER) * 65536 + to_id"
 _POWERS: Final = ("fpp", "rxp", "skew")
 _WHOLE: Final = ("gt_range_m", "range_m")
 """Columns that belong to the whole exchange."""
@@ -32,7 +30,8 @@ def exchanges_of_long(
     `ImportTableError`.
     """
     rows, within_s = staging.rows, staging.column_map.within_s
-    for name in _NEEDED[layout]:
+    needed = {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message"), "parts": ()}
+    for name in needed[layout]:
         if not rows.has(name):
             raise staging.missing(name)
     if watch:
@@ -130,7 +129,9 @@ def _messages_of_stamps(rows: StagedRows, good: str, faults: Faults, within_s: f
     values = _of_first(rows) | {name: f"max({name})" for name in cells}
     for name, event in (("tx", 1), ("rx", 2)):
         values |= {name: f"max(stamp) FILTER (event = {event})", f"{name}_count": f"count(*) FILTER (event = {event})"}
-    messages = _grouped(rows, good, "messages", _LINK, ("sequence", "message"), within_s, values)
+    messages = _grouped(
+        rows, good, "messages", "CAST(from_id AS UINTEGER) * 65536 + to_id", ("sequence", "message"), within_s, values
+    )
     wrong = Condition("event", "one tx and one rx of a message", "tx_count <> 1 OR rx_count <> 1")
     return messages, faults.reject(messages, [wrong])
 

@@ -34,21 +34,7 @@ Vectors = dict[str, dict[int, tuple[float, float, float]]]
 SAME_ANCHORS_M: Final = 0.05
 """Median difference from `gt_range`: the constellations of the dataset are a decimetre and more apart."""
 
-_CLOCKS: Final = clocks("ds")
 _ENDS: Final = {"initiator": "from_id", "target": "to_id"}
-_NEIGHBOURS: Final = tuple(tuple(f"{name}_n" for name in clock) for clock in _CLOCKS)
-_POSE: Final = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
-_LEVELS: Final = {"fpp1_dbm": "fpp1", "fpp2_dbm": "fpp2", "skew1_ppm": "skew1", "skew2_ppm": "skew2"}
-_OVERHEARD: Final = {
-    f"{name}{end}_{unit}": f"{name}{end}"
-    for name, unit in (("fpp", "dbm"), ("skew", "ppm"))
-    for end in ("1", "2", "3", "1_n", "2_n")
-}
-_IMU: Final = {
-    f"{ours}{axis}": f"{theirs}.{axis}"
-    for ours, theirs in (("w", "angular_velocity"), ("a", "linear_acceleration"))
-    for axis in "xyz"
-}
 
 
 @dataclass(slots=True)
@@ -88,16 +74,12 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     truth_m = np.where(np.isfinite(known_m), np.nan, measured_m)
     ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
     tags += [Tag(number, f"tag{number}", (0.0, 0.0, 0.0)) for number in ranging]
-    own = {f"rx{k}": f"rx{k}{{raw}}" for k in (1, 2, 3)}
-    neighbours = {f"{name}_n": f"{name}{{raw}}_n" for name in STAMPS}
-    ids = {"listener": "my_id", **_ENDS}
-    heard = _read(
-        flight, "uwb_passive.csv", ids, {}, _OVERHEARD, own | neighbours, (("rx1", "rx2", "rx3"), *_NEIGHBOURS)
-    )
-    cirs = _read(
-        flight, "uwb_cir.csv", {"board": "my_id", **_ENDS}, {"first_path_index": "idx"}, lists={"magnitudes": "cir"}
-    )
-    imu, height = _read(flight, "imu_px4.csv", {}, _IMU), _read(flight, "height.csv", {}, {"height_m": "range"})
+    heard = _read_overheard(flight)
+    ids, taps = {"board": "my_id", **_ENDS}, {"magnitudes": "cir"}
+    cirs = _read(flight, "uwb_cir.csv", ids, {"first_path_index": "idx"}, lists=taps)
+    sensed = {f"w{axis}": f"angular_velocity.{axis}" for axis in "xyz"}
+    sensed |= {f"a{axis}": f"linear_acceleration.{axis}" for axis in "xyz"}
+    imu, height = _read(flight, "imu_px4.csv", {}, sensed), _read(flight, "height.csv", {}, {"height_m": "range"})
     for columns in (heard, cirs, imu, height):
         if columns:
             columns["time_ns"] += start_ns
@@ -204,15 +186,28 @@ def _read(
 
 def _read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
     """Return all exchanges in order of time, without truth, and the distances that the authors measured (n,)."""
-    stamps, optional = {name: f"{name}{{raw}}" for name in STAMPS}, {"measured_m": "gt_range", **_LEVELS}
+    stamps = {name: f"{name}{{raw}}" for name in STAMPS}
+    optional = {"measured_m": "gt_range"} | {f"fpp{k}_dbm": f"fpp{k}" for k in (1, 2)}
+    optional |= {f"skew{k}_ppm": f"skew{k}" for k in (1, 2)}
     columns: dict[str, Any] = _read(
-        flight, "uwb_range.csv", _ENDS, {"range_m": "range{raw}"}, optional, stamps, _CLOCKS
+        flight, "uwb_range.csv", _ENDS, {"range_m": "range{raw}"}, optional, stamps, clocks("ds")
     )
     if not columns:
         raise ImportTableError(f"{flight.folder}: its uwb_range.csv hold no row that can be used")
     measured = columns.pop("measured_m")
     unknown, protocol = np.full(len(measured), np.nan), np.full(len(measured), "ds")
     return Exchanges(protocol=protocol, reporter=columns["initiator"], truth_m=unknown, **columns), measured
+
+
+def _read_overheard(flight: Flight) -> Columns:
+    """Return the exchanges that robots overheard: what the listener measured, and what the two robots did (`_n`)."""
+    own = {f"rx{k}": f"rx{k}{{raw}}" for k in (1, 2, 3)}
+    neighbours = {f"{name}_n": f"{name}{{raw}}_n" for name in STAMPS}
+    by_clock = (tuple(own), *(tuple(f"{name}_n" for name in clock) for clock in clocks("ds")))
+    ends = ("1", "2", "3", "1_n", "2_n")
+    optional = {f"fpp{end}_dbm": f"fpp{end}" for end in ends} | {f"skew{end}_ppm": f"skew{end}" for end in ends}
+    ids = {"listener": "my_id", **_ENDS}
+    return _read(flight, "uwb_passive.csv", ids, {}, optional, own | neighbours, by_clock)
 
 
 def _cir_rows(columns: Columns) -> list[CirRow]:
@@ -225,10 +220,11 @@ def _cir_rows(columns: Columns) -> list[CirRow]:
 
 def _read_poses(flight: Flight) -> Poses:
     """Return the poses of the robots, none where there is no motion capture."""
-    columns = _read(flight, "mocap.csv", {}, {name: name for name in _POSE})
+    names = [*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")]
+    columns = _read(flight, "mocap.csv", {}, {name: name for name in names})
     if not columns:
         return Poses.from_arrays([], "", (0.0, 0.0, 0.0))
-    values = np.column_stack([columns[name] for name in _POSE])
+    values = np.column_stack([columns[name] for name in names])
     norm = np.linalg.norm(values[:, 3:], axis=1)
     good = (norm > 0.9) & (norm < 1.1)
     for row in np.flatnonzero(~good):

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -19,9 +18,6 @@ from uwblink.recording.file import Recording
 from uwblink.recording.schema import Poses, Tag
 from uwblink.recording.tags import load_places
 from uwblink.twr import Exchanges, raw_range
-
-MOST_RANGES: Final = 2000
-"""Ranges, evenly spread, by which units are told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +89,7 @@ def add_poses(
 
 def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], shift_ns: int = 0) -> None:
     """Raise `ImportTableError` where the ranges say that positions, lever arms or themselves are not in metres."""
-    rows = np.unique(np.linspace(0, len(exchanges) - 1, MOST_RANGES).astype(np.int64))
+    rows = np.unique(np.linspace(0, len(exchanges) - 1, 2000).astype(np.int64))
     some = exchanges[rows]
     ranges, time_ns = raw_range(some), some.time_ns - shift_ns
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -14,9 +13,6 @@ from uwblink.importers.column_map import DISTANCE_UNITS, POSITIONS, POWERS, REGI
 from uwblink.importers.stamps import MIN_ROWS
 from uwblink.importers.tables import Columns
 from uwblink.ticks import METRES_PER_TICK
-
-MAX_DELAY_M: Final = REGISTER_MAX * METRES_PER_TICK
-"""How much longer or shorter ranges can be by antenna delays: all that registers hold, at both ends."""
 
 Errors = Callable[[float], Floats]
 """Ranges less distances (n,), if some lengths are multiplied by a factor, in the unit that the ranges have as they are.
@@ -50,7 +46,8 @@ def _remaining(errors_m: Floats) -> float:
     finite = errors_m[np.isfinite(errors_m)]
     if len(finite) < MIN_ROWS:
         return float("nan")
-    constant = np.clip(np.median(finite), -MAX_DELAY_M, MAX_DELAY_M)
+    longest = REGISTER_MAX * METRES_PER_TICK  # all that registers hold, at both ends
+    constant = np.clip(np.median(finite), -longest, longest)
     return float(np.median(np.abs(finite - constant)))
 
 

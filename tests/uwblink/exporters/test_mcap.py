@@ -38,6 +38,12 @@ def recording(tmp_path):
         poses=poses,
         imu={"time_ns": np.array([when + 2]), "body": np.array(["drone"]), **imu},
         height={"time_ns": np.array([when + 3]), "body": np.array(["drone"]), "height_m": np.array([0.5])},
+        temperature={
+            "time_ns": np.array([when + 6]),
+            "tag": np.array([2]),
+            "temperature_c": np.array([31.5]),
+            "supply_v": np.array([np.nan]),
+        },
         faults=[Fault(when + 4, "7", "time-out", 'no "answer"')],
     )
     held.save(tmp_path / "r.uwb")
@@ -46,9 +52,9 @@ def recording(tmp_path):
 
 def test_every_message_is_there_in_order_of_time(recording, tmp_path):
     path, when = recording
-    assert export_recording(path, tmp_path / "out", to="mcap") == {"recording.mcap": 7}
+    assert export_recording(path, tmp_path / "out", to="mcap") == {"recording.mcap": 8}
     messages = read(tmp_path / "out" / "recording.mcap")
-    assert [logged - when for logged, *_ in messages] == [0, 1, 1, 2, 3, 4, 5]
+    assert [logged - when for logged, *_ in messages] == [0, 1, 1, 2, 3, 4, 5, 6]
     by_topic = {topic: (name, content) for _, topic, name, content in messages}
     name, content = by_topic["/poses/drone"]
     assert name == "foxglove.PoseInFrame"
@@ -66,21 +72,15 @@ def test_every_message_is_there_in_order_of_time(recording, tmp_path):
     assert "fpp1_dbm" not in by_topic["/ranges/2_1"][1], "JSON has no word for what was not measured"
     assert by_topic["/imu/drone"][1]["linear_acceleration"] == {"x": 3.0, "y": 4.0, "z": 5.0}
     assert by_topic["/height/drone"][1]["height_m"] == 0.5
+    assert by_topic["/temperature/2"][1].keys() == {"timestamp", "temperature_c"}
     assert by_topic["/faults"][1]["message"] == 'time-out: no "answer"'
 
 
-def test_times_before_1970_are_refused(tmp_path):
-    e = Exchanges.from_arrays([1], [2], time_ns=[-5], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
-    Contents(exchanges=e).save(tmp_path / "r.uwb")
-    with pytest.raises(RecordingError, match="before 1970"):
-        export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_number_that_is_none_is_refused_in_one_line(tmp_path):
-    sample = Exchanges.from_arrays([1], [2], time_ns=[5], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
-    poses = Poses(np.array([5]), np.array(["drone"]), np.array([[1.0, np.nan, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
+@pytest.mark.parametrize(("time_ns", "x", "said"), [(-5, 1.0, "before 1970"), (5, np.nan, "a number that is none")])
+def test_what_json_cannot_say_is_one_line(tmp_path, time_ns, x, said):
+    sample = Exchanges.from_arrays([1], [2], time_ns=[time_ns], tx1=[0], rx1=[5], tx2=[1005], rx2=[3000])
+    poses = Poses(np.array([9]), np.array(["drone"]), np.array([[x, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
     Contents(exchanges=sample, poses=poses).save(tmp_path / "r.uwb")
-    with pytest.raises(RecordingError, match="holds a number that is none"):
+    with pytest.raises(RecordingError, match=said):
         export_recording(tmp_path / "r.uwb", tmp_path / "out", to="mcap")
     assert not (tmp_path / "out").exists()

@@ -3,14 +3,17 @@
 import json
 import random
 import tracemalloc
+from contextlib import nullcontext
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 import uwblink
-from tests.uwblink.importers.test_table_forms import flights, repeated, wrapped, write
+from tests.uwblink.importers.test_planted_delays import messages_of
+from tests.uwblink.importers.test_table_forms import as_messages, flights, mapped, repeated, stamps, wrapped, write
 from uwblink.errors import ImportTableError
-from uwblink.importers import exchange_tables, import_file, read_table, staging, usable_rows
+from uwblink.importers import bags, exchange_tables, import_file, read_table, staging, usable_rows
 
 SPOILT = ("", "nan", "x", "-1", "7.5", "99999999999999999999")
 
@@ -32,9 +35,9 @@ def told(contents):
     return json.dumps([listed, contents.meta, list(map(str, contents.tags + contents.faults))], default=str)
 
 
-def few_at_once(monkeypatch):
+def few_at_once(monkeypatch, count=20):
     for room in (staging, exchange_tables):
-        monkeypatch.setattr(room, "ROWS_AT_ONCE", 20)
+        monkeypatch.setattr(room, "ROWS_AT_ONCE", count)
     monkeypatch.setattr(usable_rows, "FAULTS_AT_ONCE", 5)
 
 
@@ -44,9 +47,10 @@ def test_a_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, more):
     whole = read_table(table)
     few_at_once(monkeypatch)
     assert told(read_table(table)) == told(whole)
-    done = import_file(table, tmp_path / "t.uwb")
-    assert done.counts == whole.counts()
-    assert done.notes == whole.meta["notes"]
+    said = []
+    done = import_file(table, tmp_path / "t.uwb", watch=lambda what, _: said.append(what))
+    assert list(dict.fromkeys(said)) == ["reading", "checking", "writing"]
+    assert (done.counts, done.notes) == (whole.counts(), whole.meta["notes"])
     written = uwblink.load(tmp_path / "t.uwb")
     assert written.faults == sorted(whole.faults, key=lambda fault: fault.time_ns)
     assert len(written.poses) == len(whole.poses) > len(whole.exchanges) / 2
@@ -64,30 +68,143 @@ def test_a_table_that_is_half_useless_is_refused_alike_and_leaves_nothing(tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
 
 
-def test_memory_does_not_grow_with_the_table(tmp_path, monkeypatch):
-    monkeypatch.setattr(staging, "ROWS_AT_ONCE", 1_000)
-    peaks = []
-    for times in (20, 150, 600):  # the first is for what is only made once
-        table = write(tmp_path / f"{times}.csv", wrapped(repeated(flights(), times)))
-        tracemalloc.start()
-        import_file(table, tmp_path / f"{times}.uwb")
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    # A column of 8 bytes a row that stayed would be 216 kB more.
-    assert peaks[2] - peaks[1] < 150_000
-
-
-def test_what_is_being_done_is_said(tmp_path):
-    said = []
-    import_file(
-        write(tmp_path / "t.csv", wrapped(flights())), tmp_path / "t.uwb", watch=lambda *told: said.append(told)
-    )
-    assert [what for what, _ in said] == ["reading", "checking", "writing"]
-    assert all(0 <= share <= 1 for _, share in said)
-
-
 def test_times_of_the_calendar_come_from_json_lines_too(tmp_path):
     rows = [row | {"time_s": f"2024-05-06T07:08:{k % 60:02d}+02:00"} for k, row in enumerate(wrapped(flights()))]
     (tmp_path / "t.jsonl").write_text("\n".join(map(json.dumps, rows)))
     found = read_table(tmp_path / "t.jsonl")
     assert found.exchanges.time_ns[1] - found.exchanges.time_ns[0] == 1_000_000_000
+
+
+def lines_of(layout):
+    """Exchanges as rows in any order, some lost and some that nobody can use."""
+    rows = flights(80)
+    plain = wrapped(rows)
+    if layout == "messages":
+        lines = as_messages(plain)
+    elif layout == "stamps":
+        lines = [
+            common | {"event": kind, "stamp": both[kind], "fpp": power}
+            for k, row in enumerate(plain)
+            for common, both, power in messages_of(row | {"fpp3": ""}, k)
+            for kind in ("tx", "rx")
+        ]
+    else:
+        common = ("time_s", "from_id", "to_id")
+        ours = [{n: row[n] for n in (*common, "tx1", "rx2", "rx3")} | {"seq": k} for k, row in enumerate(plain)]
+        theirs = [{n: row[n] for n in (*common, "rx1", "tx2", "tx3")} | {"seq": k} for k, row in enumerate(plain)]
+        names = dict.fromkeys(n for line in (ours[0], theirs[0]) for n in line)
+        lines = [dict.fromkeys(names, "") | line for line in ours + theirs]
+    np.random.default_rng(2).shuffle(lines)
+    del lines[5]
+    lines[8] = lines[8] | {"from_id": "?"}
+    return lines
+
+
+@pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
+def test_a_long_table_is_the_same_a_few_rows_at_a_time(tmp_path, monkeypatch, layout):
+    table = write(tmp_path / "t.csv", lines_of(layout))
+    text = mapped(tmp_path, f'layout = "{layout}"\nwithin_s = 0.1\n[columns]\nsequence = "seq"\n')
+    whole = read_table(table, text)
+    assert 70 < len(whole.exchanges) < 80
+    few_at_once(monkeypatch, 50)
+    assert told(read_table(table, text)) == told(whole)
+    said = []
+    done = import_file(table, tmp_path / "t.uwb", map_file=text, watch=lambda *one: said.append(one))
+    assert done.counts == whole.counts()
+    assert list(dict.fromkeys(what for what, _ in said)) == ["reading", "sorting", "grouping", "checking", "writing"]
+    assert all(0 <= share <= 1 for _, share in said)
+
+
+def test_all_rows_and_not_the_first_ones_tell_the_protocol(tmp_path, monkeypatch):
+    # The pair that is looked at first lost its third messages; of all exchanges it is a third.
+    lines = [
+        line
+        for line in as_messages(wrapped(flights(90)))
+        if line["message"] < 3 or 3 in (line["from_id"], line["to_id"])
+    ]
+    table = write(tmp_path / "t.csv", lines)
+    text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n')
+    few_at_once(monkeypatch, 40)
+    found = read_table(table, text)
+    assert set(found.exchanges.protocol) == {"ds"}
+    assert (len(found.exchanges), len(found.faults)) == (60, 30)
+
+
+def test_messages_are_counted_from_zero_where_all_of_them_are(tmp_path, monkeypatch):
+    # The pair that is looked at first has a message 0 in each exchange by damage.
+    lines = [line | {"message": line["message"] - 1} for line in as_messages(wrapped(flights(90)))]
+    text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n')
+    few_at_once(monkeypatch, 40)
+    assert len(read_table(write(tmp_path / "0.csv", lines), text).exchanges) == 90
+    first = [line | {"message": line["message"] + (3 in (line["from_id"], line["to_id"]))} for line in lines]
+    found = read_table(write(tmp_path / "1.csv", first), text)
+    assert (len(found.exchanges), len(found.faults)) == (60, 30)
+
+
+def test_a_group_that_is_longer_than_many_blocks(tmp_path, monkeypatch):
+    rows = flights(12)
+    ends, names = ("time_s", "from_id", "to_id"), ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
+    lines = []
+    for k, row in enumerate(wrapped(rows)):
+        plain = {n: row[n] for n in ends} | {"sequence": k} | dict.fromkeys(names, "")
+        lines += [plain | {n: row[n]} for n in names]
+        # One of the exchanges comes with a hundred rows that say nothing.
+        lines += [plain] * (100 if k == 4 else 0)
+    np.random.default_rng(6).shuffle(lines)
+    table, text = write(tmp_path / "t.csv", lines), mapped(tmp_path, 'layout = "parts"')
+    few_at_once(monkeypatch, 10)
+    found = read_table(table, text).exchanges
+    order = np.argsort(found.time_ns)
+    assert [stamps(found)[k] for k in order] == [[row[n] for n in names] for row in wrapped(rows)]
+
+
+@pytest.mark.parametrize("layout", ["messages", "stamps", "parts"])
+def test_a_table_without_any_device_says_so(tmp_path, layout):
+    lines = [line | {"from_id": "", "message": 1} for line in lines_of(layout)]
+    text = mapped(tmp_path, f'layout = "{layout}"\n[columns]\nsequence = "seq"\n')
+    with pytest.raises(ImportTableError, match="row 2, column 'from_id'"):
+        read_table(write(tmp_path / "t.csv", lines), text)
+
+
+@pytest.mark.parametrize(("layout", "missing"), [("messages", "tx"), ("stamps", "event")])
+def test_what_a_layout_needs_is_said(tmp_path, layout, missing):
+    lines = [{n: v for n, v in line.items() if n != missing} for line in lines_of(layout)]
+    with pytest.raises(ImportTableError, match=f"column '{missing}' is missing"):
+        read_table(write(tmp_path / "t.csv", lines), mapped(tmp_path, f'layout = "{layout}"'))
+
+
+class Bag:
+    """Messages as if they were read from a bag, one at a time."""
+
+    kinds: ClassVar = {"/uwb": "uwb"}
+
+    def __init__(self, path, rows):
+        self.path, self.rows = path, rows
+
+    def messages(self, _):
+        for k, whole in enumerate(self.rows):
+            (row,) = wrapped([whole])
+            yield "/uwb", "uwb", 1_000_000 * k, {n: v for n, v in row.items() if n != "time_s"}
+
+
+@pytest.mark.parametrize(
+    ("form", "at_once", "grown"), [("exchanges", 1_000, 216_000), ("messages", 2_000, 144_000), ("bag", 500, 450_000)]
+)
+def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_once, grown):
+    """A column of 8 bytes a row that stayed, or the exchanges of a bag, would be so many bytes more."""
+    monkeypatch.setattr(staging, "ROWS_AT_ONCE", at_once)
+    text = mapped(tmp_path, 'within_s = 0.1\n[columns]\nsequence = "seq"\n') if form == "messages" else None
+    few, many = {"exchanges": (150, 600), "messages": (40, 140), "bag": (42, 92)}[form]
+    peaks = []
+    for times in (10, few, many):  # the first is for what is only made once
+        rows = [row | {"time_s": row["time_s"] + 100 * (k // 60)} for k, row in enumerate(repeated(flights(), times))]
+        path = tmp_path / (f"{times}.mcap" if form == "bag" else f"{times}.csv")
+        path.touch()
+        monkeypatch.setattr(bags, "opened", lambda path, rows=rows: nullcontext(Bag(path, rows)))
+        if form != "bag":
+            write(path, as_messages(wrapped(rows)) if form == "messages" else wrapped(rows))
+        tracemalloc.start()
+        import_file(path, tmp_path / f"{times}.uwb", map_file=text)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] - peaks[1] < 0.7 * grown

@@ -27,15 +27,6 @@ HEADER = "time_s,body,x,y,z,qx,qy,qz,qw\n"
 SHIFT_NS = 1_700_000_000_123_456_789
 
 
-def test_csv_and_tum_say_the_same(tmp_path):
-    (tmp_path / "a.csv").write_text(HEADER + "1.5,b1,1,2,3,0,0,0,1\n0.5,b1,0,2,3,0,0,0.7071068,0.7071068\n")
-    (tmp_path / "a.tum").write_text("# time x y z qx qy qz qw\n0.5 0 2 3 0 0 0.7071068 0.7071068\n1.5 1 2 3 0 0 0 1\n")
-    csv, tum = read_poses(tmp_path / "a.csv"), read_poses(tmp_path / "a.tum", "b1")
-    for name in ("time_ns", "body", "position_m", "quaternion"):
-        np.testing.assert_array_equal(getattr(csv, name), getattr(tum, name))
-    assert csv.time_ns.tolist() == [500_000_000, 1_500_000_000]
-
-
 @pytest.mark.parametrize(
     ("name", "head", "order"),
     [
@@ -89,26 +80,6 @@ def test_files_that_hold_no_poses(tmp_path, name, text, fragment):
         read_poses(tmp_path / "none.csv")
 
 
-def test_bags_of_poses(tmp_path):
-    rosbags = pytest.importorskip("rosbags.rosbag2", reason="the extra uwbcal[bags] is not installed")
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    make = {name: types[f"geometry_msgs/msg/{name}"] for name in ("PoseStamped", "Pose", "Point", "Quaternion")}
-    time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
-    with rosbags.Writer(tmp_path / "bag", version=9) as writer:
-        topic = writer.add_connection("/ifo001/mavros/local", "geometry_msgs/msg/PoseStamped", typestore=store)
-        for k in range(3):
-            pose = make["Pose"](make["Point"](float(k), 0.0, 1.0), make["Quaternion"](0.0, 0.0, 0.0, 1.0))
-            message = make["PoseStamped"](header(time(k, 500), "world"), pose)
-            writer.write(topic, k, store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
-    poses = read_poses(tmp_path / "bag")
-    assert poses.time_ns.tolist() == [500, 1_000_000_500, 2_000_000_500]
-    assert poses.body.tolist() == ["ifo001"] * 3
-    assert poses.position_m[:, 0].tolist() == [0.0, 1.0, 2.0]
-
-
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     """A recording in host time without poses, and its motion capture in a file, 3.21 s late."""
@@ -116,14 +87,7 @@ def flight(tmp_path_factory):
     scenario = load(TEST1, ["run.duration_s=20"])
     simulated = simulate(scenario)
     e = simulated.exchanges
-    nothing = replace(
-        simulated.poses,
-        time_ns=simulated.poses.time_ns[:0],
-        body=simulated.poses.body[:0],
-        position_m=simulated.poses.position_m[:0],
-        quaternion=simulated.poses.quaternion[:0],
-    )
-    moved = replace(simulated, poses=nothing, exchanges=replace(e, time_ns=e.time_ns + SHIFT_NS))
+    moved = replace(simulated, poses=simulated.poses[:0], exchanges=replace(e, time_ns=e.time_ns + SHIFT_NS))
     write(moved, folder / "f.uwb")
     from uwbsim.world.world import World
 
@@ -133,24 +97,27 @@ def flight(tmp_path_factory):
     return folder
 
 
-def test_auto_finds_the_offset_from_the_ranges(flight, tmp_path):
-    copy = tmp_path / "f.uwb"
-    copy.write_bytes((flight / "f.uwb").read_bytes())
-    found = add_poses(copy, flight / "p.csv", offset="auto")
+@pytest.fixture
+def copied(flight, tmp_path):
+    path = tmp_path / "f.uwb"
+    path.write_bytes((flight / "f.uwb").read_bytes())
+    return path
+
+
+def test_auto_finds_the_offset_from_the_ranges(flight, copied):
+    found = add_poses(copied, flight / "p.csv", offset="auto")
     # A drone at 1 m/s moves 5 mm in 5 ms; 1500 ranges of 10 cm know a shift of that size.
     assert found.offset_s == pytest.approx(-3.210, abs=0.015)
     assert found.covered > 0.95 * found.exchanges
-    with Recording.open(copy) as recording:
+    with Recording.open(copied) as recording:
         assert recording.count("poses") == found.poses
         assert recording.meta()["poses_offset_s"] == pytest.approx(found.offset_s)
 
 
-def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, tmp_path):
-    copy = tmp_path / "f.uwb"
-    copy.write_bytes((flight / "f.uwb").read_bytes())
+def test_the_command_says_what_it_did_and_refuses_what_cannot_be(flight, copied, tmp_path):
 
     def run(*words):
-        return processes.run("uwblink", "poses", copy, *words)
+        return processes.run("uwblink", "poses", copied, *words)
 
     assert "3320 of 3320 exchanges have a true distance" in run("--from", flight / "p.csv", "--offset", "-3.21").stdout
     for words, fragment in (
@@ -181,13 +148,6 @@ def test_a_file_that_grows_while_it_is_read_gives_what_was_there(tmp_path, monke
     poses = read_poses(path)
     assert poses.time_ns.tolist() == [k * 10**9 for k in range(200)]
     assert poses.position_m[:, 0].tolist() == list(map(float, range(200)))
-
-
-@pytest.fixture
-def copied(flight, tmp_path):
-    path = tmp_path / "f.uwb"
-    path.write_bytes((flight / "f.uwb").read_bytes())
-    return path
 
 
 def scaled(path, factor, output):
