@@ -34,32 +34,37 @@ TimedRow = tuple[int, str, Any, Any]
 """Time in nanoseconds, table, whose row it is, and its values; of ranges their index, of faults the fault."""
 
 
-def _object(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-_NUMBER, _INTEGER, _TEXT, _FLAG = ({"type": kind} for kind in ("number", "integer", "string", "boolean"))
-_TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
 _MEASURED: Final = ("range_m", "truth_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
 _CORRECTED: Final = ("corrected_m", "sigma_m", "sigma_total_m", "mean_error_m", "tail_share", "tail_probability")
-SCHEMAS: Final[dict[str, dict[str, Any]]] = {
-    "foxglove.PoseInFrame": _object(
-        timestamp=_TIME, frame_id=_TEXT, pose=_object(position=_VECTOR, orientation=_QUATERNION)
-    ),
-    "foxglove.FrameTransform": _object(
-        timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_QUATERNION
-    ),
-    "foxglove.Log": _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER),
-    RANGE: _object(
-        timestamp=_TIME, initiator=_INTEGER, target=_INTEGER, protocol=_TEXT,
-        **dict.fromkeys(("range_m", *_CORRECTED, *_MEASURED[1:]), _NUMBER), clamped=_FLAG, outlier=_FLAG,
-    ),
-    "uwb.Imu": _object(timestamp=_TIME, angular_velocity=_VECTOR, linear_acceleration=_VECTOR),
-    "uwb.Height": _object(timestamp=_TIME, height_m=_NUMBER),
-    "uwb.Temperature": _object(timestamp=_TIME, temperature_c=_NUMBER, supply_v=_NUMBER),
-}  # fmt: skip
+
+
+def _schemas() -> dict[str, dict[str, Any]]:
+    number, integer, text, flag = ({"type": kind} for kind in ("number", "integer", "string", "boolean"))
+
+    def message(**properties: Any) -> dict[str, Any]:
+        return {"type": "object", "properties": properties}
+
+    time = message(sec=integer, nsec=integer)
+    vector = message(x=number, y=number, z=number)
+    attitude = message(x=number, y=number, z=number, w=number)
+    found = {
+        "foxglove.PoseInFrame": {"frame_id": text, "pose": message(position=vector, orientation=attitude)},
+        "foxglove.FrameTransform": {
+            "parent_frame_id": text, "child_frame_id": text, "translation": vector, "rotation": attitude,
+        },
+        "foxglove.Log": {"level": integer, "message": text, "name": text, "file": text, "line": integer},
+        RANGE: {
+            "initiator": integer, "target": integer, "protocol": text,
+            **dict.fromkeys(("range_m", *_CORRECTED, *_MEASURED[1:]), number), "clamped": flag, "outlier": flag,
+        },
+        "uwb.Imu": {"angular_velocity": vector, "linear_acceleration": vector},
+        "uwb.Height": {"height_m": number},
+        "uwb.Temperature": {"temperature_c": number, "supply_v": number},
+    }  # fmt: skip
+    return {name: message(timestamp=time, **properties) for name, properties in found.items()}
+
+
+SCHEMAS: Final = _schemas()
 """What messages hold, as JSON Schema; what is not known is left out of a message."""
 
 

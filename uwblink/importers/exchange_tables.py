@@ -352,10 +352,10 @@ def _joined(parts: Sequence[Parts]) -> Parts:
 
 
 def likely_repeated(rows: Columns) -> str:
-    """Return why ranges without stamps are likely there twice; nothing where they are not.
+    """Return a note where ranges without stamps are probably recorded twice; empty text otherwise.
 
-    A range that is exactly the one before of the same two devices is so by chance, or repeats it. By chance it comes as
-    long after it as others do; that is asked by the rank test of Mann and Whitney.
+    A range that equals the previous one of the same two devices does so by chance, or repeats it. Equal by chance, it
+    follows the previous one after as long a time as others do, which the rank test of Mann and Whitney checks.
     """
     if "time_ns" not in rows:
         return ""

@@ -41,7 +41,7 @@ from uwblink.importers.stamps import (
     stamps_of,
 )
 from uwblink.importers.tables import Table
-from uwblink.importers.units import doubted_dbm, doubted_metres
+from uwblink.importers.units import reason_against_dbm, reason_against_metres
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.twr import STAMPS
 
@@ -209,10 +209,10 @@ def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:
     units = _distance_units(columns)
     if len(units) == 1:
         lines += [f'distance = "{unit}"  # by the columns\' names' for unit in units]
-    elif not units and "range_m" in cells and (why := doubted_metres(cells["range_m"])):
+    elif not units and "range_m" in cells and (why := reason_against_metres(cells["range_m"])):
         lines.append(f'distance = "{ASKED}"  # ranges are {why}: write {", ".join(DISTANCE_UNITS)}')
-    doubts = [doubted_dbm(cells[name]) for name in POWERS if name in cells]
-    if why := next(filter(None, doubts), ""):
+    reasons = [reason_against_dbm(cells[name]) for name in POWERS if name in cells]
+    if why := next(filter(None, reasons), ""):
         lines.append(f'power = "{ASKED}"  # powers are {why}: write -dBm where they lack their sign')
     return lines
 

@@ -31,7 +31,7 @@ MAX_ID_WORDS: Final = 1_000_000
 """Different words in a column of ids from which on it holds none: more than ids can be written in."""
 
 Watch = Callable[[str, float], object]
-"""Is told what is being done, and which share of it is."""
+"""Called with the step that runs ("reading", "writing" ...) and the share of it that is done."""
 
 
 @dataclass(frozen=True, slots=True)

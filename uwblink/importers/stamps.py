@@ -2,8 +2,7 @@
 
 Stamps come in any unit, wrapped, signed or unwrapped. A range is plausible from two metres below zero (antenna delays)
 to two kilometres above, widened for single-sided ranging by what clocks 50 ppm apart add in its reply; where a distance
-was measured, within 50 m of it. All that is said of ranges less what antenna delays of devices add that were not
-programmed with any: 154 m.
+was measured, within 50 m of it. What missing antenna delays add is subtracted before: 154 m where none were programmed.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ def to_ticks(
 
 
 def how_counted(count: Callable[[float, float], int], bits: int | None, counter: str | None) -> tuple[int, str]:
-    """Return a counter's bits and how it is written, as far as they are not given.
+    """Return the width of a counter in bits and how it is written, as far as they are not given.
 
     `count(low, high)` returns how many stamps in ticks are from `low` to below `high`. Numbers that fit 32 bits are
     taken for 32, larger ones for 40, and those that fit neither for unwrapped; negative ones for signed where they fit.

@@ -1,4 +1,4 @@
-"""Lengths and powers whose unit nobody said: whether they can be what they are taken for."""
+"""Units of lengths and powers that a map does not state: whether the numbers can have the assumed unit."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def _remaining(errors_m: Floats) -> float:
     return float(np.median(np.abs(finite - constant)))
 
 
-def doubted_metres(ranges: Floats) -> str:
-    """Return why numbers (n,) can be no ranges in metres; nothing where they can be."""
+def reason_against_metres(ranges: Floats) -> str:
+    """Return why numbers (n,) cannot be ranges in metres; empty text where they can be."""
     finite = ranges[np.isfinite(ranges)]
     if len(finite) < MIN_ROWS:
         return ""
@@ -65,8 +65,8 @@ def doubted_metres(ranges: Floats) -> str:
     return ""
 
 
-def doubted_dbm(powers: Floats) -> str:
-    """Return why numbers (n,) can be no received powers in dBm; nothing where they can be."""
+def reason_against_dbm(powers: Floats) -> str:
+    """Return why numbers (n,) cannot be received powers in dBm; empty text where they can be."""
     finite = powers[np.isfinite(powers) & (powers != 0)]  # boards that cannot tell a power print 0
     middle = float(np.median(finite)) if len(finite) else -1.0
     # What may be sent is -41.3 dBm/MHz, -14 dBm in 500 MHz.
@@ -93,13 +93,13 @@ def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats 
     `raw_m` are ranges by the stamps (n,), if there are any.
     """
     for name in POWERS:
-        if column_map.power_unit is None and (why := doubted_dbm(optional(rows, name))):
+        if column_map.power_unit is None and (why := reason_against_dbm(optional(rows, name))):
             raise ImportTableError(
                 f"{path}: column {column_map.header(name)!r}: its powers are {why}; say units.power in the map: "
                 '"-dBm" where they lack their sign'
             )
     ranges, true = optional(rows, "range_m"), truth_m(rows)
-    if column_map.distance_unit is None and (why := doubted_metres(ranges)):
+    if column_map.distance_unit is None and (why := reason_against_metres(ranges)):
         raise ImportTableError(
             f"{path}: column {column_map.header('range_m')!r}: its ranges are {why}; say units.distance in the map"
         )

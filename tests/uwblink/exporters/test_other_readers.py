@@ -1,9 +1,6 @@
-"""What was exported, read by the readers that others use: mcap, rosbags, pandas, and TUM by the rules of evo."""
+"""What was exported, read by the readers that others use: mcap, rosbags and pandas."""
 
-import csv
-import io
 import json
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -133,21 +130,6 @@ def test_pandas_reads_the_tables(recording, tmp_path):
     assert poses[["qx", "qy", "qz", "qw"]].to_numpy().tolist() == held.poses.quaternion.tolist()
 
 
-def test_trajectories_are_as_evo_reads_them(recording, tmp_path):
-    """`evo` takes lines that do not begin with "#", cells between single blanks, eight of them, all numbers."""
-    export_recording(recording, tmp_path / "tum", to="tum")
-    held = load(recording).poses
-    mine = held[held.body == "drone"]
-    text = (tmp_path / "tum" / "drone.tum").read_text()
-    lines = (line for line in io.StringIO(text) if not line.startswith("#"))
-    matrix = np.array([row for row in csv.reader(lines, delimiter=" ") if row]).astype(float)
-    assert matrix.shape == (len(mine), 8)
-    assert matrix[:, 1:4].tolist() == mine.position_m.tolist()
-    assert matrix[:, 4:].tolist() == mine.quaternion.tolist()
-    assert matrix[:, 0] == pytest.approx(mine.time_ns * 1e-9, abs=1e-6)
-    assert (np.diff(matrix[:, 0]) > 0).all()
-
-
 @pytest.fixture(scope="module")
 def corrected(tmp_path_factory):
     """A flight of three tags, before and after a calibration, and what that says of each range."""
@@ -203,14 +185,3 @@ def test_corrected_ranges_in_messages(corrected, tmp_path):
     mine = (exchanges.initiator == 1) & (exchanges.target == 2)
     assert [m.range for m in messages] == pytest.approx(applied.corrected_m[mine].tolist(), rel=1e-6)
     assert [m.variance for m in messages] == pytest.approx((applied.sigma_total_m[mine] ** 2).tolist(), rel=1e-6)
-
-
-def test_a_table_that_is_not_that_of_the_exchanges_is_left_out(corrected, tmp_path):
-    folder, *_ = corrected
-    held = load(folder / "c.uwb")
-    part = {name: column[:5] for name, column in held.corrected.items()}
-    replace(held, corrected=part).save(tmp_path / "odd.uwb")
-    export_recording(tmp_path / "odd.uwb", tmp_path / "out", to="mcap")
-    with (tmp_path / "out" / "recording.mcap").open("rb") as file:
-        ranges = [json.loads(m.data) for s, _, m in make_reader(file).iter_messages() if s.name == "uwb.Range"]
-    assert not any("corrected_m" in one for one in ranges)

@@ -436,6 +436,10 @@ def test_duckdb_may_open_the_named_file_only(tmp_path):
     ("text", "fragment"),
     [
         ("bits = 33", "bits: found 33"),
+        ("bits = 32.0", "bits: found 32.0"),
+        ("bits = true", "bits: found True"),
+        ('protocol = ["ds"]', "protocol: found ['ds']"),
+        ("layout = {a = 1}", "layout: found {'a': 1}"),
         ('layout = "tall"', "layout: found 'tall'"),
         ("[units]\nstamps = -1.0", "units.stamps"),
         ('[units]\ndistance = "furlong"', "units.distance"),
