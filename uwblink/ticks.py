@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Ints
 
 TICKS_PER_SECOND: Final = 128 * 499_200_000
 TICK_S: Final = 1.0 / TICKS_PER_SECOND
@@ -41,8 +41,3 @@ def elapsed(later: ArrayLike, earlier: ArrayLike, bits: int = REPORT_BITS) -> In
     mask = np.int64((1 << bits) - 1)
     difference = np.asarray(later, dtype=np.int64) - np.asarray(earlier, dtype=np.int64)
     return np.asarray(difference & mask, dtype=np.int64)
-
-
-def seconds(ticks: ArrayLike) -> Floats:
-    """Device ticks as seconds of the clock that counted them."""
-    return np.asarray(ticks, dtype=np.float64) * TICK_S

@@ -100,9 +100,8 @@ class Exchanges:
         count = arrays.length("tx1", tx1)
         if bits not in BITS:
             raise ArgumentError(f"bits: found {bits!r:.40}, allowed: {', '.join(map(str, BITS))}")
-        chosen: dict[str, Any] = {
-            n: arrays.whole_numbers(n, v, count, 0, LARGEST_ID) for n, v in _ends(initiator, target, reporter)
-        }
+        ends = {"initiator": initiator, "target": target, "reporter": initiator if reporter is None else reporter}
+        chosen: dict[str, Any] = {n: arrays.whole_numbers(n, v, count, 0, LARGEST_ID) for n, v in ends.items()}
         arrays.reject(
             "target", chosen["target"], chosen["target"] == chosen["initiator"], "another tag than the initiator"
         )
@@ -161,10 +160,6 @@ COLUMNS: Final = tuple(f.name for f in fields(Exchanges) if f.name != "bits")
 BITS: Final = (REPORT_BITS, COUNTER_BITS)
 LARGEST_ID: Final = 65_535
 LATEST_NS: Final = 2**62
-
-
-def _ends(initiator: ArrayLike, target: ArrayLike, reporter: ArrayLike | None) -> list[tuple[str, ArrayLike]]:
-    return [("initiator", initiator), ("target", target), ("reporter", initiator if reporter is None else reporter)]
 
 
 def _protocol_of(protocol: ArrayLike | None, tx3: ArrayLike | None, rx3: ArrayLike | None) -> ArrayLike:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from uwblink.errors import ArgumentError
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed, seconds
+from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S, elapsed
 from uwblink.twr import Exchanges, board_range, delay_weights, raw_range, time_of_flight, truncate4, without_stamps
 
 
@@ -134,11 +134,6 @@ def test_degenerate_stamps_make_no_range_and_no_warning(protocol):
     none = Exchanges.from_arrays([1], [2], tx1=[0], rx1=[9], tx2=[9], rx2=[50], tx3=[9], rx3=[70], protocol=protocol)
     found = time_of_flight(none)
     assert protocol != "ds" or not np.isfinite(found[0])
-
-
-def test_ticks_are_seconds_of_the_counter_s_clock():
-    # 2^40 ticks are 17.2 s (DW1000 User Manual, section 7.2.8).
-    assert seconds([0, 1, 2**40]).tolist() == [0.0, 1 / 63_897_600_000, pytest.approx(17.2074, abs=1e-4)]
 
 
 def test_boards_print_single_sided_ranges_of_whole_ticks_and_cut_all_of_them():

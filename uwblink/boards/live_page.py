@@ -197,14 +197,17 @@ def _send(handler: BaseHTTPRequestHandler, text: str) -> None:
     data = text.encode()
     script = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
     handler.send_response(200)
-    handler.send_header("Content-Type", "text/html; charset=utf-8")
-    handler.send_header("Content-Length", str(len(data)))
-    handler.send_header("Cache-Control", "no-store")
-    handler.send_header(
-        "Content-Security-Policy",
+    policy = (
         f"default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; script-src 'sha256-{script}'; "
-        "frame-ancestors 'none'",
+        "frame-ancestors 'none'"
     )
+    for name, value in (
+        ("Content-Type", "text/html; charset=utf-8"),
+        ("Content-Length", str(len(data))),
+        ("Cache-Control", "no-store"),
+        ("Content-Security-Policy", policy),
+    ):
+        handler.send_header(name, value)
     handler.end_headers()
     handler.wfile.write(data)
 
