@@ -225,7 +225,11 @@ class FitSettings:
                 continue
             if name == "delays_from":
                 value = value if isinstance(value, str) else str(value) if isinstance(value, Path) else "a calibration"
-            found[name] = {str(key): one for key, one in value.items()} if isinstance(value, dict) else value
+            elif name == "fixed_ns":
+                value = {str(tag): delay for tag, delay in value.items()}
+            elif name == "groups":
+                value = {group: list(tags) for group, tags in value.items()}
+            found[name] = value
         return found
 
 

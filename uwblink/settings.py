@@ -1,4 +1,4 @@
-"""Fields of settings that Python and the command line share: each says what it means, and how it is typed."""
+"""Fields of settings that Python and the command line share: what each means, and how it is typed."""
 
 from __future__ import annotations
 

@@ -95,9 +95,9 @@ def _curve(
     if not calibration.groups:
         return np.asarray(getattr(calibration, name)(lifted))
     member = {tag for group in calibration.groups.values() for tag in group.tags}
-    lonely = [tag for tag in ranges.tags() if tag not in member]
-    if lonely:
-        raise BadInputError(f"{ranges.source}: tag {lonely[0]} is in none of the calibration's groups of tags")
+    without = [tag for tag in ranges.tags() if tag not in member]
+    if without:
+        raise BadInputError(f"{ranges.source}: tag {without[0]} is in none of the calibration's groups of tags")
     values = np.zeros(len(ranges))
     for group in calibration.groups.values():
         share = 0.5 * np.isin(ranges.initiator, group.tags) + 0.5 * np.isin(ranges.target, group.tags)

@@ -44,7 +44,7 @@ def apply(
 ) -> Applied:
     """Write a recording again with `range_m` of every exchange corrected, and every other row of every table as it was.
 
-    The table `corrected` says of each exchange what it was before, its standard deviation and its flags. `to` writes a
+    The table `corrected` has the raw range of each exchange, its standard deviation and its flags. `to` writes a
     folder in a form of `uwblink.exporters` instead ("csv", "parquet", "mcap", "rosbag2"). Stamps stay as they were
     recorded. An exchange without any power gets the delays' part only. Raises `BadInputError` for a recording that is
     corrected already, and what `Recording.open`, `check_output` and `export_recording` raise.

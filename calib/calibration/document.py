@@ -102,7 +102,7 @@ FILE_KEYS: Final = (
 def text_of(calibration: Calibration) -> str:
     """Return a calibration as JSON text.
 
-    The version says what a program must know to read it: 2 with groups of tags, 3 with a curve that is taken at each
+    The version is what a program must support to read it: 2 with groups of tags, 3 with a curve that is taken at each
     reception (taken at the mean power it is wrong by up to a decimetre), 4 with constants of pairs.
     """
     version = 2 if calibration.groups else 1
@@ -224,7 +224,7 @@ class Reader:
         return self._table[key]
 
     def wrong(self, key: str, expected: str) -> BadInputError:
-        """Return the error that says what stands at a key, and what was expected."""
+        """Return the error that quotes the value at a key, and states what was expected."""
         found = repr(self._table[key])
         return BadInputError(f"{self._where}: {key}: found {found[:60]}, expected {expected}")
 

@@ -1,4 +1,4 @@
-"""What the errors of corrected ranges are made of, by pair and power: core, reflections, outliers.
+"""The error model of corrected ranges, by pair and power: direct ranges, reflections, outliers.
 
 An error is noise about `location_m`; with a tail share noise plus a detour, a least one and an exponential one, which
 is of one of two kinds; rarely an outlier. Noise and share are stated at some lifted powers, in logarithms and log odds
@@ -77,7 +77,7 @@ class ErrorModel:
         return self.least_m**2 + 2 * self.least_m * detour_m + 2 * self.long.square * detour_m**2
 
     def shapes(self, lifted: Floats, initiator: Ints, target: Ints) -> ErrorShapes:
-        """Return the shape of the errors of ranges (n,) at lifted powers between two tags, whoever initiated."""
+        """Return the shape of the errors of ranges (n,) at lifted powers between two tags, in either direction."""
         return self._shapes(lifted, self._factors[self._rows(initiator, target)])
 
     def _shapes(self, lifted: Floats, factors: Floats) -> ErrorShapes:

@@ -56,12 +56,12 @@ def registers(
 ) -> dict[int | None, AntennaDelay]:
     """Return what to program into tags, on top of what was programmed when they were recorded.
 
-    The calibration says what that was, or `base` does (`programmed`) for one that does not. The chip adds the
+    These are the calibration's `antenna_delays`, or `base` (`programmed`) where it has none. The chip adds the
     transmitter's register to transmit stamps and takes the receiver's from receive stamps. A recorded stamp is the
     true one plus d_t = 0.44 d or d_r = -0.56 d, so both registers grow by their share of -d (docs/theory.md). With
     `firmware`, its constant for the stamps of delayed replies is that of the transmitter; without, it stays as it was.
     Raises `BadInputError` for a value that 16 bits do not hold, for delays that the data left free (a device ranges
-    with any other, and its register would be right with some of them alone), where nothing says what was programmed,
+    with any other, and its register would be right with some of them alone), where the programmed delays are unknown,
     and where calibration and `base` contradict each other.
     """
     free = free_delays(calibration)
@@ -75,8 +75,8 @@ def registers(
     unknown = [tag for tag in calibration.delays_ns if tag not in found]
     if unknown:
         raise BadInputError(
-            f"nothing says what was programmed into tag {', '.join(map(str, sorted(unknown)))} when the calibration "
-            "was fitted; give the recording that it was fitted to, or a file of antenna delays",
+            f"the antenna delays of tag {', '.join(map(str, sorted(unknown)))} that were programmed when the "
+            "calibration was fitted are unknown; give the recording that it was fitted to, or a file of antenna delays",
             parameter="base",
         )
     if firmware:
@@ -85,9 +85,9 @@ def registers(
 
 
 def antenna_delays_warning(calibration: Calibration, path: str | os.PathLike[str]) -> str:
-    """Say where other antenna delays were programmed into a recording's tags than where a calibration was fitted.
+    """Return a warning where a recording's tags had other antenna delays programmed than those of a calibration.
 
-    Returns "" where they were the same, or nothing says so; raises what `Recording.open` raises.
+    Returns "" where they were the same or are unknown; raises what `Recording.open` raises.
     """
     with Recording.open(path) as opened:
         now, tags = antenna_delays_in(opened.meta(), str(path)), [tag.tag for tag in opened.tags()]
@@ -100,7 +100,7 @@ def free_delays(calibration: Calibration) -> list[int]:
 
 
 def _on_top(calibration: Calibration, base: AntennaDelays | None) -> dict[int | None, AntennaDelay]:
-    """Return what to program by tag, whatever is known of the delays; nothing for tags without a known base.
+    """Return what to program by tag, determined or not; nothing for tags whose programmed delays are unknown.
 
     The sum of both registers is rounded once: it is what ranges are made of.
     """
@@ -216,9 +216,9 @@ def export(
 
     `to` is "registers" (values for the DW1000's antenna-delay registers, as TOML), "firmware" (those, and the constants
     of its build), "json", "csv" (delays), "miluv", "ros-yaml" or "c-header" (tables and a function that corrects a
-    range). Registers are on top of what was programmed when the devices were recorded, which the calibration says, or
-    `base` (`programmed`). Raises `BadInputError` for another form, for a calibration with groups of tags in a form that
-    has one curve, and for registers of tags whose delays the data left free.
+    range). Registers are on top of what was programmed when the devices were recorded: the calibration's
+    `antenna_delays`, or `base` (`programmed`). Raises `BadInputError` for another form, for a calibration with groups
+    of tags in a form that has one curve, and for registers of tags whose delays the data left free.
 
     >>> import calib
     >>> print(calib.export(calib.fit(calib.sample_flight()).calibration, "registers").splitlines()[2])

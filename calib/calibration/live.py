@@ -15,7 +15,7 @@ from uwblink.twr import Exchanges
 def live_correction(path: Path) -> Callable[[Exchanges], dict[str, Floats]]:
     """Return a function that corrects exchanges (n,) to `corrected_m`, and what else `CorrectedColumns` has.
 
-    The numbers are those of `calib.apply`; its attribute `antenna_delays` says what was programmed where the
+    The numbers are those of `calib.apply`; its attribute `antenna_delays` is what was programmed where the
     calibration was fitted. The function raises what `Calibration.apply` raises, as for a tag that is not calibrated.
     Raises what `load_calibration` raises.
     """

@@ -48,7 +48,7 @@ class PairOffset(NamedTuple):
 
 
 def offset_of(offsets: Mapping[tuple[int, int], PairOffset], first: int, second: int) -> PairOffset:
-    """Return the constant of a pair, whoever initiates; raises `BadInputError` for a pair that has none."""
+    """Return the constant of a pair, in either direction; raises `BadInputError` for a pair that has none."""
     try:
         return offsets[min(first, second), max(first, second)]
     except KeyError as error:

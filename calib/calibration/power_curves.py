@@ -93,7 +93,7 @@ class Curve:
 
 
 def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:
-    """Return a curve of one value, said to be fitted between two lifted powers."""
+    """Return a curve of one value, with the two lifted powers of `span` as its range."""
     low, high = span
     if not high > low:
         low, high = 0.999 * low, 1.001 * high

@@ -137,7 +137,7 @@ def localize(
     with waiting("localizing"):
         found = [one for path in recordings for one in calib.localize(path, known, settings, training=training)]
     # The text first: where it cannot be made, nothing is written.
-    told = (
+    text = (
         json.dumps(localization_json(found), indent=1)
         if as_json
         else localization_text(found, summarize(found), settings)
@@ -146,7 +146,7 @@ def localize(
         write_tum(found, tum, force=force)
     if figures:
         write_track_figures(found, figures, force=force)
-    typer.echo(told)
+    typer.echo(text)
 
 
 def _onboard(
@@ -165,14 +165,14 @@ def _onboard(
     settings = OnboardSettings(model=model)
     with waiting("localizing"):
         found = [one for path in recordings for one in localize_onboard(path, known, settings)]
-    told = json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings)
+    text = json.dumps(onboard_json(found), indent=1) if as_json else onboard_text(found, settings)
     if tum:
         write_onboard_tum(found, tum, force=force)
     if figures:
         from calib.report import write_onboard_figures
 
         write_onboard_figures(found, figures, force=force)
-    typer.echo(told)
+    typer.echo(text)
 
 
 def doctor(
@@ -219,7 +219,7 @@ def doctor(
 
 def compare(
     first: Annotated[Path, typer.Argument(help="Calibration to compare with (.json).")],
-    second: Annotated[Path, typer.Argument(help="Calibration whose differences are told (.json).")],
+    second: Annotated[Path, typer.Argument(help="Calibration that is compared with the first (.json).")],
     figures: Figures = None,
     as_json: AsJson = False,
     force: Force = False,
@@ -292,7 +292,7 @@ def report(
     else:
         for path in filter(None, (output, pdf, figures)):
             typer.echo(f"report: {path}")
-        if tests:  # without tests the report itself says that the training was judged
+        if tests:  # without tests the report itself states that the training was judged
             _warn_of_seen(campaign.evaluation)
         findings = [f"{name}: {finding.fault}" for name, finding in campaign.findings]
         for warning in [*campaign.fit.warnings, *findings]:

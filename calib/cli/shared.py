@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from calib import Calibration
 
 STOPPED: Final = 1
-"""Exit status of a command whose fit stopped before it converged: what it wrote says so, and is not final."""
+"""Exit status of a command whose fit stopped before it converged: its output is marked as not final."""
 
 FLAGS: Final = {
     "boards": "COUNT",

@@ -160,7 +160,7 @@ def left_skew_of(terms: Sequence[tuple[Floats, Floats]]) -> LeftSkew | None:
     replies = [reply_s for reply_s, _ in terms if len(reply_s)]
     if not replies:
         return None
-    median, told_m = float(np.median(np.concatenate(replies))), np.concatenate([told for _, told in terms])
+    median, told_m = float(np.median(np.concatenate(replies))), np.concatenate([metres for _, metres in terms])
     told = float(np.quantile(told_m, 0.95)) if len(told_m) else np.nan
     # Each of two crystals may be off its frequency by 20 ppm (IEEE 802.15.4, 15.4.9).
     return LeftSkew(bound_m=2 * 20.0 * PPM_TO_METRES * median, reply_s=median, told_m=told)

@@ -102,7 +102,7 @@ class RecordedSource:
 
     @cached_property
     def meta(self) -> Mapping[str, Any]:
-        """Return what the recording says of itself."""
+        """Return the recording's metadata."""
         return self.recording.meta()
 
     @cached_property
@@ -314,7 +314,7 @@ def held_open(data: Data) -> AbstractContextManager[Data]:
 
 
 def antenna_delays_in(meta: Mapping[str, Any], source: str) -> AntennaDelays:
-    """Return what a recording's `meta` says was programmed; raises `BadInputError` where it cannot be understood."""
+    """Return the programmed antenna delays that `meta` states; raises `BadInputError` where it cannot be understood."""
     try:
         return delays_in_meta(meta)
     except ValueError as error:
@@ -417,7 +417,7 @@ class Flight:
 
 
 def require_times(ranges: Ranges) -> None:
-    """Raise `UnanswerableError` where all ranges have one time, as where nobody recorded any."""
+    """Raise `UnanswerableError` where all ranges have the same time, as those without recorded times."""
     if len(ranges) > 1 and not np.ptp(ranges.time_ns):
         raise UnanswerableError(
             f"{ranges.source}: all of its {len(ranges)} ranges have the same time, so nothing can be tracked; import "

@@ -9,7 +9,6 @@ import calib
 from calib.data.samples import sample_flight
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import TABLES, CirRow, Fault, FrameRow
-from uwblink.twr import COLUMNS
 
 
 def full_recording(path):
@@ -97,10 +96,6 @@ def test_a_corrected_recording_is_not_corrected_again(corrected):
     with pytest.raises(calib.BadInputError, match="corrected already"):
         calib.apply(folder / "c.uwb", known, folder / "again.uwb")
     assert not (folder / "again.uwb").exists()
-
-
-def test_all_columns_of_exchanges_are_compared():
-    assert set(COLUMNS) == set(TABLES["exchanges"])
 
 
 def test_a_recording_without_exchanges_is_corrected_to_one_without(tmp_path):

@@ -28,24 +28,19 @@ def run(*words):
 @pytest.fixture
 def stopped(flight, monkeypatch, tmp_path):
     monkeypatch.setattr(pair_mixture, "MAX_STEPS", 2)
-    done = run("fit", flight, "-o", tmp_path / "c.json")
-    return done, tmp_path / "c.json"
+    return run("fit", flight, "-o", tmp_path / "c.json"), tmp_path / "c.json"
 
 
-def test_the_command_writes_it_says_so_and_ends_with_1(stopped):
+def test_the_command_writes_it_marks_it_and_ends_with_1(stopped, flight, tmp_path):
     done, path = stopped
     assert done.exit_code == 1
     assert "stopped after" in done.stdout
     assert "before it settled" in done.stderr
     assert json.loads(path.read_text())["provenance"]["converged"] is False
     assert "NOT SETTLED" in repr(calib.load_calibration(path))
-
-
-def test_json_is_printed_and_ends_with_1(flight, monkeypatch, tmp_path):
-    monkeypatch.setattr(pair_mixture, "MAX_STEPS", 2)
-    done = run("fit", flight, "-o", tmp_path / "c.json", "--json")
-    assert done.exit_code == 1
-    assert json.loads(done.stdout)["provenance"]["converged"] is False
+    as_json = run("fit", flight, "-o", tmp_path / "d.json", "--json")
+    assert as_json.exit_code == 1
+    assert json.loads(as_json.stdout)["provenance"]["converged"] is False
 
 
 def test_commands_that_use_it_warn(stopped, flight, tmp_path):
