@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from calib.planning.flights import plan_flight
     from calib.planning.result import Plan
     from calib.report.campaign import run_campaign
-    from calib.report.sections import register_report_section, write_report
+    from calib.report.sections import register_report_section
+    from calib.report.writing import write_report
     from calib.settings import FitSettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
@@ -113,7 +114,7 @@ _HOMES: Final = {
     "sample_arrangements": "calib.surveys.samples",
     "sample_flight": "calib.data.samples",
     "survey": "calib.surveys.surveying",
-    "write_report": "calib.report.sections",
+    "write_report": "calib.report.writing",
 }
 
 if not TYPE_CHECKING:

@@ -24,7 +24,7 @@ from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE, look
-from uwblink.pages.figures import NARROW_IN, WIDTHS, label, legend, mark, sheet
+from uwblink.pages.figures import NARROW_IN, WIDTHS, label, legend, mark, outlines, sheet
 from uwblink.ticks import SPEED_OF_LIGHT
 
 STAGE_LINES: Final[dict[str, dict[str, Any]]] = {
@@ -116,15 +116,8 @@ def histogram(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None
         low, high = min(low, raw[0]), max(high, raw[1])
     margin = 0.05 * float(high - low) + 0.1
     low, high = float(low) - margin, float(high) + margin
-    edges = np.linspace(low, high, 41)
-    for stage, error in errors.items():
-        inside = np.clip(error, low, np.nextafter(high, low))
-        share = np.histogram(inside, edges)[0] * (100 / len(error))
-        mark(axes.stairs(share, edges, lw=1.3, **STAGE_LINES[stage]), stage)
-    inner = [t for t in axes.get_xticks() if low + 0.12 * (high - low) < t < high - 0.12 * (high - low)]
-    names = [f"≤ {low:.0f}", *(f"{t:.0f}" for t in inner), f"≥ {high:.0f}"]
-    axes.set_xticks([low, *inner, high], [name.replace("-", "−") for name in names])
-    axes.set_xlim(low, high)
+    lines = {stage: {"lw": 1.3, **line} for stage, line in STAGE_LINES.items()}
+    outlines(axes, errors, np.linspace(low, high, 41), lines)
     label(axes, "range error (cm)", "ranges (%)")
     return _explained(axes)
 

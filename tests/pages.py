@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
+from unittest.mock import patch
 
 ROOT: Final = Path(__file__).parents[1]
 DOCS: Final = ROOT / "docs"
@@ -110,17 +111,12 @@ def command(line: str) -> str:
     bare, _, output = line.partition(" > ")
     words = shlex.split(bare)
     assert words[0] in COMMANDS, f"{line}: only {', '.join(COMMANDS)} are run"
-    main = import_module(f"{words[0]}.cli").main
-    before, sys.argv = sys.argv, words
-    complaints = io.StringIO()
-    status: Any = None
-    with told() as printed, contextlib.redirect_stderr(complaints):
+    complaints, status = io.StringIO(), None
+    with told() as printed, contextlib.redirect_stderr(complaints), patch.object(sys, "argv", words):
         try:
-            main()
+            import_module(f"{words[0]}.cli").main()
         except SystemExit as end:
             status = end.code
-        finally:
-            sys.argv = before
     assert status in (0, None), f"{line}: status {status}\n{printed.getvalue()}{complaints.getvalue()}"
     if output:
         Path(output).write_text(printed.getvalue(), encoding="utf-8")
@@ -131,16 +127,8 @@ def command(line: str) -> str:
 @contextlib.contextmanager
 def told() -> Iterator[io.StringIO]:
     """Catch what is printed, as it would be on a terminal of 100 columns."""
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "100"
-    try:
-        with contextlib.redirect_stdout(io.StringIO()) as printed:
-            yield printed
-    finally:
-        if before is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = before
+    with patch.dict(os.environ, COLUMNS="100"), contextlib.redirect_stdout(io.StringIO()) as printed:
+        yield printed
 
 
 def compare(printed: str, shown: str) -> None:

@@ -1,8 +1,9 @@
 """Reports as HTML and PDF, made of `Heading`, `Text`, `Table`, `Picture` and `Listing`; and figures as files."""
 
 from calib.report.plans import write_plan
-from calib.report.results import check_places, origin_of
-from calib.report.sections import (
+from calib.report.results import origin_of
+from calib.report.writing import (
+    check_places,
     write_comparison_figures,
     write_onboard_figures,
     write_survey_report,

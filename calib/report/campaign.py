@@ -21,8 +21,9 @@ from calib.estimation.losses import MIXTURE
 from calib.estimation.passive_listeners import heard_delays
 from calib.estimation.result import FitResult
 from calib.evaluation.localization import Localization, localize, summarize
-from calib.report.results import Results, check_places, origin_of
-from calib.report.sections import TITLE, document
+from calib.report.results import Results, origin_of
+from calib.report.sections import document
+from calib.report.writing import check_places
 from calib.settings import FitSettings
 from uwblink.pages.blocks import write_document
 
@@ -59,7 +60,8 @@ class Campaign(Results):
         """
         output, *more = (None if place is None else Path(place) for place in (html, pdf, figures))
         check_places(output, *more, force=force)
-        write_document(document(self, TITLE), output, *more, force=force, progress=progress)
+        made = document(self, "Calibration of ultra-wideband ranges")
+        write_document(made, output, *more, force=force, progress=progress)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `calib report --json` prints."""
@@ -133,7 +135,6 @@ def run_campaign(
             calibration=known,
             training=fitted,
             tests=testing,
-            warnings=found.warnings,
             fit=found,
             refits=refits,
             # From the first recording that has passive listeners.

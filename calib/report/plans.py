@@ -11,7 +11,7 @@ from calib.planning.flight_result import FlightPlan
 from calib.planning.procedure import where
 from calib.planning.result import Plan
 from calib.report.figures import arrangement, flight, more, planned_delays
-from calib.report.results import check_places
+from calib.report.writing import check_places
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, write_document
 
 

@@ -1,4 +1,4 @@
-"""What a report tells of, where it comes from, and where it may be written."""
+"""What a report tells of, and where it comes from."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data
-from calib.errors import BadInputError
 from calib.evaluation.statistics import Evaluation, evaluate
-from uwblink.output import check_output
 
 if TYPE_CHECKING:
     from calib.doctor.base import Finding
@@ -64,7 +62,7 @@ class Results:
     """What a report tells of: a calibration, and as much as there is of how it was fitted and how it does.
 
     `training` are the ranges it was fitted to, `tests` others that judge it; an `evaluated` one of the judged ranges
-    is not made again. `warnings` are those of the fit. `refits` are calibrations for other scales of the loss, by
+    is not made again. `refits` are calibrations for other scales of the loss, by
     scale in ns; `heard` delays as passive listeners see them; `findings` the doctor's, by recording; `tracks` the
     bodies that were localized; `origin` says when the report was made, and from what files.
     """
@@ -73,13 +71,17 @@ class Results:
     training: list[Ranges] = field(default_factory=list)
     tests: list[Ranges] = field(default_factory=list)
     evaluated: Evaluation | None = None
-    warnings: list[str] = field(default_factory=list)
     fit: FitResult | None = None
     refits: dict[float, Calibration] = field(default_factory=dict)
     heard: dict[int, OverheardDelay] = field(default_factory=dict)
     findings: list[tuple[str, Finding]] = field(default_factory=list)
     tracks: list[Localization] = field(default_factory=list)
     origin: Origin = field(default_factory=Origin)
+
+    @property
+    def warnings(self) -> list[str]:
+        """The warnings of the fit, which its calibration keeps."""
+        return list(map(str, self.calibration.provenance.get("warnings", [])))
 
     @property
     def recordings(self) -> list[Ranges]:
@@ -110,26 +112,3 @@ class Results:
     def evaluation(self) -> Evaluation:
         """How the calibration does on the judged ranges."""
         return self.evaluated or evaluate(self.judged, self.calibration)
-
-
-def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
-    """Raise, before anything is computed, what would keep the files of a report from being written.
-
-    Raises what `check_output` raises, and `BadInputError` for a `pdf` that is the `output`, and for a folder of
-    `figures` that is a file, that holds some already, or whose parent does not exist.
-    """
-    for path in filter(None, (output, pdf)):
-        check_output(path, force=force)
-    if pdf is not None and output is not None and output.resolve() == pdf.resolve():
-        raise BadInputError(f"{output} is the page already; give the PDF another name", parameter="pdf")
-    if figures is None:
-        return
-    wrong = ""
-    if figures.exists() and not figures.is_dir():
-        wrong = "is a file, expected a folder"
-    elif not force and any(path.suffix in (".pdf", ".svg") for path in figures.glob("*.*")):
-        wrong = "holds figures already; give another folder, or `force` to replace them"
-    elif not figures.parent.is_dir():
-        raise BadInputError(f"{figures.parent} does not exist", parameter="figures")
-    if wrong:
-        raise BadInputError(f"{figures} {wrong}", parameter="figures")

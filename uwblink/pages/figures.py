@@ -5,14 +5,16 @@ from __future__ import annotations
 import io
 import json
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Final
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from uwblink.arrays import Floats
 from uwblink.pages.colours import GRID, INK, MUTED
 
 WIDTHS: Final = {"column": 3.5, "page": 7.16}
@@ -112,6 +114,30 @@ def legend(figure: Figure, axes: Axes | None = None, *, texts: Sequence[str] = (
         ncols=columns,
         columnspacing=1.2,
     )
+
+
+def outlines(
+    axes: Axes,
+    samples: Mapping[str, Floats],
+    edges: Floats,
+    lines: Mapping[str, Mapping[str, Any]],
+    *,
+    ends: bool = True,
+) -> None:
+    """Draw the distribution of each of some samples (n,) in bins between edges, in per cent; `lines` say how.
+
+    The outermost bins hold everything beyond them; the axis says so where `ends`.
+    """
+    low, high = float(edges[0]), float(edges[-1])
+    for name, values in samples.items():
+        share = np.histogram(np.clip(values, low, np.nextafter(high, low)), edges)[0] * (100 / len(values))
+        mark(axes.stairs(share, edges, **lines[name]), name)
+    if ends:
+        axes.set_xlim(low, high)
+        reach = 0.12 * (high - low)
+        inner = [t for t in axes.get_xticks() if low + reach < t < high - reach]
+        names = [f"≤ {low:.0f}", *(f"{t:g}" for t in inner), f"≥ {high:.0f}"]
+        axes.set_xticks([low, *inner, high], [name.replace("-", "−") for name in names])
 
 
 def mark(artist: Any, text: str) -> None:

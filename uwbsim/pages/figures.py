@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 
 from uwblink.arrays import Floats
 from uwblink.pages.colours import BLUE, GRID, INK, MUTED, PALE, SERIES, VERMILION, look
-from uwblink.pages.figures import NARROW_IN, label, legend, mark, sheet
+from uwblink.pages.figures import NARROW_IN, label, legend, mark, outlines, sheet
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import TICK_S
@@ -52,14 +52,9 @@ def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
     best = min((np.quantile(e, (0.005, 0.995)) for e in samples.values()), key=np.ptp)
     margin = 0.25 * np.ptp(best) + 1e-4
     edges = 100 * np.linspace(best[0] - margin, best[1] + margin, 81)
-    for k, (name, errors) in enumerate(samples.items()):
-        inside = np.clip(100 * errors, edges[0] + 1e-9, edges[-1] - 1e-9)
-        share = 100 * np.histogram(inside, edges)[0] / len(inside)
-        mark(axes.stairs(share, edges, lw=1.2, color=look(k).colour, ls=look(k).dashes, label=name), name)
-    ticks = [t for t in axes.get_xticks() if edges[8] < t < edges[-9]]
-    names = [f"≤ {edges[0]:.0f}", *(f"{t:.0f}" for t in ticks), f"≥ {edges[-1]:.0f}"]
-    axes.set_xticks([edges[0], *ticks, edges[-1]], [text.replace("-", "−") for text in names])
-    axes.set_xlim(edges[0], edges[-1])
+    looks = {name: look(k) for k, name in enumerate(samples)}
+    lines = {name: {"lw": 1.2, "color": own.colour, "ls": own.dashes, "label": name} for name, own in looks.items()}
+    outlines(axes, {name: 100 * errors for name, errors in samples.items()}, edges, lines)
     label(axes, "range error (cm)", "ranges (%)")
     legend(figure)
     return figure
@@ -94,7 +89,7 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
                 break
         _plain_ticks(left.yaxis, kept)
     if spreads.max() > 10 * spreads.min():
-        right.set_ylabel("standard deviation (cm), log axis")
+        right.set_ylabel("std (cm), log axis")
         right.set_yscale("log")
         ticks = [m * 10.0**k for k in range(-2, 6) for m in (1, 2, 5)]
         ticks = [t for t in ticks if 0.8 * spreads.min() <= t <= 1.25 * spreads.max()]
@@ -398,12 +393,12 @@ def _heat_maps(width_in: float, swept: Swept, grid: list[Floats], name: str) -> 
 def marginals(width_in: float, found: Sequence[Compared]) -> Figure:
     """Draw the distributions of both sides, one panel a quantity; the outermost bins hold what lies beyond them."""
     figure, panels = sheet(width_in, len(found), height_in=1.7, across=1 if width_in < NARROW_IN else 3)
+    colours = {"measured": BLUE, "simulated": VERMILION}
     for axes, one in zip(panels, found, strict=True):
         low, high = np.quantile(np.concatenate([one.measured, one.simulated]), [0.005, 0.995])
         edges = np.linspace(low, high if high > low else low + 1, 41)
-        for values, colour, name in ((one.measured, BLUE, "measured"), (one.simulated, VERMILION, "simulated")):
-            share = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0] / len(values)
-            mark(axes.stairs(share, edges, color=colour, label=name, linewidth=1.2), name)
+        lines = {name: {"lw": 1.2, "color": colour, "label": name} for name, colour in colours.items()}
+        outlines(axes, {"measured": one.measured, "simulated": one.simulated}, edges, lines, ends=False)
         axes.set_title(one.name, loc="left")
         axes.set_xlabel(one.unit)
         axes.set_yticks([])

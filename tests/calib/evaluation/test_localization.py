@@ -78,16 +78,18 @@ def test_a_body_that_ranges_only_where_its_place_is_unknown_is_left_out(flights)
 
 def test_a_filter_that_trusts_its_ranges_too_much_is_found_out(flights):
     flight, calibration = clean(flights["test1"])
-    sure = replace(calibration, sigma_curve=flat(0.05))
-    found = summarize(localize(flight, sure, Settings(gate=1e9, seeds=1)))
+    found = summarize(localize(flight, replace(calibration, sigma_curve=flat(0.05)), Settings(gate=1e9, seeds=1)))
     assert found.nis > found.nis_bounds[1]
     assert found.nees > found.nees_bounds[1]
 
 
-def test_a_filter_that_takes_no_range_has_no_summary(flights):
+def test_what_cannot_be_localized_or_summed_up(flights):
     flight, calibration = clean(flights["test1"])
-    with pytest.raises(UnanswerableError, match="no range agrees with the track"):
+    with pytest.raises(UnanswerableError, match="ifo001"):
         summarize(localize(flight, calibration, Settings(gate=1e-12, seeds=1)))
+    still = replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * 0))
+    with pytest.raises(UnanswerableError, match=r"test1\.uwb"):
+        localize(still, calibration)
 
 
 def test_a_calibration_is_worth_at_least_a_third_of_the_error(flights):
@@ -192,17 +194,11 @@ def test_wrong_ranges_do_not_lock_the_filter_out(flights, far_m):
         assert np.median(wrong) < 0.15
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"velocity_std_mps": 0.0}, "`velocity_std_mps`: found 0.0, expected a number above 0"),
-        ({"gate": float("nan")}, "`gate`: found nan"),
-        ({"seeds": 0}, "`seeds`: found 0, expected 1 to 1000"),
-    ],
-)
-def test_settings_that_no_filter_can_run_with(settings, said):
-    with pytest.raises(BadInputError, match=said):
-        Settings(**settings)
+@pytest.mark.parametrize(("name", "value"), [("velocity_std_mps", 0.0), ("gate", float("nan")), ("seeds", 0)])
+def test_settings_that_no_filter_can_run_with(name, value):
+    with pytest.raises(BadInputError) as caught:
+        Settings(**{name: value})
+    assert caught.value.parameter == name
 
 
 def test_it_says_what_it_rests_on(flights):
@@ -221,13 +217,6 @@ def test_it_says_what_it_rests_on(flights):
     assert set(document["summary"]["rmse_m"]) == {"raw", "calibrated", "variance"}, "nothing is known of reflections"
 
 
-def test_nothing_that_moves_is_nothing_to_localize(flights):
-    flight, calibration = clean(flights["test1"])
-    still = replace(flight, poses=replace(flight.poses, position_m=flight.poses.position_m * 0))
-    with pytest.raises(UnanswerableError, match="no body moves"):
-        localize(still, calibration)
-
-
 def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_path):
     flight, calibration = clean(flights["test1"])
     found = localize(flight, calibration, Settings(seeds=1))
@@ -243,8 +232,7 @@ def test_trajectories_are_written_in_tum_form_with_their_attitudes(flights, tmp_
     np.testing.assert_allclose(rows[k, 4:], flight.poses.quaternion[mine][near], atol=1e-6)
     write_tum(found, tmp_path)
     assert len(list(tmp_path.glob("*.tum"))) == 3 * 4
-    truth = next(tmp_path.glob("*robot*truth.tum"), None) or next(tmp_path.glob("*truth.tum"))
-    assert truth.read_text().splitlines()[0].startswith("# time")
+    assert next(tmp_path.glob("*truth.tum")).read_text().startswith("# time")
 
 
 def test_recordings_of_one_name_keep_their_own_trajectories(tmp_path):

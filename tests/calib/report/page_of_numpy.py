@@ -5,7 +5,8 @@ It follows docs/theory.md and the reference of a calibration's keys, and is here
 
 import csv
 import json
-from html.parser import HTMLParser
+import re
+from html import unescape
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -16,30 +17,14 @@ LIGHT, TICK_S = 299_702_547.0, 1 / (128 * 499.2e6)
 STAGES = ("raw", "delays", "full")
 
 
-class Tables(HTMLParser):
-    """Tables of a page: rows of the texts of their cells, without the heads above."""
+class Tables:
+    """Tables of a page: rows of the texts of their cells."""
 
     def __init__(self, page):
-        super().__init__()
-        self.tables, self._cell = [], None
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-        elif tag in ("td", "th"):
-            self._cell = ""
-
-    def handle_data(self, data):
-        if self._cell is not None:
-            self._cell += data
-
-    def handle_endtag(self, tag):
-        if tag in ("td", "th") and self._cell is not None:
-            self.tables[-1][-1].append(self._cell.strip())
-            self._cell = None
+        self.tables = []
+        for table in re.findall("<table.*?</table>", page, re.DOTALL):
+            rows = [re.findall("<t[dh][^>]*>(.*?)</t[dh]>", row) for row in table.split("<tr")[1:]]
+            self.tables.append([[unescape(cell).strip() for cell in row] for row in rows])
 
     def having(self, *cells):
         """Return the one table in whose rows all of some cells stand."""

@@ -1,11 +1,11 @@
 """The report: one file that needs nothing else, and shows what it must."""
 
 import hashlib
+import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ from pypdf import PdfReader
 
 from calib.cli.judging import spread_tests
 from calib.estimation.fitting import fit
-from calib.report.sections import render
+from calib.report.writing import render
 from tests import processes
-from tests.browser import lies_well
+from tests.browser import chromium, lies_well
 from tests.calib.report import page_of_numpy
 from tests.calib.synthetic import DELAYS_NS, ranges
 
@@ -28,14 +28,9 @@ def page():
     return render([r], fit(r).calibration)
 
 
-def test_it_is_self_contained(page):
-    assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
-    assert "@import" not in page
-    assert not re.findall(r"url\((?!#)", page)
+def test_it_needs_no_other_file_and_escapes_text_from_files(page):
+    assert not re.findall(r"(?:src|href)=['\"](?!data:|#)|@import|url\((?!#)", page)
     assert not re.findall(r"\b(?:fetch|XMLHttpRequest|WebSocket|import)\b\(", page)
-
-
-def test_text_from_files_is_escaped(page):
     assert page.count("<script") == 1, "the page's own, and none from a file"
     assert "&lt;script&gt;" in page
 
@@ -74,20 +69,8 @@ def campaign(tmp_path_factory):
         settings = [f"run.seed={seed}", "run.duration_s=15", "tags.0.passive=true"]
         options = [word for setting in settings for word in ("--set", setting)]
         run("uwbsim", "run", ROOT / "scenarios/icra2023/train.toml", "-o", f"{name}.uwb", *options, cwd=folder)
-    words = [
-        "report",
-        "train.uwb",
-        "--tests",
-        "test.uwb",
-        "-o",
-        "r.html",
-        "--pdf",
-        "r.pdf",
-        "--figures",
-        "figures",
-        "--json",
-    ]
-    (folder / "r.json").write_text(run("calib", *words, cwd=folder).stdout)
+    words = "report train.uwb --tests test.uwb -o r.html --pdf r.pdf --figures figures --json"
+    (folder / "r.json").write_text(run("calib", *words.split(), cwd=folder).stdout)
     return folder
 
 
@@ -127,27 +110,11 @@ def sizes_of_drawing(text):
     return {float(size) for size in re.findall(r"font(?:-size)?: ([0-9.]+)px", text)}
 
 
-def test_the_pdf_has_numbered_pages_and_figures_that_are_drawings(campaign):
-    pages = PdfReader(campaign / "r.pdf").pages
-    assert 5 <= len(pages) <= 20
-    texts = [page.extract_text() for page in pages]
-    for number, text in enumerate(texts, 1):
-        assert f"{number} / {len(pages)}" in text
-    whole = "\n".join(texts)
-    assert "lifted power" in whole, "the words inside a figure are words"
-    figures = re.findall(r"Figure (\d+)\.", whole)
-    assert [int(number) for number in figures] == list(range(1, len(figures) + 1))
-    begin = dict(re.findall(r"^(Localization|Over time|Provenance)\s*(\d+)$", texts[0], re.MULTILINE))
-    if begin:
-        for name, number in begin.items():
-            assert name in texts[int(number) - 1]
-
-
 def fonts_of(resources, seen):
-    """Yield kind and base font of every font below some resources, forms included."""
+    """Yield the kind of every font below some resources, forms included."""
     for font in (resources.get("/Font") or {}).values():
         for one in [font.get_object(), *(d.get_object() for d in font.get_object().get("/DescendantFonts", []))]:
-            yield one["/Subtype"], one.get("/BaseFont")
+            yield one["/Subtype"]
     for form in (resources.get("/XObject") or {}).values():
         form = form.get_object()
         if form["/Subtype"] == "/Form" and id(form) not in seen and "/Resources" in form:
@@ -155,27 +122,35 @@ def fonts_of(resources, seen):
             yield from fonts_of(form["/Resources"].get_object(), seen)
 
 
-def test_fonts_of_the_pdf_are_outlines_that_printers_take(campaign):
-    kinds = {kind for page in PdfReader(campaign / "r.pdf").pages for kind, _ in fonts_of(page["/Resources"], set())}
-    assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}, "type 42; type 3 is refused by publishers"
+def test_the_pdf_has_numbered_pages_links_and_figures_that_are_drawings(campaign):
+    reader = PdfReader(campaign / "r.pdf")
+    assert 5 <= len(reader.pages) <= 20
+    texts, sizes, kinds = [], set(), set()
 
+    def seen(text, cm, tm, font, size):
+        if text.strip():
+            sizes.add(round(size * abs(tm[3] or tm[1]) * abs(cm[3] or cm[1]), 2))
 
-def test_no_text_of_the_pdf_is_smaller_than_8_pt(campaign):
-    found: set[float] = set()
-    for page in PdfReader(campaign / "r.pdf").pages:
-
-        def seen(text, cm, tm, font, size, found=found):
-            if text.strip():
-                found.add(round(size * abs(tm[3] or tm[1]) * abs(cm[3] or cm[1]), 2))
-
-        page.extract_text(visitor_text=seen)
-    assert found
-    assert min(found) >= 7.99
+    for number, page in enumerate(reader.pages, 1):
+        texts.append(page.extract_text(visitor_text=seen))
+        kinds |= set(fonts_of(page["/Resources"], set()))
+        assert f"{number} / {len(reader.pages)}" in texts[-1]
+    assert min(sizes) >= 7.99, "no text is smaller than 8 pt"
+    # Outlines that printers take: type 42; type 3 is refused by publishers.
+    assert kinds <= {"/Type0", "/CIDFontType2", "/TrueType"}
+    whole = "\n".join(texts)
+    assert "lifted power" in whole, "the words inside a figure are words"
+    figures = re.findall(r"Figure (\d+)\.", whole)
+    assert [int(number) for number in figures] == list(range(1, len(figures) + 1))
+    outline: list[Any] = reader.outline
+    begin = {item["/Title"]: reader.get_destination_page_number(item) for item in outline}
+    assert {"Localization", "Over time", "Provenance"} <= set(begin)
+    assert all(name in texts[place] for name, place in begin.items())
+    links: Any = reader.pages[0]["/Annots"]
+    assert len(links) == len(begin)
 
 
 def test_the_json_tells_what_the_page_tells(campaign):
-    import json
-
     document = json.loads((campaign / "r.json").read_text())
     assert {"calibration", "warnings", "evaluation", "heard", "findings", "localization"} == set(document)
     assert document["evaluation"]["overall"]["full"]["n"] == 2400
@@ -184,16 +159,9 @@ def test_the_json_tells_what_the_page_tells(campaign):
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_a_browser_shows_it(campaign, tmp_path, width):
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if not chromium:
-        pytest.skip("no Chromium is installed to render the page with")
     picture = tmp_path / "page.png"
-    flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --hide-scrollbars"
-    subprocess.run(
-        [chromium, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},2400",
-         f"--screenshot={picture}", (campaign / "r.html").as_uri()],
-        check=True, capture_output=True, timeout=60,
-    )  # fmt: skip
+    words = (f"--window-size={width},2400", f"--screenshot={picture}", (campaign / "r.html").as_uri())
+    chromium(*words, profile=tmp_path / "profile")
     lies_well((campaign / "r.html").read_text(), width, tmp_path)
     pixels = imread(picture)
     assert pixels.shape[:2] == (2400, width)

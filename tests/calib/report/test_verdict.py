@@ -12,8 +12,9 @@ from calib.doctor.base import Finding
 from calib.estimation.fitting import fit
 from calib.report import Heading, Picture, Table, Text, write_survey_report
 from calib.report.results import Results
-from calib.report.sections import SECTIONS, render
+from calib.report.sections import SECTIONS
 from calib.report.verdict import criteria, verdict
+from calib.report.writing import render
 from tests.calib.synthetic import ranges
 from uwblink.errors import UwblinkError
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -56,7 +57,7 @@ def test_without_a_test_and_with_warnings_there_are_reservations(known, unseen):
     assert text.kind == "doubt"
     assert met["Was it judged on recordings that the fit has not seen?"] == "! in part"
     clock = Finding(fault="clock", evidence="it jumps", remedy="leave it out", p_value=0.0)
-    text, met = told(known, unseen, warnings=["only 3 s of data"], findings=[("a.uwb", clock)])
+    text, met = told(changed(known, warnings=["only 3 s of data"]), unseen, findings=[("a.uwb", clock)])
     assert text.kind == "doubt"
     assert "2 warnings, below" in text.text
     assert [question for question, how in met.items() if how != "✓ yes"] == ["Is there nothing to warn of?"]

@@ -1,0 +1,236 @@
+"""The sections of a report on errors: over power, before and after, what they are made of, in positions, over time."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from calib import figures
+from calib.calibration.model import curve_rows
+from calib.error_mixture import fit_error_mixtures
+from calib.evaluation.localization import PAPER_RMSE_M, Localization, summarize
+from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows
+from calib.evaluation.tracking import Settings
+from calib.report.figures import FILTER_NAMES, rmse_bars, track
+from calib.report.results import Results
+from uwblink.pages.blocks import Block, Heading, Picture, Table, Text
+
+
+def curves(results: Results) -> list[Block]:
+    """Return the curves over power: with bands and data, or without any recording as a table."""
+    calibration = results.calibration
+    if not results.recordings:
+        power, *curves = curve_rows(calibration)
+        return [Heading("Bias and spread over power"), Table(list(power), [list(row) for row in curves])]
+    if calibration.loss == "l2":
+        follows = "The curve follows the mean of the errors, as least squares do; points are means, bin by bin."
+    else:
+        follows = (
+            "The curve follows the core of the errors: noise, without reflections, which can only lengthen a range. "
+            "Points are the centre of that core (below: its spread), told from the tail bin by bin, without the curve. "
+            "Medians are drawn, too, and lie above: with a share s of reflected ranges about the quantile "
+            "0.5 / (1 − s) of the core."
+        )
+    mean_of_lifted = "the mean over both ends." if calibration.lift == "mean-of-lifted" else ""
+    lifted = (
+        "Lifted power is the first-path power p on a scale that stretches where ranges are good and the bias "
+        f"changes: ψ = 10^((p − α) / 10 dB) with α = {calibration.alpha_dbm:g} dBm, so ψ = 1 at α and a tenth of "
+        f"it 10 dB lower; of an exchange, {mean_of_lifted or 'that of the mean power of both ends.'} Powers in dBm "
+        "stand above the figures."
+    )
+    known = (results.trained, calibration.apply(results.trained), calibration)
+    # Binned once for both widths.
+    bias, sigma = (cache(partial(figures.over_power, *known, which)) for which in ("bias", "sigma"))
+    return [
+        Heading("Bias and standard deviation over power"),
+        Text(follows, "note"),
+        Text(lifted, "note"),
+        Picture(
+            "bias",
+            lambda width: figures.alone(partial(figures.bias_over_power, *known, found=bias()), width),
+            "Bias over power: what the delay-corrected errors centre on, and the curve with its 95 % band.",
+        ),
+        Picture(
+            "sigma",
+            lambda width: figures.alone(partial(figures.sigma_over_power, *known, found=sigma()), width),
+            "Standard deviation over power: that of the calibrated errors' noise, and the curve with its 95 % band.",
+        ),
+    ]
+
+
+def before_after(results: Results) -> list[Block]:
+    """Return errors by pair and stage, how well sigma covers them, and their figures."""
+    if not results.recordings:
+        return []
+    evaluation, overall = results.evaluation, results.evaluation.overall
+    groups = [*evaluation.pairs.items(), ("all", overall)]
+    header = ["pair", "n", *["mean", "std", "robust"] * len(CORRECTION_STAGES), "95 % |e|", "noise", "in 95 %", "new p"]
+    above = [("", 2), *[(stage, 3) for stage in CORRECTION_STAGES], ("full", 3), ("", 1)]
+    levels = list(overall.coverage)
+    covered = [[name, *(f"{100 * group.coverage[level]:.0f} %" for level in levels)] for name, group in groups]
+    low, high = 100 * overall.full.low_m, 100 * overall.full.high_m
+    known: dict[str, Any] = {"ranges": results.judged, "applied": results.corrected}
+    return [
+        Heading("Before and after"),
+        Table(header, [[name, *_error_cells(group)] for name, group in groups], above, total=True),
+        Text(
+            "Errors in cm. Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
+            f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Noise: share of corrected "
+            "ranges that their own sigma explains at 95 %, 95 % without reflections; the rest are mostly reflected. In "
+            "95 %: share within the 95 % intervals that reckon with reflections. New p: share at powers the curves "
+            "were not fitted at.",
+            "note",
+        ),
+        Table(["pair", *[f"{level} %" for level in levels]], covered, [("", 1), ("nominal", len(levels))], total=True),
+        Text(
+            "Coverage: how many calibrated errors lie within the bounds that their sigma gives for a normal "
+            "distribution. Reflections take from the high levels.",
+            "note",
+        ),
+        Picture(
+            "errors",
+            partial(figures.distribution, **known),
+            "Range errors: how many of which size and sign (the outermost bins hold everything beyond them), and how "
+            "many are smaller than so much.",
+        ),
+        Picture(
+            "z-scores",
+            partial(figures.z_scores, **known),
+            "Calibrated errors over their sigma: density, and quantiles against those of the standard normal.",
+        ),
+        Picture(
+            "residuals",
+            partial(figures.residuals, **known, alpha_dbm=results.calibration.alpha_dbm),
+            "What is left over distance and over power, reflections included: they lift the medians off zero, the more "
+            "of them the higher; a slope or a wave would be a bias that is left. A hundredth of the points is beyond.",
+        ),
+    ]
+
+
+def _error_cells(group: ErrorStatistics) -> list[str]:
+    cells = [str(group.raw.n)]
+    for stage in CORRECTION_STAGES:
+        stats = getattr(group, stage)
+        cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.std_m, stats.robust_std_m)]
+    shares = ["–" if v != v else f"{100 * v:.1f} %" for v in (1 - group.rejected, group.inside_95, group.clamped)]
+    return [*cells, f"{100 * group.full.abs95_m:.1f}", *shares]
+
+
+def outliers(results: Results) -> list[Block]:
+    """Say what the calibrated errors are made of, by pair."""
+    if not results.recordings:
+        return []
+    ranges, applied, rows = results.judged, results.corrected, []
+    error = applied.corrected_m - ranges.truth_m
+    z = error / applied.sigma_m
+    groups = {**pair_rows(ranges), "all": np.ones(len(ranges), dtype=bool)}
+    told = {name: mine for name, mine in groups.items() if np.count_nonzero(mine) >= figures.FEWEST_IN_BIN}
+    mixtures = fit_error_mixtures([error[mine] for mine in told.values()])
+    for (name, mine), mixture in zip(told.items(), mixtures, strict=True):
+        rows.append(
+            [
+                name,
+                f"{100 * np.mean(z[mine] > 3):.1f} %",
+                f"{100 * np.mean(z[mine] < -3):.1f} %",
+                f"{100 * mixture.sigma_m[0]:.1f}",
+                f"{100 * mixture.tail_share:.1f} %",
+                f"{100 * mixture.tail_mean_m:.0f}",
+                f"{100 * mixture.outlier_share:.2f} %",
+            ]
+        )
+    return [
+        Heading("Outliers"),
+        Table(["pair", "too long", "too short", "core (cm)", "tail", "its mean (cm)", "outliers"], rows, total=True),
+        Text(
+            "Too long and too short: share of ranges beyond three sigmas. Core, tail and outliers: a Gaussian, an "
+            "exponential detour on the long side, and what fits neither, by maximum likelihood.",
+            "note",
+        ),
+    ]
+
+
+def localization(results: Results) -> list[Block]:
+    """Return the RMSE by body and filter beside the paper's own, and figures."""
+    found, drawn = results.tracks, 12
+    if not found:
+        return []
+    total = summarize(found)
+    names = list(total.rmse_m)
+    rows = [[f"{one.source} {one.body}", *(f"{one.rmse_m[name].mean():.3f}" for name in names)] for one in found]
+    rows.append(["mean", *(f"{total.rmse_m[name]:.3f}" for name in names)])
+    rows.append(["its spread over seeds", *(f"{total.spread_m[name]:.3f}" for name in names)])
+    rows.append(["against raw", "", *(f"{-100 * less:+.0f} %" for less in total.reduction.values())])
+    paper = [f"{PAPER_RMSE_M[name]:.3f}" if name in PAPER_RMSE_M else "" for name in names]
+    rows.append(["ICRA 2023, its own flights", *paper])
+    (nis_low, nis_high), (nees_low, nees_high) = total.nis_bounds, total.nees_bounds
+    if total.nis > nis_high or total.nees > nees_high:
+        meaning = (
+            "Above their bounds: the filter is surer than it should be, as with reflections, which sigma leaves out."
+        )
+    elif total.nis < nis_low or total.nees < nees_low:
+        meaning = "Below their bounds: the filter is less sure than it could be, as where a gate refuses the tail."
+    else:
+        meaning = "Both lie within: the filter knows how good it is."
+    heads = [FILTER_NAMES[name].removeprefix("calibrated, ") for name in names]
+    blocks: list[Block] = [
+        Heading("Localization"),
+        Table(["body", *heads], rows, [("", 1), ("RMSE (m)", len(names))]),
+        Text(_filters(found), "note"),
+        Text(
+            f"With the calibrated variance the mean NIS is {total.nis:.2f} (1 expected, 95 % bounds {nis_low:.2f} to "
+            f"{nis_high:.2f}, {100 * total.nis_inside:.0f} % of the values within their own), the mean NEES "
+            f"{total.nees:.2f} (3 expected, {nees_low:.2f} to {nees_high:.2f}, {100 * total.nees_inside:.0f} %); "
+            f"{100 * total.accepted:.1f} % of the ranges pass the gate. {meaning}",
+            "note",
+        ),
+        Picture("rmse", partial(rmse_bars, found=found), "RMSE of the position of each body, and the mean."),
+    ]
+    for one in found[:drawn]:
+        caption = (
+            f"{one.source}, {one.body}: path from above, height, and position error over time, with three sigmas of "
+            "the filter with variance."
+        )
+        blocks.append(Picture(track_name(one.source, one.body), partial(track, one=one), caption))
+    if len(found) > drawn:
+        blocks.append(Text(f"The first {drawn} of {len(found)} tracks are drawn; the table has all.", "note"))
+    return blocks
+
+
+def _filters(found: list[Localization]) -> str:
+    """Say how the filters were set up, and how far the paper's own figures may be compared."""
+    chosen, fixed = Settings(), found[0].fixed
+    own = "these flights are simulated" if all(one.simulated for one in found) else "these are other flights"
+    paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())
+    return (
+        "One body at a time is tracked by an EKF from its ranges to the others, whose positions are known; velocity "
+        f"and attitude are inputs from the poses, velocity with white noise of {chosen.velocity_std_mps:g} m/s an axis "
+        f"at {chosen.velocity_rate_hz:g} Hz, as a small drone's optical flow has it. How much a calibration gains "
+        "depends on that choice: the better velocity is known, the less ranges decide. Fixed standard deviations, "
+        f"{fixed.source}: raw {100 * fixed.std_m['raw']:.0f} cm, calibrated {100 * fixed.std_m['calibrated']:.0f} cm. "
+        f"ICRA 2023 has {paper} m (raw, calibrated, with variance) for real flights of its own and another filter's "
+        f"noise; {own}, so metres do not compare, and percentages only as far as the filters' noise is alike."
+    )
+
+
+def track_name(source: str, body: str) -> str:
+    """Return what the figure of a body in a recording is called."""
+    return "track-" + "".join(c if c.isalnum() else "-" for c in f"{source.removesuffix('.uwb')}-{body}")
+
+
+def over_time(results: Results) -> list[Block]:
+    """Return a figure a recording of the calibrated errors over time."""
+    blocks: list[Block] = [Heading("Over time")] if results.recordings else []
+    for k, recording in enumerate(results.recordings):
+        pairs, most = len(pair_rows(recording)), figures.MOST_PAIRS
+        left_out = (
+            f" Of {pairs} pairs the {most} whose errors spread most; others are left out." if pairs > most else ""
+        )
+        caption = (
+            f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
+            f"{left_out}"
+        )
+        draw = partial(figures.over_time, ranges=recording, applied=results.calibration.apply(recording))
+        blocks.append(Picture(f"over-time-{k + 1}", draw, caption))
+    return blocks
