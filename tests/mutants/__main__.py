@@ -44,7 +44,7 @@ class Room(NamedTuple):
 ROOMS: Final = {
     "wire": Room(("uwblink/wire/codec.py", "uwblink/wire/fields.py", "uwblink/wire/bulk.py"), ("tests/uwblink/wire",)),
     "twr": Room(
-        ("uwblink/ticks.py", "uwblink/twr.py", "uwblink/protocols/formulas.py"),
+        ("uwblink/ticks.py", "uwblink/twr.py", "uwblink/protocols/rows.py"),
         (
             "tests/uwblink/test_twr.py",
             "tests/uwblink/test_from_arrays.py",
