@@ -14,7 +14,7 @@ import uwbsim
 from calib.errors import BadInputError
 from tests import processes
 from uwblink.errors import PlanError
-from uwblink.importers.motion_capture import add_poses
+from uwblink.importers import add_poses
 from uwblink.recording import load_antenna_delays
 from uwbsim.scenario import with_antenna_delays
 

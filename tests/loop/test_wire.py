@@ -11,7 +11,7 @@ from tests.boards import served
 from uwblink.boards.listeners import Progress
 from uwblink.boards.ranging_plan import RangingPlan
 from uwblink.boards.record import record
-from uwblink.importers.motion_capture import add_poses
+from uwblink.importers import add_poses
 from uwblink.recording.file import Recording
 from uwblink.recording.tags import load_places
 from uwbsim.scenario.loading import load

@@ -17,7 +17,7 @@ from uwblink.importers.bags import BAG_SUFFIXES, open_exchange_bag
 from uwblink.importers.exchange_tables import TABLE_SUFFIXES, open_tables
 from uwblink.importers.exported import read_exported
 from uwblink.importers.miluv import read_miluv
-from uwblink.importers.motion_capture import add_poses
+from uwblink.importers.poses import add_poses
 from uwblink.importers.staging import Watch
 from uwblink.output import check_output
 from uwblink.plugins import NAME, Registry

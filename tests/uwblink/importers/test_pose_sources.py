@@ -5,7 +5,7 @@ import pytest
 
 from uwblink.errors import ImportTableError, PlanError
 from uwblink.exporters import export_recording
-from uwblink.importers.motion_capture import add_poses
+from uwblink.importers import add_poses
 from uwblink.importers.poses import body_of, read_poses
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import Poses, Tag

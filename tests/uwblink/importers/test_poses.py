@@ -9,7 +9,7 @@ import pytest
 
 from tests import processes
 from uwblink.errors import ImportTableError
-from uwblink.importers.motion_capture import add_poses
+from uwblink.importers import add_poses
 from uwblink.importers.poses import read_poses
 from uwblink.importers.tables import Table
 from uwblink.recording.contents import Contents
