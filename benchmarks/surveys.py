@@ -23,9 +23,7 @@ import numpy as np
 
 import calib
 from benchmarks.standing import DIMENSIONS, Standing, power_dbm, standing_boards
-from calib.planning.candidates import Layout
-from calib.planning.having import having
-from calib.planning.promise import promises
+from calib.planning.predicted import Layout, SurveyInputs, predict
 from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
@@ -115,9 +113,9 @@ def promised(world: Standing, dimensions: int, curve_m: float, reflected: float)
     is planted, its size is known and that it bends over 4 dB, and no more.
     """
     if not curve_m:
-        shape = next(name for name, size in DIMENSIONS.items() if size == dimensions)
-        given = having(len(world.delays_ns), shape, None, 0, 0.005, (), 0.01, PAIR_M, 1, reflected)
-        return promises(given, [Layout(place, dimensions) for place in world.places])[-1].each
+        shape = {1: "line", 2: "plane", 3: ""}[dimensions]
+        inputs = SurveyInputs(tags=tuple(world.delays_ns), on=shape, pair_error_m=PAIR_M, reflected=reflected)
+        return predict(inputs, [Layout(place, dimensions) for place in world.places])[-1].each
     boards = len(world.places[0])
     pairs = np.array(list(combinations(range(boards), 2)))
     lines, powers = [], []

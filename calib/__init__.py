@@ -27,18 +27,18 @@ if TYPE_CHECKING:
     from calib.evaluation.localization import localize
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
-    from calib.planning.arranging import plan
     from calib.planning.flight_result import FlightPlan
     from calib.planning.flights import plan_flight
     from calib.planning.result import Plan
+    from calib.planning.surveys import plan
     from calib.report.campaign import run_campaign
     from calib.report.sections import register_report_section
     from calib.report.writing import write_report
     from calib.settings import FitSettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
-    from calib.surveys.samples import sample_arrangements
-    from calib.surveys.surveying import survey
+    from calib.surveys.sample import sample_arrangements
+    from calib.surveys.survey import survey
     from calib.trajectories.fitting import fit_from_ranges
 
 __all__ = [
@@ -106,14 +106,14 @@ _HOMES: Final = {
     "load_ranges": "calib.data.sources",
     "localize": "calib.evaluation.localization",
     "localize_onboard": "calib.evaluation.onboard",
-    "plan": "calib.planning.arranging",
+    "plan": "calib.planning.surveys",
     "plan_flight": "calib.planning.flights",
     "register_loss": "calib.estimation.losses",
     "register_report_section": "calib.report.sections",
     "run_campaign": "calib.report.campaign",
-    "sample_arrangements": "calib.surveys.samples",
+    "sample_arrangements": "calib.surveys.sample",
     "sample_flight": "calib.data.samples",
-    "survey": "calib.surveys.surveying",
+    "survey": "calib.surveys.survey",
     "write_report": "calib.report.writing",
 }
 

@@ -26,7 +26,7 @@ CONFINED = {
         in {
             "calib/estimation/fitting.py",
             "calib/planning/flights.py",
-            "calib/surveys/surveying.py",
+            "calib/surveys/survey.py",
             "calib/trajectories/fitting.py",
             "uwbsim/twins/fitting.py",
         }

@@ -10,11 +10,11 @@ import numpy as np
 from calib.data.sources import Data
 from calib.doctor.checks import Seen
 from calib.errors import UnanswerableError
-from calib.surveys.gathering import gather
 from calib.surveys.knowledge import Knowledge
-from calib.surveys.power import NARROWEST_DB, in_dbm
+from calib.surveys.network import NARROWEST_DB, in_dbm
+from calib.surveys.recordings import read_surveys
 from calib.surveys.result import Contradiction, SurveyResult
-from calib.surveys.surveying import survey
+from calib.surveys.survey import survey
 
 FAULTS: Final = {
     "moved": "board moved within an arrangement",
@@ -48,7 +48,7 @@ def surveyed(recordings: list[Data]) -> Iterator[Seen]:
     try:
         found = survey(recordings, regardless=True)
     except UnanswerableError as error:
-        yield from _contradicted(gather(recordings, Knowledge()).findings)
+        yield from _contradicted(read_surveys(recordings, Knowledge()).findings)
         yield Seen("survey determines nothing", str(error))
         return
     yield from _contradicted(found.contradictions)
@@ -82,7 +82,7 @@ def _weak(found: SurveyResult) -> Iterator[Seen]:
 
 def _powers(recordings: list[Data]) -> Iterator[Seen]:
     try:
-        lifted = gather(recordings, Knowledge()).means.lifted
+        lifted = read_surveys(recordings, Knowledge()).means.lifted
     except UnanswerableError:
         return
     if np.isfinite(lifted).all() and (lifted > 0).all() and np.ptp(in_dbm(lifted)) < NARROWEST_DB:

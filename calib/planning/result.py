@@ -22,6 +22,14 @@ class PlannedArrangement:
         """Return the tags in the order in which they lie along x."""
         return tuple(sorted(self.place_m, key=lambda tag: self.place_m[tag]))
 
+    def where(self, on: str) -> str:
+        """Return in words where boards stand on a "line", a "plane", or in a room ("")."""
+        if on == "line":
+            return "in the order " + " ".join(map(str, self.order()))
+        axes = 2 if on == "plane" else 3
+        spots = (f"{tag} at ({', '.join(f'{v:.1f}' for v in p[:axes])})" for tag, p in self.place_m.items())
+        return f"with {', '.join(spots)}"
+
 
 @dataclass(frozen=True, slots=True)
 class NextBest:

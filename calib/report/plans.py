@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 from calib.planning.flight_result import FlightPlan
-from calib.planning.procedure import where
 from calib.planning.result import Plan
 from calib.report.figures import arrangement, flight, more, planned_delays
 from calib.report.writing import check_places
@@ -47,7 +46,7 @@ def _of_boards(plan: Plan) -> Iterator[Block]:
     for k, one in enumerate(plan.arrangements):
         yield Heading(f"Step {k + 1}: arrangement {one.name}")
         tapes = "".join(f" Tape the distance of {i} and {j}, antenna to antenna." for i, j in one.taped)
-        places = f"Boards {where(plan.on, one)}".replace("Boards with", "Board")
+        places = f"Boards {one.where(plan.on)}".replace("Boards with", "Board")
         yield Text(f"{places}.{tapes} Record all pairs for {plan.seconds_each:.0f} s.")
         yield Picture(
             f"arrangement-{one.name}",

@@ -24,7 +24,7 @@ from calib.report import error_sections
 from calib.report.results import Results
 from calib.report.verdict import left_open, verdict
 from calib.spread import TWO_SIDED_95
-from calib.surveys.surveyed import SurveyedArrangement
+from calib.surveys.result import SurveyedArrangement
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 
 Section = Callable[[Results], list[Block]]

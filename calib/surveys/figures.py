@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from calib.surveys.surveyed import SurveyedArrangement
+from calib.surveys.result import SurveyedArrangement
 from uwblink.arrays import Floats
 
 ACROSS: Final = 3

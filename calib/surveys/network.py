@@ -1,273 +1,299 @@
-"""Boards that stand still as a network of distances: unknowns in columns, what was measured in rows, and derivatives.
+"""Boards that stand still as a network of distances: unknown places, delays and curve, and rows of what was measured.
 
-A mean of raw ranges of a pair is distance - w_i b_i - w_j b_j + curve(power) + error, with b = c d the delays in metres
-(docs/theory.md). Its error is constant for a pair and an arrangement, so more ranges do not shrink it: it has a
-variance of its own, which is estimated (`calib.surveys.adjustment`).
+A mean of raw ranges of a pair is distance - w_i d_i - w_j d_j + curve(power) + error, with delays d (docs/theory.md).
+Its error is constant for a pair and an arrangement, so more ranges do not shrink it: it has a variance of its own,
+which is estimated (`calib.surveys.solution`).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 
-from calib.surveys.orders import agrees, along
-from calib.surveys.pair_means import PairMeans
-from calib.surveys.power import PowerModel
+from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis
+from calib.estimator.range_model import DELAY_NS, METRES_A_NS
+from calib.estimator.rows import Terms, normal_terms
+from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
+from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Bools, Floats, Ints
 
-DIMENSIONS: Final = {"line": 1, "plane": 2, "": 3}
-GUESS_M: Final = 0.45
-"""What a delay is without any data, as a standard deviation: 1.5 ns."""
+DIMENSIONS = {"line": 1, "plane": 2, "": 3}
+"""In how many dimensions boards may stand, by what is known of an arrangement."""
 
-FAR_M: Final = 1e3
-DETOUR_M: Final = 0.3
-DETOUR_STD_M: Final = 0.25
-"""How much longer a reflected way is, before any data: two in three detours within these."""
+FAR_M = 30.0
+"""Standard deviation of a coordinate about those that are known, before any data: it holds what no range determines."""
+
+BESIDE_M = 0.5
+"""The same of how far boards stand beside a line, or a plane, that is none."""
+
+DETOUR_M, DETOUR_STD_M = 0.3, 0.25
+"""How much longer a reflected way is, before any data: two in three detours within these of each other."""
+
+BEND_DB = 4.0
+"""Length of the Gaussian process (Matern 5/2 over decibels) that a curve is before any data.
+
+From the three published curves of boards (`icra2023`, `icra2023-july`, `miluv` of `uwbsim`): at 13 powers from -95 to
+-77 dBm, with errors of 5 mm, the likeliest lengths are 4, 6 and 4 dB, the mean standard deviations 0.11, 0.14 and
+0.09 m, each known to a factor of 1.7. The shorter length costs little where a curve is straight; the longer one takes a
+bend for an error of pairs, and what all delays share for what it is not.
+"""
+
+CURVE_SEGMENTS = 12
+"""Enough that splines follow a process of this length over 25 dB; the prior, not their number, makes them smooth."""
+
+NARROWEST_DB = 3.0
+"""Span of powers below which there is no curve to speak of."""
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """An arrangement of boards: its name, in how many dimensions they may stand, and who they are.
+class CurvePrior:
+    """Cubic splines `design` (n, m) at the powers of rows, and the information (m, m) on them for a spread of 1 m."""
 
-    `beside_m` is how far they stand out into the last of these dimensions, as a standard deviation. `order` are tags as
-    they are said to stand along a line, or nothing.
+    knots: Floats
+    design: Floats
+    precision: Floats
+
+    @classmethod
+    def at(cls, lifted: Floats) -> CurvePrior | None:
+        """Return that of a curve at lifted powers (n,); None where powers lack, or hardly vary."""
+        if not len(lifted) or not np.isfinite(lifted).all() or not (lifted > 0).all():
+            return None
+        power = in_dbm(lifted)
+        low, high = float(power.min()), float(power.max())
+        if high - low < NARROWEST_DB:
+            return None
+        inner = 10 ** ((np.linspace(low, high, CURVE_SEGMENTS + 1) - ALPHA_DBM) / 10)
+        knots = np.concatenate([[inner[0]] * DEGREE, inner, [inner[-1]] * DEGREE])
+        dense = np.linspace(low, high, 60)
+        back = np.linalg.pinv(basis(10 ** ((dense - ALPHA_DBM) / 10), knots))
+        # The process, given that it is zero at the reference power.
+        both = np.append(dense, ALPHA_DBM)
+        apart = math.sqrt(5.0) * np.abs(both[:, None] - both) / BEND_DB
+        likeness = (1 + apart + apart**2 / 3) * np.exp(-apart)
+        process = likeness[:-1, :-1] - np.outer(likeness[:-1, -1], likeness[-1, :-1])
+        covariance = back @ process @ back.T
+        precision: Floats = np.asarray(np.linalg.inv(covariance + 1e-4 * np.eye(len(covariance))), dtype=np.float64)
+        return cls(knots, basis(lifted, knots), precision)
+
+
+def in_dbm(lifted: Floats) -> Floats:
+    """Return the powers that lifted ones stand for."""
+    return np.asarray(ALPHA_DBM + 10 * np.log10(lifted))
+
+
+@dataclass(frozen=True, slots=True)
+class Boards:
+    """The boards of an arrangement: its name, in how many dimensions they may stand, and their tags.
+
+    `order` are tags as they are said to stand along a line, or nothing. Where `freed`, the last dimension is how far
+    they stand beside the line or plane that they are said to be on.
     """
 
     name: str
     dimensions: int
     tags: tuple[int, ...]
-    beside_m: float = FAR_M
     order: tuple[int, ...] = ()
-
-    @property
-    def ordered_rows(self) -> list[int]:
-        """The numbers among `tags` of those whose order is said, in that order."""
-        return [self.tags.index(tag) for tag in self.order]
+    freed: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Known:
-    """Distances and coordinates that are known, as columns.
+    """Distances and positions that are known.
 
     `ends` (k, 2) are points (rows of `Network.points`), `distance_m` and `distance_std_m` (k,) go with them and
-    `distance_of` says from which statement each comes; `at` (l,) are points at `position_m` (l, 3), known to
+    `statement` says from which statement each comes; `at` (l,) are points at `position_m` (l, 3), known to
     `position_std_m` (l,).
     """
 
     ends: Ints
     distance_m: Floats
     distance_std_m: Floats
-    distance_of: Ints
+    statement: Ints
     at: Ints
     position_m: Floats
     position_std_m: Floats
 
-    @classmethod
-    def nothing(cls) -> Known:
-        """Return no distance and no position."""
-        none, ids = np.zeros(0), np.zeros(0, dtype=np.int64)
-        return cls(
-            ends=ids.reshape(0, 2), distance_m=none, distance_std_m=none, distance_of=ids, at=ids,
-            position_m=none.reshape(0, 3), position_std_m=none,
-        )  # fmt: skip
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What a network's errors may be: which means are reflected (n,), the spread of pairs and that of the curve, m."""
+
+    marks: Bools
+    pair_m: float
+    curve_m: float
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Rows of lengths that were measured, in a `case` (`Network.linear`)."""
+
+    network: Network
+    case: Case
+
+    def terms(self, x: Floats) -> Iterator[Terms]:
+        """Yield all rows as one block."""
+        left, derivative = self.network.linear(x)
+        left[: len(self.case.marks)] -= DETOUR_M * self.case.marks
+        std = self.network.std_m(self.case)
+        yield replace(normal_terms(left, std, derivative.T, np.arange(len(x))[None]), starts=np.array([0, len(left)]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """Means of pairs, where they belong, and what is known beside them.
+    """Means of pairs, the boards they belong to, and what is known beside them.
 
-    The unknowns are coordinates, then delays in metres, then coefficients of the curve over power. `reflected` (n,) are
-    means that a detour lengthens, by what is known of detours beforehand.
+    The unknowns are three coordinates of each point, delays in ns, and coefficients of the curve over power; known are
+    coordinates beyond an arrangement's dimensions, and delays of `fixed_ns`.
     """
 
     means: PairMeans
-    places: tuple[Place, ...]
+    arrangements: tuple[Boards, ...]
     tags: tuple[int, ...]
     known: Known
-    fixed_m: dict[int, float]
-    power: PowerModel | None
-    reflected: Bools
+    fixed_ns: dict[int, float]
+    curve: CurvePrior | None
 
     @cached_property
     def points(self) -> list[tuple[int, int]]:
         """Arrangement and tag of every point."""
-        return [(k, tag) for k, place in enumerate(self.places) for tag in place.tags]
+        return [(k, tag) for k, boards in enumerate(self.arrangements) for tag in boards.tags]
 
     @cached_property
-    def point_of(self) -> dict[tuple[int, int], int]:
-        """The number of a point by arrangement and tag."""
-        return {point: k for k, point in enumerate(self.points)}
+    def owner(self) -> Ints:
+        """The arrangement of every point (points,)."""
+        return np.array([k for k, _ in self.points])
 
     @cached_property
-    def columns(self) -> Ints:
-        """The column of each coordinate (points, 3), -1 where it is not free."""
-        free = np.array([[axis < self.places[k].dimensions for axis in range(3)] for k, _ in self.points])
-        return np.where(free, np.cumsum(free.ravel()).reshape(free.shape) - 1, -1)
+    def layout(self) -> Layout:
+        """The unknowns; only places and curve where no delay is free."""
+        fixed = np.array([tag in self.fixed_ns for tag in self.tags])
+        delays = np.array([self.fixed_ns.get(tag, 0.0) for tag in self.tags])
+        dimensions = np.array([boards.dimensions for boards in self.arrangements])[self.owner]
+        beyond = np.arange(3) >= dimensions[:, None]
+        size = 0 if self.curve is None else len(self.curve.precision)
+        places = tuple(str(tag) for _, tag in self.points for _ in range(3))
+        centres = np.zeros((len(self.points), 3))
+        for k in range(len(self.arrangements)):
+            known = self.known.position_m[self.owner[self.known.at] == k]
+            centres[self.owner == k] = known.mean(axis=0) if len(known) else 0.0
+        curve = Unknown(kind="curve", names=("",) * size, start=np.zeros(size))
+        return Layout(
+            (
+                Unknown(kind="place", names=places, start=centres.ravel(), known=beyond.ravel()),
+                Unknown(kind="delay", names=tuple(map(str, self.tags)), start=delays, known=fixed),
+                curve,
+            )
+        )
 
-    @cached_property
-    def coordinates(self) -> int:
-        """How many coordinates are unknown."""
-        return int(self.columns.max()) + 1
+    def columns(self, kind: str) -> Ints:
+        """Return the indices of a kind of unknowns."""
+        where = self.layout.where[kind]
+        return np.arange(where.start, where.stop)
 
-    @cached_property
-    def delay_columns(self) -> Ints:
-        """The columns of the delays (tags,)."""
-        return self.coordinates + np.arange(len(self.tags))
+    def seats(self, arrangement: int) -> Ints:
+        """Return the points (rows of `points`) of an arrangement, in the order of its tags."""
+        return np.flatnonzero(self.owner == arrangement)
 
-    @cached_property
-    def curve_columns(self) -> Ints:
-        """The columns of the curve's coefficients."""
-        size = 0 if self.power is None else self.power.size
-        return self.coordinates + len(self.tags) + np.arange(size)
+    def free(self, only: int | None = None) -> Ints:
+        """Return the indices of the free unknowns; of `only` one arrangement's places where that is given."""
+        free = self.layout.free()
+        if only is None:
+            return free
+        return np.intersect1d(free, (3 * self.seats(only)[:, None] + np.arange(3)).ravel())
 
-    @cached_property
-    def size(self) -> int:
-        """How many unknowns there are."""
-        return self.coordinates + len(self.tags) + len(self.curve_columns)
-
-    @cached_property
-    def ends(self) -> Ints:
-        """The points between which each mean was measured (n, 2)."""
-        m = self.means
-        rows = zip(m.arrangement.tolist(), m.first.tolist(), m.second.tolist(), strict=True)
-        return np.array([(self.point_of[k, i], self.point_of[k, j]) for k, i, j in rows]).reshape(-1, 2)
-
-    @cached_property
-    def linear(self) -> Floats:
-        """The part of the derivatives (n, unknowns) that does not depend on where boards are: delays and curve."""
-        found = np.zeros((len(self.means), self.size))
-        number = dict(zip(self.tags, self.delay_columns.tolist(), strict=True))
-        rows = np.arange(len(self.means))
-        found[rows, [number[t] for t in self.means.first.tolist()]] -= self.means.weight_first
-        found[rows, [number[t] for t in self.means.second.tolist()]] -= self.means.weight_second
-        if self.power is not None:
-            found[:, self.curve_columns] = self.power.design
-        return found
+    def rows_of(self, only: int | None = None) -> Bools:
+        """Return which means (n,) belong to an arrangement; all of them for none."""
+        return np.asarray(self.means.arrangement == (self.means.arrangement if only is None else only))
 
     def positions(self, x: Floats) -> Floats:
         """Return the points (points, 3) that a vector of unknowns stands for."""
-        return np.where(self.columns >= 0, x[np.maximum(self.columns, 0)], 0.0)
+        return x[self.layout.where["place"]].reshape(-1, 3).copy()
 
     def with_positions(self, x: Floats, positions: Floats) -> Floats:
         """Return a vector of unknowns with other points (points, 3)."""
         found = x.copy()
-        free = self.columns >= 0
-        found[self.columns[free]] = positions[free]
+        mine = np.setdiff1d(self.free(), np.arange(3 * len(self.points), len(x)))
+        found[mine] = positions.ravel()[mine]
         return found
-
-    def residuals(self, x: Floats) -> Floats:
-        """Return what was measured less what the unknowns say: means, known distances, known coordinates."""
-        place = self.positions(x)
-        k = self.known
-        means = self.means.range_m - _lengths(place, self.ends) - self.linear @ x - DETOUR_M * self.reflected
-        return np.concatenate(
-            [means, k.distance_m - _lengths(place, k.ends), (k.position_m - place[k.at])[self._position_free]]
-        )
-
-    def jacobian(self, x: Floats) -> Floats:
-        """Return the derivatives of what the unknowns say, a row each of `residuals`."""
-        place = self.positions(x)
-        at = np.zeros((int(self._position_free.sum()), self.size))
-        at[np.arange(len(at)), self.columns[self.known.at][self._position_free]] = 1.0
-        return np.vstack(
-            [self.linear + self._of_lengths(place, self.ends), self._of_lengths(place, self.known.ends), at]
-        )
-
-    def std_m(self, pair_std_m: float) -> Floats:
-        """Return the standard deviation of each row, with that of a pair's constant error."""
-        k = self.known
-        each = np.repeat(k.position_std_m[:, None], 3, axis=1)[self._position_free]
-        means = np.sqrt(self.means.std_m**2 + pair_std_m**2 + DETOUR_STD_M**2 * self.reflected)
-        return np.concatenate([means, k.distance_std_m, each])
-
-    def prior(self, curve_std_m: float) -> Floats:
-        """Return what is known of the unknowns before any data (unknowns, unknowns), as information.
-
-        That is hardly anything of delays and coordinates, for what the data leave free to be a number, and all of
-        those that are fixed.
-        """
-        found = np.zeros((self.size, self.size))
-        diagonal = np.full(self.size, FAR_M**-2)
-        for (k, _), columns in zip(self.points, self.columns.tolist(), strict=True):
-            diagonal[columns[self.places[k].dimensions - 1]] = self.places[k].beside_m ** -2
-        fixed = [tag in self.fixed_m for tag in self.tags]
-        diagonal[self.delay_columns] = np.where(fixed, 1e-5**-2, GUESS_M**-2)
-        found[np.diag_indices(self.size)] = diagonal
-        if self.power is not None:
-            found[np.ix_(self.curve_columns, self.curve_columns)] = self.power.precision / curve_std_m**2
-        return found
-
-    def centre(self) -> Floats:
-        """Return the unknowns (unknowns,) that the prior is about: zeros but for fixed delays."""
-        found = np.zeros(self.size)
-        found[self.delay_columns] = [self.fixed_m.get(tag, 0.0) for tag in self.tags]
-        return found
-
-    def motions(self, x: Floats, *, all_places: bool = False) -> Floats:
-        """Return unit vectors (k, unknowns): rigid motions of arrangements, which change no distance.
-
-        Of arrangements without known positions, or of all.
-        """
-        place = self.positions(x)
-        held = {self.points[k][0] for k in self.known.at.tolist()}
-        rows = [
-            row for k in range(len(self.places)) if all_places or k not in held for row in self._motions_of(place, k)
-        ]
-        return np.array(rows).reshape(-1, self.size)
-
-    def rows_of(self, arrangement: int) -> Bools:
-        """Return which rows (n, and those of what is known) belong to an arrangement."""
-        k = self.known
-        owner = np.array([a for a, _ in self.points])
-        each = np.repeat(owner[k.at][:, None], 3, axis=1)[self._position_free]
-        return np.asarray(np.concatenate([self.means.arrangement, owner[k.ends[:, 0]], each]) == arrangement)
-
-    def seats(self, arrangement: int) -> list[int]:
-        """Return the points (rows of `points`) of an arrangement, in the order of its tags."""
-        return [n for n, (k, _) in enumerate(self.points) if k == arrangement]
-
-    def out_of_order(self, x: Floats) -> list[int]:
-        """Return the arrangements in which boards do not stand in the order that is said."""
-        said = [k for k, place in enumerate(self.places) if place.order]
-        points = self.positions(x) if said else np.zeros((0, 3))
-        return [k for k in said if not agrees(along(points[self.seats(k)][self.places[k].ordered_rows]))]
-
-    def marked(self, reflected: Bools) -> Network:
-        """Return the network with other means (n,) taken to be reflected."""
-        return replace(self, reflected=reflected)
 
     @cached_property
-    def _position_free(self) -> Bools:
-        return (self.columns[self.known.at] >= 0).reshape(-1, 3)
+    def ends(self) -> Ints:
+        """The points between which each length was measured (n, 2): means, then known distances."""
+        number = {point: k for k, point in enumerate(self.points)}
+        rows = zip(self.means.arrangement.tolist(), self.means.ends.tolist(), strict=True)
+        of_means = [(number[k, i], number[k, j]) for k, (i, j) in rows]
+        return np.concatenate([np.array(of_means).reshape(-1, 2), self.known.ends])
 
-    def _of_lengths(self, place: Floats, ends: Ints) -> Floats:
-        found = np.zeros((len(ends), self.size))
-        apart = place[ends[:, 0]] - place[ends[:, 1]]
-        length = np.linalg.norm(apart, axis=1)
-        # Boards on top of each other have no direction: any will do to part them.
-        unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
-        for end, sign in ((0, 1.0), (1, -1.0)):
-            columns = self.columns[ends[:, end]]
-            row, axis = np.nonzero(columns >= 0)
-            found[row, columns[row, axis]] += sign * unit[row, axis]
+    @cached_property
+    def _of_delays_and_curve(self) -> Floats:
+        """The derivatives of all rows (n, p) by delays and curve, which do not depend on places."""
+        found = np.zeros((len(self.ends) + 3 * len(self.known.at), self.layout.size))
+        number = np.searchsorted(self.tags, self.means.ends) + self.layout.where["delay"].start
+        rows = np.arange(len(self.means))
+        found[rows[:, None], number] = -METRES_A_NS * self.means.weights
+        if self.curve is not None:
+            found[: len(rows), self.layout.where["curve"]] = self.curve.design
         return found
 
-    def _motions_of(self, place: Floats, arrangement: int) -> list[Floats]:
-        here = [k for k, (a, _) in enumerate(self.points) if a == arrangement]
-        columns, middle = self.columns[here], place[here] - place[here].mean(axis=0)
-        dimensions = self.places[arrangement].dimensions
-        fields = [np.tile(np.eye(3)[axis], (len(here), 1)) for axis in range(dimensions)]
-        turns = {1: (), 2: (2,), 3: (0, 1, 2)}[dimensions]
-        fields += [np.cross(np.eye(3)[axis], middle) for axis in turns]
-        rows = np.zeros((len(fields), self.size))
-        for row, moving in zip(rows, fields, strict=True):
-            row[columns[columns >= 0]] = moving[columns >= 0]
-        _, size, basis = np.linalg.svd(rows, full_matrices=False)
-        return list(basis[size > 1e-6 * size[0]])
+    def linear(self, x: Floats) -> tuple[Floats, Floats]:
+        """Return what is left of each row (n,), and derivatives (n, p): means, known distances, coordinates."""
+        place, known, found = self.positions(x), self.known, self._of_delays_and_curve.copy()
+        apart = place[self.ends[:, 0]] - place[self.ends[:, 1]]
+        length = np.linalg.norm(apart, axis=1)
+        measured = np.concatenate([self.means.range_m, known.distance_m, known.position_m.ravel()])
+        told = np.concatenate([length, place[known.at].ravel()])
+        left = measured - told - found @ x
+        # Boards on top of each other have no direction: any will do to part them.
+        unit = np.where(length[:, None] > 1e-9, apart / np.maximum(length, 1e-9)[:, None], [1.0, 0.0, 0.0])
+        rows = np.arange(len(length))[:, None]
+        for end, sign in ((0, 1.0), (1, -1.0)):
+            found[rows, 3 * self.ends[:, [end]] + np.arange(3)] = sign * unit
+        found[np.arange(len(length), len(left)), (3 * known.at[:, None] + np.arange(3)).ravel()] = 1.0
+        return left, found
+
+    def std_m(self, case: Case) -> Floats:
+        """Return the standard deviation of each row, with the constant errors of pairs."""
+        means = np.sqrt(self.means.std_m**2 + case.pair_m**2 + DETOUR_STD_M**2 * case.marks)
+        return np.concatenate([means, self.known.distance_std_m, np.repeat(self.known.position_std_m, 3)])
+
+    def prior(self, curve_m: float) -> tuple[Floats, Floats]:
+        """Return what is known of the unknowns beforehand: a precision (p, p), and the unknowns (p,) it is about."""
+        freed = np.array([boards.dimensions - 1 if boards.freed else -1 for boards in self.arrangements])[self.owner]
+        beside = (np.arange(3) == freed[:, None]).ravel()
+        delays = np.full(len(self.tags), DELAY_NS**-2)
+        curve = np.zeros((0, 0)) if self.curve is None else self.curve.precision / curve_m**2
+        found = np.zeros((self.layout.size,) * 2)
+        diagonal = np.concatenate([np.where(beside, BESIDE_M**-2, FAR_M**-2), delays, np.zeros(len(curve))])
+        found[np.diag_indices_from(found)] = diagonal
+        found[self.layout.where["curve"], self.layout.where["curve"]] = curve
+        return found, self.layout.start()
+
+    def priors(self, curve_m: float, only: int | None = None) -> Priors:
+        """Return the same for a search, in which all but `only` one arrangement's places are known if that is given."""
+        precision, _ = self.prior(curve_m)
+        known = np.ones(self.layout.size, dtype=bool)
+        known[self.free(only)] = False
+        blocks = []
+        for block in self.layout.blocks:
+            own = self.layout.where[block.kind]
+            prior = Prior(weight=1.0, structure=precision[own, own], centre=block.start, rows=len(block.start))
+            blocks.append(
+                Unknown(kind=block.kind, names=block.names, start=block.start, known=known[own], priors=(prior,))
+            )
+        return Priors(Layout(tuple(blocks)))
 
 
-def _lengths(place: Floats, ends: Ints) -> Floats:
-    return np.asarray(np.linalg.norm(place[ends[:, 0]] - place[ends[:, 1]], axis=1))
+@dataclass(frozen=True, slots=True)
+class TakenCurve:
+    """A curve that is taken over from another calibration, and the covariance (m, m) of its coefficients, m^2."""
+
+    curve: Curve
+    covariance_m2: Floats
+
+    def design(self, lifted: Floats) -> Floats:
+        """Return the derivatives (n, m) of the curve at lifted powers with respect to its coefficients."""
+        return basis(np.clip(lifted, *self.curve.range), np.array(self.curve.knots))

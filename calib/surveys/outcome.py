@@ -1,141 +1,306 @@
-"""From an adjusted network to what a survey returns: the calibration, what it rests on, places with covariance."""
+"""From a solution to what a survey returns: calibration, what is determined, reflections, places in a stated frame."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 import uwblink
 from calib.calibration.model import Calibration
 from calib.calibration.parts import Matrix, Uncertainty
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, flat_curve
-from calib.information import Verdict
-from calib.surveys.adjustment import Adjusted
-from calib.surveys.frames import framed
-from calib.surveys.gathering import Gathered
-from calib.surveys.pair_means import LIFT
-from calib.surveys.power import PowerModel
-from calib.surveys.scales import M_PER_NS
-from calib.surveys.surveyed import SurveyedArrangement, SurveyedBoard
-from calib.surveys.taken_curve import TakenCurve
+from calib.errors import UnanswerableError
+from calib.estimator.range_model import METRES_A_NS
+from calib.information import Unknown, Verdict, judge, reduced
+from calib.spread import TWO_SIDED_95
+from calib.surveys.network import Boards, Network, TakenCurve
+from calib.surveys.recordings import LIFT, SurveyData
+from calib.surveys.result import (
+    Contradiction,
+    ReflectedPair,
+    SecondBest,
+    SurveyedArrangement,
+    SurveyedBoard,
+    SurveyResult,
+)
+from calib.surveys.solution import PAIR_WORTH, Solution
 from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
+DELAY_SCALE_NS = 0.5
+"""How far a delay is known without any data: devices of one design differ by that."""
 
-def calibration_of(
-    gathered: Gathered,
-    found: Adjusted,
-    verdict: Verdict,
-    widened: float,
-    warnings: list[str],
-    more: Mapping[str, Any],
-    taken: TakenCurve | None,
-) -> Calibration:
-    """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on.
+PROBABLY, PERHAPS = 0.5, 0.1
+"""Probabilities from which a pair is believed to be reflected, and from which it is said that it may be."""
 
-    `more` goes into its provenance; a curve that was `taken` over is its curve.
+SHAPES = {1: "line", 2: "plane", 3: ""}
+"""What is known of an arrangement by the dimensions in which its boards may stand."""
+
+
+def students_factor(freedom: float) -> float:
+    """Return by how much Student's 95 % quantile is more than the normal one: the spread of errors is estimated.
+
+    What is known of that spread beforehand counts as a few degrees of freedom.
     """
+    return float(stdtrit(max(freedom + PAIR_WORTH, 1.0), 0.975)) / TWO_SIDED_95
+
+
+def result_of(
+    data: SurveyData,
+    found: Solution,
+    second: SecondBest | None,
+    findings: tuple[Contradiction, ...],
+    taken: TakenCurve | None,
+) -> SurveyResult:
+    """Return the result of a survey; raises `UnanswerableError` where no delay is determined."""
+    verdict = verdict_of(found)
+    free = verdict.named("delay")
+    if len(free) == len(verdict.unknowns) - len(found.network.fixed_ns):
+        raise UnanswerableError(
+            f"the arrangements determine no delay: {'; '.join(d.words for d in verdict.free)} can change without "
+            "changing any range; `calib plan` says which arrangements or distances would tell",
+            undetermined=[[int(tag) for tag in free]],
+        )
+    reflected = reflected_pairs(found)
+    warnings = [
+        *data.warnings,
+        *(one.text for one in findings),
+        *_reflections_in_words(reflected),
+        *_notes(found, second, verdict),
+    ]
+    factor = students_factor(found.freedom)
+    covariance = found.covariance() * factor**2
+    arrangements = tuple(_arrangement(found, covariance, k) for k in range(len(found.network.arrangements)))
+    more = {
+        "surveyed": [one.to_dict() for one in arrangements],
+        "reflected": [one.to_dict() for one in reflected],
+        "findings": [one.text for one in findings],
+        "second_best": None if second is None else round(second.worse, 2),
+    }
+    return SurveyResult(
+        calibration=_calibration(data, found, verdict, factor, taken, warnings, more),
+        arrangements=arrangements,
+        verdict=verdict,
+        pair_error_m=found.case.pair_m,
+        second_best=second,
+        contradictions=findings,
+        warnings=tuple(warnings),
+        reflected=reflected,
+    )
+
+
+def verdict_of(found: Solution) -> Verdict:
+    """Return what is determined of the delays, in nanoseconds, whatever places and curve are."""
     network = found.network
-    known = verdict.determined
+    free, delays = network.free(), network.columns("delay")
+    open_delays = np.intersect1d(free, delays)
+    information = np.diag(np.where(np.isin(delays, free), 0.0, 1e8))
+    mine = np.searchsorted(delays, open_delays)
+    of_free = found.information()[np.ix_(free, free)]
+    information[np.ix_(mine, mine)] = reduced(of_free, np.isin(free, open_delays))
+    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in network.tags])
+
+
+def reflected_pairs(found: Solution) -> tuple[ReflectedPair, ...]:
+    """Return the pairs that may be reflected, the likeliest first."""
+    network = found.network
+    means, names, longer = network.means, [boards.name for boards in network.arrangements], found.residuals_m().tolist()
+    return tuple(
+        ReflectedPair(
+            names[means.arrangement[k]], int(means.ends[k, 0]), int(means.ends[k, 1]), longer[k], float(found.chance[k])
+        )
+        for k in np.argsort(-found.chance, kind="stable").tolist()
+        if found.chance[k] >= PERHAPS
+    )
+
+
+def _reflections_in_words(reflected: tuple[ReflectedPair, ...]) -> list[str]:
+    """Return a line for each pair that is believed to be reflected, and one for those that may be."""
+    lines = [
+        f"{one.arrangement}: the range of {one.first} and {one.second} is {100 * one.longer_m:+.0f} cm off what all "
+        f"others say: believed to be reflected ({100 * one.chance:.0f} %), and hardly counted"
+        for one in reflected
+        if one.chance >= PROBABLY
+    ]
+    perhaps = [
+        f"{one.first}-{one.second} in {one.arrangement} ({100 * one.chance:.0f} %)"
+        for one in reflected
+        if one.chance < PROBABLY
+    ]
+    return [*lines, *([f"may be reflected, too: {', '.join(perhaps)}; intervals are wider by that"] if perhaps else [])]
+
+
+def _notes(found: Solution, second: SecondBest | None, verdict: Verdict) -> list[str]:
+    """Return what a user should know beside reflections, a line each."""
+    notes = []
+    if not found.settled:
+        notes.append("the search stopped before it settled: delays and places are not final")
+    if not verdict.determined.all():
+        notes.append(f"not determined, and left out: {'; '.join(d.words for d in verdict.free)}")
+    if found.network.curve is not None:
+        notes.append(
+            "a constant of the curve and one of all delays are the same to ranges: what the delays share is known only "
+            "as well as the curve at its reference power; differences of delays are known better, and a "
+            "taped distance (`known`) tells what they share"
+        )
+    if second is not None and second.ambiguous:
+        who = ", ".join(map(str, second.tags))
+        notes.append(
+            f"{second.arrangement}: another solution agrees as well with the ranges (worse by {second.worse:.1f}), in "
+            f"which boards {who} are elsewhere"
+        )
+    return notes
+
+
+def _calibration(
+    data: SurveyData,
+    found: Solution,
+    verdict: Verdict,
+    factor: float,
+    taken: TakenCurve | None,
+    warnings: list[str],
+    more: dict[str, Any],
+) -> Calibration:
+    """Return the calibration: delays that are determined, the curve, how well both are known and what they rest on."""
+    network, known = found.network, verdict.determined
     tags = [tag for tag, good in zip(network.tags, known.tolist(), strict=True) if good]
-    delays = dict(zip(network.tags, (found.x[network.delay_columns] / M_PER_NS).tolist(), strict=True))
-    std = dict(zip(network.tags, (verdict.std * widened).tolist(), strict=True))
-    pinned = dict.fromkeys(network.fixed_m, 0.0)
-    covariance = verdict.covariance[np.ix_(known, known)] * widened**2
+    std = dict(zip(network.tags, (verdict.std * factor).tolist(), strict=True)) | dict.fromkeys(network.fixed_ns, 0.0)
+    delays = dict(zip(network.tags, found.delays.tolist(), strict=True))
     noise = float(np.sqrt(np.average(network.means.noise_m**2, weights=network.means.count)))
-    sigma = math.hypot(noise, found.pair_std_m)
-    curve, curve_covariance, span = _curve(found, widened, taken)
-    variance = np.full((DEGREE + 1,) * 2, (0.5 * sigma / math.sqrt(max(found.freedom, 1.0))) ** 2)
+    sigma = math.hypot(noise, found.case.pair_m)
+    lifted = network.means.lifted[np.isfinite(network.means.lifted)]
+    span = (float(lifted.min()), float(lifted.max())) if len(lifted) else (1.0, 1.0)
+    curve, curve_covariance = flat_curve(0.0, span), np.zeros((DEGREE + 1,) * 2)
+    gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
+    if taken is not None:
+        curve, curve_covariance, span = taken.curve, taken.covariance_m2, taken.curve.range
+        gauge = "that of the calibration whose curve was taken over"
+    elif network.curve is not None:
+        columns, knots = network.columns("curve"), network.curve.knots
+        span = (float(knots[0]), float(knots[-1]))
+        curve = Curve(tuple(knots.tolist()), tuple(found.x[columns].tolist()), DEGREE, span)
+        curve_covariance = found.covariance()[np.ix_(columns, columns)] * factor**2
+    else:
+        gauge = "no curve; the delays carry the constant"
+    fixed = {"fixed_ns": {str(tag): delay for tag, delay in sorted(network.fixed_ns.items())}}
+    freedom = found.freedom
+    provenance = (fixed if network.fixed_ns else {}) | {
+        "writer": f"uwbcal {uwblink.__version__}",
+        "recordings": list(data.sources),
+        "exchanges": int(network.means.count.sum()),
+        "pairs": len(network.means),
+        "recipe": "survey",
+        "rests_on": {
+            "arrangements": [
+                {"name": boards.name, "known": SHAPES[boards.dimensions], "tags": list(boards.tags)}
+                for boards in network.arrangements
+            ],
+            "known_distances": len(set(network.known.statement.tolist())),
+            "known_positions": len(network.known.at),
+            "pair_error_m": found.case.pair_m,
+            "freedom": freedom,
+        },
+        "fitted": f"delays of {len(tags)} tags from the geometry of boards that stood still",
+        "converged": found.settled,
+        "standard_errors": f"constant errors of pairs, {freedom:.0f} degrees of freedom",
+        "undetermined": [[int(tag) for tag in verdict.named("delay")]] if verdict.free else [],
+        "warnings": warnings,
+        "gauge": gauge,
+    }
+    covariance = verdict.covariance[np.ix_(known, known)] * factor**2
+    of_sigma = np.full((DEGREE + 1,) * 2, (0.5 * sigma / math.sqrt(max(freedom, 1.0))) ** 2)
     return Calibration(
         delays_ns={tag: delays[tag] for tag in tags},
-        delays_std_ns={tag: std[tag] for tag in tags} | {t: s for t, s in pinned.items() if t in tags},
+        delays_std_ns={tag: std[tag] for tag in tags},
         loss="gaussian",
-        scale_ns=noise / M_PER_NS,
+        scale_ns=noise / METRES_A_NS,
         lift=LIFT,
         alpha_dbm=ALPHA_DBM,
         speed_of_light=SPEED_OF_LIGHT,
         bias_curve=curve,
         sigma_curve=flat_curve(sigma, span),
-        provenance=_provenance(gathered, found, verdict, warnings, curve) | dict(more),
-        uncertainty=Uncertainty(tuple(tags), _rows(covariance), _rows(curve_covariance), _rows(variance)),
-        antenna_delays=known_delays(gathered.antenna_delays, tags),
+        provenance=provenance | more,
+        uncertainty=Uncertainty(tuple(tags), _rows(covariance), _rows(curve_covariance), _rows(of_sigma)),
+        antenna_delays=known_delays(data.antenna_delays, tags),
     )
-
-
-def _curve(found: Adjusted, widened: float, taken: TakenCurve | None) -> tuple[Curve, Floats, tuple[float, float]]:
-    """Return the curve, the covariance of its coefficients, and the lifted powers between which it holds."""
-    if taken is not None:
-        return taken.curve, taken.covariance_m2, taken.curve.range
-    power: PowerModel | None = found.network.power
-    lifted = found.network.means.lifted
-    if power is None:
-        known = lifted[np.isfinite(lifted)]
-        span = (float(known.min()), float(known.max())) if len(known) else (1.0, 1.0)
-        return flat_curve(0.0, span), np.zeros((DEGREE + 1,) * 2), span
-    columns = found.network.curve_columns
-    span = (float(power.knots[0]), float(power.knots[-1]))
-    coefficients = tuple(found.x[columns].tolist())
-    covariance = found.covariance()[np.ix_(columns, columns)] * widened**2
-    return Curve(tuple(power.knots.tolist()), coefficients, DEGREE, span), covariance, span
 
 
 def _rows(matrix: Floats) -> Matrix:
     return tuple(tuple(row) for row in matrix.tolist())
 
 
-def _provenance(
-    gathered: Gathered, found: Adjusted, verdict: Verdict, warnings: list[str], curve: Curve
-) -> dict[str, Any]:
-    network = found.network
-    rests = {
-        "arrangements": [
-            {"name": p.name, "known": {1: "line", 2: "plane", 3: ""}[p.dimensions], "tags": list(p.tags)}
-            for p in network.places
-        ],
-        "known_distances": len(set(network.known.distance_of.tolist())),
-        "known_positions": len(network.known.at),
-        "pair_error_m": found.pair_std_m,
-        "freedom": found.freedom,
-    }
-    gauge = "no curve; the delays carry the constant"
-    if not curve.flat:
-        gauge = f"the bias curve is zero at {ALPHA_DBM:g} dBm; the delays carry the constant"
-    if not curve.flat and network.power is None:
-        gauge = "that of the calibration whose curve was taken over"
-    more = {"fixed_ns": {str(t): d / M_PER_NS for t, d in sorted(network.fixed_m.items())}} if network.fixed_m else {}
-    return more | {
-        "writer": f"uwbcal {uwblink.__version__}",
-        "recordings": list(gathered.sources),
-        "exchanges": gathered.exchanges,
-        "pairs": len(network.means),
-        "recipe": "survey",
-        "rests_on": rests,
-        "fitted": f"delays of {int(verdict.determined.sum())} tags from the geometry of boards that stood still",
-        "converged": found.settled,
-        "standard_errors": f"constant errors of pairs, {found.freedom:.0f} degrees of freedom",
-        "undetermined": [[int(tag) for tag in verdict.named("delay")]] if verdict.free else [],
-        "warnings": warnings,
-        "gauge": gauge,
-    }
+def _arrangement(found: Solution, covariance: Floats, number: int) -> SurveyedArrangement:
+    """Return where boards stood in an arrangement, in the frame of known positions or that of its first boards."""
+    network, boards, seats = found.network, found.network.arrangements[number], found.network.seats(number)
+    points = network.positions(found.x)[seats]
+    columns = (3 * seats[:, None] + np.arange(3)).ravel()
+    spread, frame = covariance[np.ix_(columns, columns)], "that of the known positions"
+    if not np.isin(network.known.at, seats).any():
+        points, spread, frame = _in_frame(points, spread, boards)
+    surveyed = []
+    for n, (tag, (x, y, z)) in enumerate(zip(boards.tags, points.tolist(), strict=True)):
+        own = spread[3 * n : 3 * n + 3, 3 * n : 3 * n + 3]
+        surveyed.append(SurveyedBoard(tag, (x, y, z), own, bool(np.trace(own) < 1.0)))
+    return SurveyedArrangement(boards.name, SHAPES[boards.dimensions], tuple(surveyed), frame)
 
 
-def arrangements_of(found: Adjusted, widened: float) -> tuple[SurveyedArrangement, ...]:
-    """Return where boards stood in each arrangement, in its frame, with covariance widened by Student's quantile."""
-    network = found.network
-    covariance = found.covariance() * widened**2
-    rows = []
-    for k, place in enumerate(network.places):
-        there = framed(network, found.x, covariance, k)
-        spread = [there.covariance_m2[3 * n : 3 * n + 3, 3 * n : 3 * n + 3] for n in range(len(place.tags))]
-        boards = tuple(
-            SurveyedBoard(tag, (float(p[0]), float(p[1]), float(p[2])), c, bool(np.trace(c) < 1.0))
-            for tag, p, c in zip(place.tags, there.position_m, spread, strict=True)
-        )
-        rows.append(
-            SurveyedArrangement(place.name, {1: "line", 2: "plane", 3: ""}[place.dimensions], boards, there.words)
-        )
-    return tuple(rows)
+def _in_frame(points: Floats, covariance: Floats, boards: Boards) -> tuple[Floats, Floats, str]:
+    """Return points (n, 3) and their covariance (3n, 3n) in the frame of the first boards, and that in words.
+
+    The first is the origin, x points to the second, y to the side of the next beside it. The covariance is that in
+    which the coordinates that make the frame have none (Baarda's transformation of the datum).
+    """
+    away = points - points[0]
+    x = away[1] / max(float(np.linalg.norm(away[1])), 1e-9)
+    first, second = boards.tags[:2]
+    if boards.dimensions == 1:
+        turn, datum = np.diag([np.sign(x[0]) or 1.0, 1.0, 1.0]), np.array([0])
+        words = f"{first} at the origin, x towards {second}"
+    else:
+        beside = away - np.outer(away @ x, x)
+        reach = np.linalg.norm(beside, axis=1)
+        third = int(np.argmax(reach > 0.2 * reach.max())) if reach.max() > 0 else 0
+        y = beside[third] / max(float(reach[third]), 1e-9)
+        tag = boards.tags[third]
+        if boards.dimensions == 2:
+            turn, datum = np.array([x, y, [0.0, 0.0, 1.0]]), np.array([0, 1, 4])
+            words = f"{first} at the origin, x towards {second}, y towards {tag}"
+        else:
+            turn, datum = np.array([x, y, np.cross(x, y)]), np.array([0, 1, 2, 4, 5, 3 * third + 2])
+            words = f"{first} at the origin, x towards {second}, {tag} in the plane of x and y, z right-handed"
+    moved = away @ turn.T
+    turns = np.kron(np.eye(len(points)), turn)
+    motions = rigid_motions(moved, boards.dimensions)
+    hold = np.eye(len(motions)) - motions @ np.linalg.pinv(motions[datum]) @ np.eye(len(motions))[datum]
+    # Along its own motions an arrangement is as free as the prior has it: none of that is left in its frame.
+    found = hold @ _without(rigid_motions(moved, boards.dimensions), turns @ covariance @ turns.T) @ hold.T
+    return moved, (found + found.T) / 2, words
+
+
+def _without(motions: Floats, covariance: Floats) -> Floats:
+    basis = np.linalg.qr(motions)[0]
+    rest = np.eye(len(covariance)) - basis @ basis.T
+    return np.asarray(rest @ covariance @ rest)
+
+
+def rigid_motions(points: Floats, dimensions: int) -> Floats:
+    """Return the motions (3n, k) of points (n, 3) that change no distance: shifts and turns in so many dimensions."""
+    fields = [np.tile(np.eye(3)[axis], (len(points), 1)) for axis in range(dimensions)]
+    turns: dict[int, tuple[int, ...]] = {1: (), 2: (2,), 3: (0, 1, 2)}
+    fields += [np.cross(np.eye(3)[axis], points) for axis in turns[dimensions]]
+    return np.array([field.ravel() for field in fields]).T
+
+
+def widened_by(found: Solution, taken: TakenCurve) -> Solution:
+    """Return a solution whose covariance has what the errors of a curve that was taken over do to delays and places."""
+    network: Network = found.network
+    count = len(network.means)
+    std = network.std_m(found.case)[:count, None]
+    rows = network.linear(found.x)[1][:count]
+    gain = (found.covariance() - found.more) @ ((rows / std).T @ (taken.design(network.means.lifted) / std))
+    return replace(found, more=found.more + gain @ taken.covariance_m2 @ gain.T)

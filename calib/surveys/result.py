@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,22 +13,83 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.errors import BadInputError
 from calib.information import Verdict
-from calib.surveys.minima import SecondBest
-from calib.surveys.surveyed import SurveyedArrangement, SurveyedBoard
+from uwblink.arrays import Floats
 from uwblink.output import write_bytes, write_text
 
-FORMATS = {".toml": "toml", ".yaml": "yaml", ".yml": "yaml"}
+AMBIGUOUS = 9.0
+"""By how much -2 log likelihood of a second solution may be worse for it to be as good: three standard deviations."""
 
 
-PICTURES = (".svg", ".png", ".pdf")
+@dataclass(frozen=True, slots=True)
+class SurveyedBoard:
+    """Where a tag's antenna was: metres, and the covariance (3, 3); zero along what the frame or the shape fixes.
+
+    `determined` is whether the ranges determine the place.
+    """
+
+    tag: int
+    position_m: tuple[float, float, float]
+    covariance_m2: Floats
+    determined: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyedArrangement:
+    """An arrangement: its name, what was said of it ("line", "plane" or ""), its boards, and the frame in words."""
+
+    name: str
+    known: str
+    boards: tuple[SurveyedBoard, ...]
+    frame: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as JSON takes it, in metres."""
+        boards = [
+            {
+                "tag": board.tag,
+                "position_m": [round(value, 5) for value in board.position_m],
+                "covariance_m2": [[float(f"{value:.4g}") for value in line] for line in board.covariance_m2.tolist()],
+                "determined": board.determined,
+            }
+            for board in self.boards
+        ]
+        return {"name": self.name, "known": self.known, "frame": self.frame, "boards": boards}
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> SurveyedArrangement:
+        """Return the arrangement that `to_dict` wrote."""
+        boards = []
+        for one in row["boards"]:
+            x, y, z = map(float, one["position_m"])
+            covariance = np.array(one["covariance_m2"], dtype=float)
+            boards.append(SurveyedBoard(int(one["tag"]), (x, y, z), covariance, bool(one["determined"])))
+        return cls(str(row["name"]), str(row["known"]), tuple(boards), str(row["frame"]))
+
+
+@dataclass(frozen=True, slots=True)
+class SecondBest:
+    """The best other solution: in which arrangement it differs, whose places, how much worse its -2 log likelihood."""
+
+    arrangement: str
+    tags: tuple[int, ...]
+    worse: float
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the ranges can hardly tell it from the best one."""
+        return self.worse < AMBIGUOUS
 
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """What contradicts the ranges: "shape" (a line that is none), "distance", "labels" or "moved", and it in words."""
+    """What contradicts the ranges: "shape" (a line that is none), "distance", "labels" or "moved", and it in words.
+
+    `p_value` is how probable it is at most that sound ranges look like this.
+    """
 
     kind: str
     text: str
+    p_value: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +170,30 @@ class SurveyResult:
         `arrangement` names which, where there are several. Raises `BadInputError`.
         """
         place = Path(path)
-        form = FORMATS.get(place.suffix.lower())
-        if form is None:
+        one = self.arrangement(arrangement)
+        if place.suffix.lower() not in (".toml", ".yaml", ".yml"):
             raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .toml or .yaml", parameter="anchors")
-        lines = _toml if form == "toml" else _yaml
-        write_text(place, "\n".join(lines(self.arrangement(arrangement))) + "\n", force=force)
+        boards = [board for board in one.boards if board.determined]
+        toml = place.suffix.lower() == ".toml"
+        key = "covariance_m2" if toml else "covariance"
+        lines = [
+            f"# Arrangement {one.name}, surveyed from ranges. Frame: {one.frame}. Metres.",
+            f"# {key}: xx xy xz yy yz zz{', m^2' if toml else ''}.",
+        ]
+        if not toml:
+            lines += ["/**:", "  ros__parameters:", "    anchors:"]
+            lines += [f"      ids: [{', '.join(str(board.tag) for board in boards)}]"]
+        for board in boards:
+            position = ", ".join(str(round(value, 5)) for value in board.position_m)
+            upper = board.covariance_m2[np.triu_indices(3)].tolist()
+            covariance = ", ".join(str(float(f"{value:.6g}")) for value in upper)
+            if toml:
+                lines += ["", "[[anchors]]", f"id = {board.tag}"]
+                lines += [f"position_m = [{position}]", f"covariance_m2 = [{covariance}]"]
+            else:
+                lines += [f"      anchor_{board.tag}:"]
+                lines += [f"        position: [{position}]", f"        covariance: [{covariance}]"]
+        write_text(place, "\n".join(lines) + "\n", force=force)
 
     def save_picture(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Draw where boards stood, with the ellipses that hold them with 95 %, as .svg, .png or .pdf.
@@ -123,7 +203,7 @@ class SurveyResult:
         from calib.surveys.figures import board_picture
 
         place = Path(path)
-        if place.suffix.lower() not in PICTURES:
+        if place.suffix.lower() not in (".svg", ".png", ".pdf"):
             raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .svg, .png or .pdf", parameter="plot")
         write_bytes(place, board_picture(self.arrangements, place.suffix.lower()[1:]), force=force)
 
@@ -136,34 +216,3 @@ class SurveyResult:
             found = "none is named" if name is None else f"found {name!r:.40}"
             raise BadInputError(f"{found}, there are {', '.join(known)}", parameter="arrangement")
         return known[name]
-
-
-def _rows(found: SurveyedArrangement) -> Iterator[tuple[SurveyedBoard, list[float], list[float]]]:
-    for board in found.boards:
-        if board.determined:
-            upper = board.covariance_m2[np.triu_indices(3)].tolist()
-            yield board, [round(value, 5) for value in board.position_m], [float(f"{value:.6g}") for value in upper]
-
-
-def _toml(found: SurveyedArrangement) -> Iterator[str]:
-    yield f"# Arrangement {found.name}, surveyed from ranges. Frame: {found.frame}. Metres."
-    yield "# covariance_m2: xx xy xz yy yz zz, m^2."
-    for board, position, upper in _rows(found):
-        yield ""
-        yield "[[anchors]]"
-        yield f"id = {board.tag}"
-        yield f"position_m = [{', '.join(map(str, position))}]"
-        yield f"covariance_m2 = [{', '.join(map(str, upper))}]"
-
-
-def _yaml(found: SurveyedArrangement) -> Iterator[str]:
-    yield f"# Arrangement {found.name}, surveyed from ranges. Frame: {found.frame}. Metres."
-    yield "# covariance: xx xy xz yy yz zz, m^2."
-    yield "/**:"
-    yield "  ros__parameters:"
-    yield "    anchors:"
-    yield f"      ids: [{', '.join(str(board.tag) for board, _, _ in _rows(found))}]"
-    for board, position, upper in _rows(found):
-        yield f"      anchor_{board.tag}:"
-        yield f"        position: [{', '.join(map(str, position))}]"
-        yield f"        covariance: [{', '.join(map(str, upper))}]"

@@ -2,107 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
 
 from calib.surveys.network import Network
-from calib.surveys.orders import rearranged
-from uwblink.arrays import Floats
+from calib.surveys.orders import in_said_order
+from uwblink.arrays import Floats, Ints
 
 
-def first_start(network: Network, delays_m: Floats | None = None) -> Floats:
-    """Return unknowns from the ranges alone, with delays (tags,) in metres, or none: by classical scaling."""
-    x = network.centre()
-    if delays_m is not None:
-        x[network.delay_columns] = delays_m
-    place = np.zeros((len(network.points), 3))
-    for k in range(len(network.places)):
-        here, apart = _distances(network, x, k)
-        found = scaled(apart, network.places[k].dimensions)
-        place[here, : found.shape[1]] = found
-        place[here] = _onto_known(network, place[here], here)
+def first_start(network: Network, delays: Floats | None = None) -> Floats:
+    """Return unknowns from the ranges alone, with delays (tags,) in ns, or none: by classical scaling."""
+    x = network.layout.start()
+    if delays is not None:
+        x[network.layout.where["delay"]] = delays
+    place = network.positions(x)
+    measured = network.linear(x)[0]  # All points are at the origin as yet.
+    for k, boards in enumerate(network.arrangements):
+        here = network.seats(k)
+        apart = _distances(network, measured, here)
+        centring = np.eye(len(here)) - 1 / len(here)
+        values, vectors = np.linalg.eigh(-0.5 * centring @ apart**2 @ centring)
+        top = np.argsort(values)[::-1][: boards.dimensions]
+        found = np.zeros((len(here), 3))
+        found[:, : len(top)] = vectors[:, top] * np.sqrt(np.maximum(values[top], 1e-6))
+        place[here] = _onto_known(network, found, here)
     return network.with_positions(x, place)
 
 
-def start_in_order(network: Network, x: Floats) -> Floats | None:
-    """Return unknowns with boards put in the order that is said wherever they stand in another; None where nowhere."""
-    place, wrong = network.positions(x), network.out_of_order(x)
-    for k in wrong:
-        here = network.seats(k)
-        place[here] = rearranged(place[here], network.places[k].ordered_rows)[0]
-    return network.with_positions(x, place) if wrong else None
-
-
-def scaled(apart: Floats, dimensions: int) -> Floats:
-    """Return points (n, dimensions) whose distances are near `apart` (n, n): classical multidimensional scaling."""
-    count = len(apart)
-    centring = np.eye(count) - 1 / count
-    values, vectors = np.linalg.eigh(-0.5 * centring @ apart**2 @ centring)
-    top = np.argsort(values)[::-1][:dimensions]
-    found = vectors[:, top] * np.sqrt(np.maximum(values[top], 1e-6))
-    return np.asarray(found)
-
-
-def other_starts(network: Network, x: Floats, arrangement: int, count: int, seed: int = 0) -> Iterator[Floats]:
-    """Yield unknowns in which one arrangement begins elsewhere: neighbours exchanged, mirrored, or shaken."""
-    rng = np.random.default_rng(seed + arrangement)
+def start_in_order(network: Network, x: Floats, wrong: Sequence[int]) -> Floats:
+    """Return unknowns with the boards of some arrangements put in the order that is said."""
     place = network.positions(x)
-    here = [k for k, (a, _) in enumerate(network.points) if a == arrangement]
-    dimensions = network.places[arrangement].dimensions
-    order = network.places[arrangement].ordered_rows
-    if order:
-        yield first_start(network, x[network.delay_columns])
-    said = rearranged(place[here], order) if order else []
-    for points in (*said, *_variants(place[here], dimensions, count, rng)):
+    for k in wrong:
+        here, boards = network.seats(k), network.arrangements[k]
+        place[here] = in_said_order(place[here], boards.tags, boards.order)[0]
+    return network.with_positions(x, place)
+
+
+def other_starts(network: Network, x: Floats, arrangement: int, shaken: int = 4, seed: int = 0) -> Iterator[Floats]:
+    """Yield unknowns in which one arrangement begins elsewhere: neighbours exchanged, mirrored, or `shaken`."""
+    rng = np.random.default_rng(seed + arrangement)
+    place, here, boards = network.positions(x), network.seats(arrangement), network.arrangements[arrangement]
+    points = place[here]
+    variants = list(in_said_order(points, boards.tags, boards.order)) if boards.order else []
+    if boards.dimensions == 1:
+        for a, b in pairwise(np.argsort(points[:, 0]).tolist()):
+            exchanged = points.copy()
+            exchanged[[a, b]] = points[[b, a]]
+            variants.append(exchanged)
+    middle = points - points.mean(axis=0)
+    _, size, axes = np.linalg.svd(middle, full_matrices=False)
+    if boards.dimensions > 1:
+        # Through the plane in which boards nearly lie: what is on its one side might be on its other.
+        normal = axes[boards.dimensions - 1] if len(axes) >= boards.dimensions else np.eye(3)[boards.dimensions - 1]
+        variants.append(points - 2 * np.outer(middle @ normal, normal))
+    spread = max(float(size[0]) / np.sqrt(len(points)), 0.1)
+    for _ in range(shaken):
+        moved = points.copy()
+        moved[:, : boards.dimensions] += 0.5 * spread * rng.normal(size=(len(points), boards.dimensions))
+        variants.append(moved)
+    if boards.order:
+        variants.append(first_start(network, x[network.layout.where["delay"]])[: place.size].reshape(-1, 3)[here])
+    for variant in variants:
         changed = place.copy()
-        changed[here] = points
+        changed[here] = variant
         yield network.with_positions(x, changed)
 
 
-def _variants(points: Floats, dimensions: int, count: int, rng: np.random.Generator) -> Iterator[Floats]:
-    order = np.argsort(points[:, 0])
-    for a, b in pairwise(order.tolist()):
-        if dimensions == 1:
-            found = points.copy()
-            found[[a, b]] = points[[b, a]]
-            yield found
-    middle = points - points.mean(axis=0)
-    _, size, axes = np.linalg.svd(middle, full_matrices=False)
-    if dimensions > 1:
-        # Through the plane in which boards nearly lie: what is on its one side might be on its other.
-        normal = axes[dimensions - 1] if len(axes) >= dimensions else np.eye(3)[dimensions - 1]
-        yield points - 2 * np.outer(middle @ normal, normal)
-    spread = max(float(size[0]) / np.sqrt(len(points)), 0.1)
-    for _ in range(count):
-        shaken = points.copy()
-        shaken[:, :dimensions] += 0.5 * spread * rng.normal(size=(len(points), dimensions))
-        yield shaken
-
-
-def _distances(network: Network, x: Floats, arrangement: int) -> tuple[list[int], Floats]:
-    """Return the points of an arrangement and their distances (n, n); by way of others where not measured."""
-    here = [k for k, (a, _) in enumerate(network.points) if a == arrangement]
-    number = {point: k for k, point in enumerate(here)}
+def _distances(network: Network, measured: Floats, here: Ints) -> Floats:
+    """Return the distances (n, n) of the points of an arrangement; by way of others where they were not measured."""
     apart = np.full((len(here), len(here)), np.inf)
     np.fill_diagonal(apart, 0.0)
-    measured = network.means.range_m - network.linear @ x
-    for (i, j), length in zip(network.ends.tolist(), measured.tolist(), strict=True):
-        if i in number and j in number:
-            apart[number[i], number[j]] = apart[number[j], number[i]] = max(length, 0.01)
+    rows = np.flatnonzero(np.isin(network.ends[: len(network.means), 0], here))
+    ends = np.searchsorted(here, network.ends[rows])
+    apart[ends[:, 0], ends[:, 1]] = apart[ends[:, 1], ends[:, 0]] = np.maximum(measured[rows], 0.01)
     for via in range(len(here)):
         apart = np.minimum(apart, apart[:, [via]] + apart[[via], :])
     longest = float(apart[np.isfinite(apart)].max(initial=1.0))
-    return here, np.where(np.isfinite(apart), apart, longest)
+    return np.where(np.isfinite(apart), apart, longest)
 
 
-def _onto_known(network: Network, points: Floats, here: list[int]) -> Floats:
+def _onto_known(network: Network, points: Floats, here: Ints) -> Floats:
     """Return points turned, mirrored and shifted onto the known positions among them."""
-    number = {point: k for k, point in enumerate(here)}
-    rows = [k for k, at in enumerate(network.known.at.tolist()) if at in number]
-    if not rows:
+    rows = np.flatnonzero(np.isin(network.known.at, here))
+    if not len(rows):
         return points
-    goal, mine = network.known.position_m[rows], points[[number[int(network.known.at[k])] for k in rows]]
+    goal, mine = network.known.position_m[rows], points[np.searchsorted(here, network.known.at[rows])]
     u, _, v = np.linalg.svd((mine - mine.mean(axis=0)).T @ (goal - goal.mean(axis=0)))
     return np.asarray((points - mine.mean(axis=0)) @ (u @ v) + goal.mean(axis=0))

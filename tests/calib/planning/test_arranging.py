@@ -10,24 +10,25 @@ from typer.testing import CliRunner
 import calib
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
-from calib.planning.candidates import Layout, delay_information, on_line
+from calib.planning.predicted import Layout, SurveyInputs, delay_information, on_line
 
 C_M_PER_NS = 0.299702547
 
 
 def test_three_in_a_row_give_the_middle_delay_by_what_was_counted_by_hand():
     """r12 + r23 - r13 is twice half the middle's delay: its variance is that of three pairs."""
-    information = delay_information(on_line((0, 1, 2), 2.0), 0.02, 0.005)
+    information = delay_information(SurveyInputs(tags=(1, 2, 3), on="line"), on_line((0, 1, 2), 2.0))
     values, vectors = np.linalg.eigh(information)
     assert np.count_nonzero(values > 1e-6 * values[-1]) == 1
     assert np.abs(vectors[:, -1]) == pytest.approx([0, 1, 0], abs=1e-9)
-    assert 1 / math.sqrt(values[-1]) == pytest.approx(0.02 * math.sqrt(3))
+    assert C_M_PER_NS / math.sqrt(values[-1]) == pytest.approx(0.02 * math.sqrt(3))
 
 
 def test_four_in_a_row_say_of_each_board_inside_its_own_delay_and_nothing_else():
     """So eight orders, in which each of four stands inside four times, leave sqrt(2 / 4) of a pair's error, at best."""
-    information = delay_information(on_line((2, 0, 3, 1), 3.0), 0.02, 0.005)
-    assert information == pytest.approx(np.diag([0.5, 0, 0, 0.5]) / 0.02**2, abs=1e-9 / 0.02**2)
+    information = delay_information(SurveyInputs(tags=(1, 2, 3, 4), on="line"), on_line((2, 0, 3, 1), 3.0))
+    unit = (C_M_PER_NS / 0.02) ** 2
+    assert information == pytest.approx(np.diag([0.5, 0, 0, 0.5]) * unit, abs=1e-6 * unit)
 
 
 def in_pair_errors(boards, on, count):
@@ -134,7 +135,7 @@ def test_what_cannot_be_planned_is_refused(boards, settings, message):
 
 
 def test_information_of_a_known_place_is_that_of_its_coordinates():
+    inputs = SurveyInputs(tags=(1, 2), on="plane", anchors=(1, 2), anchor_sigma_m=1e-6)
     place = np.array([[0.0, 0, 0], [2.0, 0, 0]])
-    known = {0: 1e-6, 1: 1e-6}
-    information = delay_information(Layout(place, 1), 0.02, 0.005, known)
-    assert information == pytest.approx(np.full((2, 2), 0.25 / 0.02**2), rel=1e-3)
+    information = delay_information(inputs, Layout(place, 2)) * (0.02 / C_M_PER_NS) ** 2
+    assert information == pytest.approx(np.full((2, 2), 0.25), rel=1e-3)

@@ -8,33 +8,38 @@ import pytest
 import calib
 from benchmarks import surveys
 from benchmarks.standing import places_of, standing_boards
-from calib.planning.candidates import Layout, delay_information, on_line
-from calib.planning.having import having
-from calib.planning.promise import CURVE_M, POWER_AT_1_M_DBM, promises
+from calib.planning.predicted import (
+    CURVE_M,
+    POWER_AT_1_M_DBM,
+    Layout,
+    SurveyInputs,
+    delay_information,
+    on_line,
+    predict,
+)
 
 
 def given(boards, on="line", **settings):
-    return having(boards, on, None, 0, 0.005, (), 0.01, 0.02, 1, settings.get("reflected", 0.0))
+    return SurveyInputs(tags=tuple(range(1, boards + 1)), on=on, **settings)
 
 
 def test_without_reflections_and_curve_it_is_the_inverse_of_the_information():
     layouts = [on_line(order, 4.0) for order in ((0, 1, 2, 3), (1, 0, 3, 2), (2, 0, 3, 1))]
-    total = sum(delay_information(layout, 0.02, 0.005) for layout in layouts)
-    covariance = np.linalg.inv(total) / surveys.C_M_PER_NS**2
-    last = promises(given(4), layouts)[-1]
+    covariance = np.linalg.inv(sum(delay_information(given(4), layout) for layout in layouts))
+    last = predict(given(4), layouts)[-1]
     assert last.each == pytest.approx(np.sqrt(np.diag(covariance)))
     assert last.common == pytest.approx(math.sqrt(covariance.mean()))
     centre = np.eye(4) - 0.25
     assert last.apart == pytest.approx(np.sqrt(np.diag(centre @ covariance @ centre)))
-    assert np.isinf(promises(given(4), layouts)[0].common)
+    assert np.isinf(predict(given(4), layouts)[0].common)
 
 
 def test_three_in_a_row_say_nothing_where_one_of_their_pairs_is_mostly_reflected():
     """All three are straight with 0.9^3 = 0.73 and 0.7^3 = 0.34; then the middle delay is what it always is."""
     row = [on_line((0, 1, 2), 2.0)]
     middle = 0.02 * math.sqrt(3) / surveys.C_M_PER_NS
-    assert promises(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(middle)
-    assert np.isinf(promises(given(3, reflected=0.3), row)[0].each[1])
+    assert predict(given(3, reflected=0.1), row)[0].each[1] == pytest.approx(middle)
+    assert np.isinf(predict(given(3, reflected=0.3), row)[0].each[1])
 
 
 def test_reflected_pairs_cost_what_their_loss_costs():
@@ -59,9 +64,9 @@ def test_reflected_pairs_cost_what_their_loss_costs():
             total += left.T @ left / 0.02**2
         of_draws.append(np.diag(np.linalg.pinv(total)))
     expected = np.sqrt(np.mean(of_draws)) / surveys.C_M_PER_NS
-    found = promises(given(6, "plane", reflected=0.1), [Layout(place, 2) for place in places])[-1].each
+    found = predict(given(6, "plane", reflected=0.1), [Layout(place, 2) for place in places])[-1].each
     assert np.sqrt(np.mean(found**2)) == pytest.approx(expected, rel=0.15)
-    assert np.mean(found) > 1.05 * np.mean(promises(given(6, "plane"), [Layout(place, 2) for place in places])[-1].each)
+    assert np.mean(found) > 1.05 * np.mean(predict(given(6, "plane"), [Layout(place, 2) for place in places])[-1].each)
 
 
 def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
@@ -69,7 +74,7 @@ def test_a_curve_costs_what_a_process_of_its_size_costs(monkeypatch):
     monkeypatch.setattr(surveys, "power_dbm", lambda length: POWER_AT_1_M_DBM - 20 * math.log10(length))
     world = standing_boards(3, "plane", boards=5, arrangements=5, size_m=6.0, each=5)
     expected = surveys.promised(world, 2, CURVE_M, 0.0)
-    found = promises(given(5, "plane"), [Layout(place, 2) for place in world.places], curve=True)[-1].each
+    found = predict(given(5, "plane"), [Layout(place, 2) for place in world.places], curve=True)[-1].each
     assert found == pytest.approx(expected, rel=0.1)
 
 

@@ -9,65 +9,64 @@ from scipy.special import betaln, ndtr
 
 import calib
 from benchmarks.standing import standing_boards
-from calib.surveys.assembling import assembled
-from calib.surveys.gathering import gather
 from calib.surveys.knowledge import Knowledge
-from calib.surveys.reflections import choices, searched
+from calib.surveys.network import Case
+from calib.surveys.recordings import read_surveys
+from calib.surveys.reflections import Marks
 from calib.surveys.starts import first_start
+from calib.surveys.survey import network_of
 
-PAIR_M = 0.02
-
-
-def network_of(world, shape="line"):
-    knowledge = Knowledge(shape=shape)
-    return assembled(gather(world.ranges, knowledge), knowledge, {}, delays_only=True)[0]
+PAIR_M, CURVE_M = 0.02, 0.03
 
 
 @pytest.fixture(scope="module")
 def linear():
-    """A network of three arrangements on a line, unknowns about which it is linear, and what is known of its rows."""
-    network = network_of(standing_boards(11, boards=4, arrangements=3, reflected=0.12))
-    x = first_start(network)
+    """Marks of three arrangements on a line, none set, and how unlikely marks are by the likelihood written out."""
+    world = standing_boards(11, boards=4, arrangements=3, reflected=0.12)
+    knowledge = Knowledge(shape="line")
+    network = network_of(read_surveys(world.ranges, knowledge), knowledge, {}, curve=False)[0]
+    x, free = first_start(network), network.free()
     rows = len(network.means)
-    jacobian = network.jacobian(x)
-    spread = jacobian @ np.linalg.inv(network.prior(0.03)) @ jacobian.T
-    seen = network.residuals(x) + jacobian @ (x - network.centre())
+    left, jacobian = network.linear(x)
+    prior, centre = network.prior(CURVE_M)
+    spread = jacobian[:, free] @ np.linalg.inv(prior[np.ix_(free, free)]) @ jacobian[:, free].T
+    seen = left + jacobian[:, free] @ (x - centre)[free]
 
     def unlikely(marks):
         marks = np.array(marks, dtype=float)
         own = network.means.std_m**2 + PAIR_M**2 + 0.25**2 * marks
         count = marks.sum()
-        prior = betaln(1 + count, 30 + rows - count) - betaln(1, 30)
+        share = betaln(1 + count, 30 + rows - count) - betaln(1, 30)
         covariance, away = np.diag(own) + spread, seen - 0.3 * marks
         back = np.linalg.inv(covariance)
         # No detour is shorter than the straight way, but for a gross error in a hundred.
         hit = marks > 0
         detour, std = 0.3 + 0.25**2 * (back @ away)[hit], np.sqrt(0.25**2 - 0.25**4 * np.diag(back)[hit])
         longer = np.log((ndtr(detour / std) + 0.01) / (ndtr(0.3 / 0.25) + 0.01)).sum()
-        return np.linalg.slogdet(covariance)[1] + away @ np.linalg.solve(covariance, away) - 2 * prior - 2 * longer
+        return np.linalg.slogdet(covariance)[1] + away @ np.linalg.solve(covariance, away) - 2 * share - 2 * longer
 
-    return network, x, unlikely
-
-
-def test_weights_are_those_of_the_likelihood_written_out(linear):
-    network, x, unlikely = linear
-    found = choices(network, x, network.std_m(PAIR_M), 0.03)
-    assert len(found.weight) > 3
-    value = np.array([unlikely(marks) for marks in found.marks])
-    weight = np.exp(-0.5 * (value - value.min()))
-    # The covariance written out has numbers from 1e-4 to 1e6.
-    assert found.weight == pytest.approx(weight / weight.sum(), rel=5e-3)
+    return Marks.at(network, x, Case(np.zeros(rows, dtype=bool), PAIR_M, CURVE_M)), unlikely
 
 
 def test_the_search_ends_where_no_change_of_two_rows_is_likelier(linear):
-    network, x, unlikely = linear
-    marks = searched(network, x, network.std_m(PAIR_M), 0.03)
+    none, unlikely = linear
+    marks = none.searched()
     assert marks.any()
     here = unlikely(marks)
     for rows in [*combinations(range(len(marks)), 1), *combinations(range(len(marks)), 2)]:
         other = marks.copy()
         other[list(rows)] ^= True
         assert unlikely(other) > here - 1e-3
+
+
+def test_weights_are_those_of_the_likelihood_written_out(linear):
+    none, unlikely = linear
+    found, weight = none.window()
+    assert len(weight) > 3
+    value = np.array([unlikely(marks) for marks in found])
+    expected = np.exp(-0.5 * (value - value.min()))
+    # The covariance written out has numbers from 1e-4 to 1e6.
+    assert weight == pytest.approx(expected / expected.sum(), rel=5e-3)
 
 
 def reflected(world, arrangement, first, second, longer_m):

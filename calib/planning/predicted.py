@@ -1,0 +1,262 @@
+"""What arrangements of boards would say of their delays: Fisher's information of a survey's own rows, without data.
+
+Places are unknown. With reflections, which pairs are reflected is drawn, and what is promised is the root mean square
+over the draws: a reflected pair says nothing of the delays. A curve over power is what a survey takes it for, a smooth
+function of the power, which falls with distance as in free space, of 5 cm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from calib.calibration.power_curves import ALPHA_DBM
+from calib.errors import BadInputError
+from calib.information import Unknown, Verdict, judge
+from calib.surveys.network import DIMENSIONS, Boards, Case, CurvePrior, Known, Network
+from calib.surveys.outcome import DELAY_SCALE_NS
+from calib.surveys.recordings import PairMeans
+from uwblink.arrays import Floats
+
+SIZES_M = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "": (6.0, 5.0, 2.5)}
+"""Where boards may stand if nobody says: a string across a room, a large table, a room."""
+
+MOST_REFLECTED = 0.3
+"""Share of reflected pairs beyond which nobody could tell which they are."""
+
+NEAREST_M = 0.4
+"""Boards stand no nearer to each other; nearer, powers saturate and fields are not yet waves."""
+
+CURVE_M = 0.05
+"""How large a curve over power is, as a standard deviation: that of the published curves (`BEND_DB`) is 0.1 m."""
+
+POWER_AT_1_M_DBM = -74.0
+"""Received power at a metre, as DW1000 boards report it."""
+
+DRAWS = 100
+"""Draws of which pairs are reflected: a root mean square over them is good to a few per cent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Places (boards, 3) of an arrangement in metres, and the pairs of boards (by number) whose distance is taped."""
+
+    place_m: Floats
+    dimensions: int
+    taped: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveyInputs:
+    """What one has, checked: `on` is "line", "plane" or "" (a room), as a survey knows it; lengths in metres.
+
+    `size_m` None stands for `SIZES_M`. Raises `BadInputError` for what cannot be.
+    """
+
+    tags: tuple[int, ...]
+    on: str
+    size_m: Sequence[float] | None = None
+    taped: int = 0
+    tape_sigma_m: float = 0.005
+    pair_error_m: float = 0.02
+    anchors: tuple[int, ...] = ()
+    anchor_sigma_m: float = 0.01
+    seed: int = 1
+    reflected: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check all values."""
+        if not 2 <= len(self.tags) <= 30 or len(set(self.tags)) < len(self.tags):
+            raise BadInputError(f"found {self.tags!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
+        if self.on not in DIMENSIONS:
+            raise BadInputError(f"found {self.on!r:.40}, allowed: line, plane, space", parameter="on")
+        for name in ("tape_sigma_m", "anchor_sigma_m", "pair_error_m"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise BadInputError(f"found {value}, expected more than 0", parameter=name)
+        if self.taped < 0:
+            raise BadInputError(f"found {self.taped}, expected 0 or more", parameter="taped")
+        if not 0 <= self.reflected <= MOST_REFLECTED:
+            raise BadInputError(f"found {self.reflected}, expected 0 to {MOST_REFLECTED}", parameter="reflected")
+        strangers = sorted(set(self.anchors) - set(self.tags))
+        if strangers:
+            raise BadInputError(f"{strangers[0]} is none of the boards", parameter="anchors")
+        if self.anchors and self.on == "line":
+            raise BadInputError(
+                "stand in a plane or in space; on a line say how many distances are taped", parameter="anchors"
+            )
+        size = self.size_m
+        if size is not None and (
+            len(size) != self.dimensions or not all(math.isfinite(length) and length > 0 for length in size)
+        ):
+            text = f"found {list(size)}, expected as many lengths in metres as it has dimensions, {self.dimensions}"
+            raise BadInputError(text, parameter="size_m")
+
+    @property
+    def dimensions(self) -> int:
+        """In how many dimensions boards may stand."""
+        return DIMENSIONS[self.on]
+
+    def lengths_m(self) -> Floats:
+        """Return how large the line, table or room is (3,)."""
+        if self.size_m is None:
+            x, y, z = SIZES_M[self.on]
+            return np.array([max(x, 0.8 * (len(self.tags) - 1)) if self.on == "line" else x, y, z])
+        return np.pad(np.array(self.size_m, dtype=float), (0, 3 - len(self.size_m)))
+
+
+def random_layouts(inputs: SurveyInputs, count: int, tries: int = 400) -> list[Layout]:
+    """Return random arrangements: orders on a line at even steps, random places on a table or in a room.
+
+    Fewer than `count` where a line has fewer orders, or a room too little space. Anchors stay where the first one has
+    them: the corners of a room are as good a guess as any.
+    """
+    rng, boards, size = np.random.default_rng(inputs.seed), len(inputs.tags), inputs.lengths_m()
+    anchors = [inputs.tags.index(tag) for tag in inputs.anchors]
+    found: list[Layout] = []
+    seen: set[tuple[int, ...]] = set()
+    for _ in range(tries):
+        if len(found) == count:
+            break
+        if inputs.on == "line":
+            order = tuple(rng.permutation(boards).tolist())
+            if order not in seen:
+                seen |= {order, order[::-1]}
+                found.append(on_line(order, float(size[0])))
+            continue
+        place = np.zeros((boards, 3))
+        dimensions = inputs.dimensions
+        place[:, :dimensions] = np.round(rng.uniform(0, size[:dimensions], (boards, dimensions)), 1)
+        if min(np.linalg.norm(place[i] - place[j]) for i, j in combinations(range(boards), 2)) >= NEAREST_M:
+            place[anchors] = found[0].place_m[anchors] if found else place[anchors]
+            found.append(Layout(place, dimensions))
+    return found
+
+
+def on_line(order: tuple[int, ...], length_m: float) -> Layout:
+    """Return boards (by number) in an order, at even steps along a line."""
+    place = np.zeros((len(order), 3))
+    place[list(order), 0] = np.round(np.linspace(0, length_m, len(order)), 1)
+    return Layout(place, 1)
+
+
+def rows_of(inputs: SurveyInputs, layout: Layout, curve: CurvePrior | None = None) -> tuple[Floats, Floats]:
+    """Return the derivatives (n, k) of an arrangement's rows by delays (ns) and curve, and by coordinates, over errors.
+
+    First those of all pairs, as `itertools.combinations` has them, then taped distances and known coordinates.
+    """
+    boards = len(inputs.tags)
+    pairs = np.array(list(combinations(range(boards), 2)))
+    none, ids = np.zeros(len(pairs)), np.zeros(len(pairs), dtype=np.int64)
+    taped = np.array(layout.taped, dtype=np.int64).reshape(-1, 2)
+    anchors = np.array([inputs.tags.index(tag) for tag in inputs.anchors], dtype=np.int64)
+    network = Network(
+        means=PairMeans(
+            arrangement=ids,
+            ends=pairs,
+            weights=np.full((len(pairs), 2), 0.5),
+            range_m=none,
+            std_m=none,
+            noise_m=none,
+            count=ids,
+            lifted=none,
+        ),
+        arrangements=(Boards("", layout.dimensions, tuple(range(boards))),),
+        tags=tuple(range(boards)),
+        known=Known(
+            ends=taped,
+            distance_m=np.zeros(len(taped)),
+            distance_std_m=np.full(len(taped), inputs.tape_sigma_m),
+            statement=np.arange(len(taped)),
+            at=anchors,
+            position_m=layout.place_m[anchors],
+            position_std_m=np.full(len(anchors), inputs.anchor_sigma_m),
+        ),
+        fixed_ns={},
+        curve=curve,
+    )
+    case = Case(marks=none.astype(bool), pair_m=inputs.pair_error_m, curve_m=CURVE_M)
+    rows = network.linear(network.with_positions(network.layout.start(), layout.place_m))[1]
+    rows /= network.std_m(case)[:, None]
+    wanted = np.concatenate([network.columns("delay"), network.columns("curve")])
+    return rows[:, wanted], rows[:, np.setdiff1d(network.free(), wanted)]
+
+
+def delay_information(inputs: SurveyInputs, layout: Layout) -> Floats:
+    """Return the information (boards, boards) on delays, 1/ns^2, that an arrangement gives, whatever its places."""
+    return information_beside(*rows_of(inputs, layout))
+
+
+def information_beside(wanted: Floats, others: Floats) -> Floats:
+    """Return the information on the wanted unknowns (n, m) that the others (n, k) cannot take up."""
+    if not len(others):
+        return np.zeros((wanted.shape[1],) * 2)
+    basis, size, _ = np.linalg.svd(others, full_matrices=False)
+    basis = basis[:, size > 1e-9 * size[0]]
+    left = wanted - basis @ (basis.T @ wanted)
+    return left.T @ left
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Standard deviations in ns, infinite where undetermined: of delays (tags,), each against their mean, that."""
+
+    each: Floats
+    apart: Floats
+    common: float
+
+
+def predict(inputs: SurveyInputs, layouts: Sequence[Layout], *, curve: bool = False) -> list[Prediction]:
+    """Return what is predicted of the first of the arrangements, of the first two, and so on."""
+    boards, pairs = len(inputs.tags), np.array(list(combinations(range(len(inputs.tags)), 2)))
+    lengths = [np.linalg.norm(one.place_m[pairs[:, 0]] - one.place_m[pairs[:, 1]], axis=1) for one in layouts]
+    powers = POWER_AT_1_M_DBM - 20 * np.log10(np.concatenate(lengths))
+    prior = CurvePrior.at(10 ** ((powers - ALPHA_DBM) / 10)) if curve else None
+    parts = []
+    for k, layout in enumerate(layouts):
+        here = slice(k * len(pairs), (k + 1) * len(pairs))
+        own = None if prior is None else replace(prior, design=prior.design[here])
+        wanted, places = rows_of(inputs, layout, own)
+        kept = np.ones((DRAWS if inputs.reflected else 1, len(wanted)), dtype=bool)
+        if inputs.reflected:
+            rng = np.random.default_rng([inputs.seed, k])
+            kept[:, : len(pairs)] = rng.uniform(size=(DRAWS, len(pairs))) >= inputs.reflected
+        parts.append(np.array([information_beside(wanted[rows], places[rows]) for rows in kept]))
+    before = np.zeros(parts[0].shape[1:])
+    if prior is not None:
+        before[boards:, boards:] = prior.precision / CURVE_M**2
+    return [_averaged([_verdict(one, inputs.tags) for one in draws + before]) for draws in np.cumsum(parts, axis=0)]
+
+
+def verdict_on_delays(information: Floats, tags: Sequence[int]) -> Verdict:
+    """Return what is determined of delays by their information (tags, tags), 1/ns^2."""
+    return judge(information, [Unknown("delay", str(tag), DELAY_SCALE_NS) for tag in tags])
+
+
+def _verdict(information: Floats, tags: tuple[int, ...]) -> Verdict:
+    """Return what is determined of the delays, whatever the curve is."""
+    boards = len(tags)
+    mixed, curve = information[:boards, boards:], information[boards:, boards:]
+    left = information[:boards, :boards] - mixed @ np.linalg.solve(curve, mixed.T)
+    values, vectors = np.linalg.eigh((left + left.T) / 2)
+    return verdict_on_delays((vectors * np.maximum(values, 0.0)) @ vectors.T, tags)
+
+
+def _averaged(verdicts: list[Verdict]) -> Prediction:
+    """Return root mean squares over the draws that determine it; infinite where most do not."""
+    rows = []
+    for one in verdicts:
+        whole = one.determined.all()
+        centre = np.eye(len(one.std)) - 1 / len(one.std)
+        apart = np.sqrt(np.diag(centre @ one.covariance @ centre)) if whole else np.full(len(one.std), math.inf)
+        rows.append([*one.std, *apart, math.sqrt(float(one.covariance.mean())) if whole else math.inf])
+    every = np.array(rows)
+    good = np.isfinite(every)
+    mean = np.sqrt((np.where(good, every, 0.0) ** 2).sum(axis=0) / np.maximum(good.sum(axis=0), 1))
+    found = np.where(good.mean(axis=0) > 0.5, mean, math.inf)
+    count = len(found) // 2
+    return Prediction(found[:count], found[count:-1], float(found[-1]))

@@ -1,0 +1,195 @@
+"""What contradicts the ranges: known distances, shapes that are none, labels that were exchanged.
+
+Each check holds hypotheses of what is wrong against the survey as it was said to be, each with the reflections that fit
+it best: a few reflected pairs can look like a string that is not straight. The statistic is the ratio of likelihoods,
+whatever the unknowns are; by Markov's inequality such a ratio is above 1/p with a probability of at most p where
+nothing is wrong. The likeliest hypothesis is taken first, because a wrong tape makes other things look wrong, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from calib.surveys.network import Network
+from calib.surveys.orders import exchanged_boards, line_coordinates
+from calib.surveys.result import Contradiction
+from calib.surveys.solution import Solution, adjust, out_of_order, settle_with_marks, unlikelihood
+from calib.surveys.starts import first_start
+from uwblink.arrays import Floats
+
+FALSE_ALARMS = 0.01
+"""Share of sound surveys in which a check may find something."""
+
+WORTH_A_LOOK = 1.0
+"""Fall of -2 log likelihood of an arrangement alone from which its shape is looked at, if there are more than three."""
+
+ODD = 3.0
+"""Standard deviations by which something known must be off for labels to be looked at."""
+
+WRONG_TAPE_M = 0.5
+"""How wrong a tape is if it is, before any data."""
+
+LEAST_SHARE = 0.02
+"""Share of its variance that the fit must leave of a known distance for its error to be seen."""
+
+LIFT_M = 0.15
+"""How far boards are put beside a line, or plane, for a search to begin: on it a derivative would be zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """What may be wrong, in words, the network without it, a start, and what is known of its size before (-2 log)."""
+
+    text: str
+    network: Network
+    start: Floats
+    beforehand: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A question to a survey: the hypotheses that answer it, and what to do where one is true."""
+
+    name: str
+    question: str
+    remedy: str
+    hypotheses: Callable[[Solution, tuple[str, ...]], Iterator[Hypothesis]]
+
+
+def worst(
+    found: Solution, names: tuple[str, ...], pair_m: float | None = None
+) -> tuple[Contradiction, Solution] | None:
+    """Return the likeliest hypothesis that chance does not explain, and the solution in which it is true.
+
+    `names` say what each known distance is called.
+    """
+    best: tuple[float, Contradiction, Solution] | None = None
+    for check in CHECKS:
+        for one in check.hypotheses(found, names):
+            without = adjust(one.network, one.start, pair_m=pair_m)
+            p_value = math.exp(min(0.5 * (without.unlikely + one.beforehand - found.unlikely), 0.0))
+            if p_value < FALSE_ALARMS and (best is None or without.unlikely + one.beforehand < best[0]):
+                finding = Contradiction(check.name, f"{one.text}; {check.remedy}", p_value)
+                best = without.unlikely + one.beforehand, finding, without
+    return None if best is None else best[1:]
+
+
+def _of_known(found: Solution) -> tuple[Floats, Floats, Floats]:
+    """Return of what is known (k,) what is left, its standard deviation, and the share of its variance that is left."""
+    network, here = found.network, len(found.network.means)
+    left, jacobian = network.linear(found.x)
+    std = network.std_m(found.case)
+    rows = jacobian[here:]
+    covariance = found.covariance() - found.more
+    share = 1 - np.einsum("ij,jk,ik->i", rows, covariance, rows) / std[here:] ** 2
+    return left[here:], std[here:], np.clip(share, 1e-9, 1.0)
+
+
+def _distances(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+    network, known = found.network, found.network.known
+    left, _, share = _of_known(found)
+    for statement in np.unique(known.statement).tolist():
+        rows = np.flatnonzero(known.statement == statement)
+        off = float(np.mean(left[rows] / np.maximum(share[rows], LEAST_SHARE)))
+        keep = known.statement != statement
+        less = replace(
+            known,
+            ends=known.ends[keep],
+            distance_m=known.distance_m[keep],
+            distance_std_m=known.distance_std_m[keep],
+            statement=known.statement[keep],
+        )
+        # The rows go, and with them what they say of likelihood: as if the tape were wrong by some half a metre.
+        std = np.append(known.distance_std_m[rows][1:], WRONG_TAPE_M)
+        beforehand = 2 * float(np.log(std).sum()) + (off / WRONG_TAPE_M) ** 2
+        text = f"{names[statement]} is {100 * off:+.0f} cm off what the ranges say"
+        yield Hypothesis(text, replace(network, known=less), found.x, beforehand)
+
+
+def _shapes(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+    network = found.network
+    for k, boards in enumerate(network.arrangements):
+        if boards.dimensions == 3 or len(boards.tags) < boards.dimensions + 2 or boards.freed:
+            continue
+        arrangements = list(network.arrangements)
+        arrangements[k] = replace(boards, dimensions=boards.dimensions + 1, freed=True)
+        freed = replace(network, arrangements=tuple(arrangements))
+        seats, beside = network.seats(k), boards.dimensions
+        place = network.positions(found.x)
+        place[seats] = freed.positions(first_start(freed, found.delays))[seats]
+        # Where scaling finds nothing beside the line, a derivative there would be zero.
+        if np.ptp(place[seats, beside]) < LIFT_M:
+            place[seats, beside] += LIFT_M * np.where(np.arange(len(seats)) % 2, 1.0, -1.0)
+        mine = replace(found.case, marks=found.case.marks & ~network.rows_of(k))
+        value, x, _ = settle_with_marks(freed, freed.with_positions(found.x, place), mine, k)
+        alone = unlikelihood(network, found.x, found.case, k)
+        if alone - value < WORTH_A_LOOK and len(network.arrangements) > 3:
+            continue
+        away = freed.positions(x)[seats, beside]
+        odd = boards.tags[int(np.argmax(np.abs(away - np.median(away))))]
+        shape = "line" if boards.dimensions == 1 else "plane"
+        text = (
+            f"{boards.name} is said to be a {shape} and is none: its ranges fit if boards, {odd} first of all, stand "
+            f"up to {100 * np.ptp(away):.0f} cm beside it"
+        )
+        yield Hypothesis(text, freed, x)
+
+
+def _exchanged(found: Solution, names: tuple[str, ...]) -> Iterator[Hypothesis]:
+    """Yield what is known with two tags' names exchanged, where something known is off or reflected."""
+    network, known = found.network, found.network.known
+    left, std, share = _of_known(found)
+    if not (np.abs(left) > ODD * std * np.sqrt(share)).any() and not (len(left) and found.case.marks.any()):
+        return
+    number = {point: k for k, point in enumerate(network.points)}
+    involved = {network.points[k][1] for k in [*known.ends.ravel().tolist(), *known.at.tolist()]}
+    for one, other in combinations(sorted(involved), 2):
+        swap = {one: other, other: one}
+        new = np.array([number.get((a, swap.get(t, t)), k) for k, (a, t) in enumerate(network.points)])
+        changed = replace(network, known=replace(known, ends=new[known.ends], at=new[known.at]))
+        text = f"what is known fits if {one} and {other} are exchanged"
+        yield Hypothesis(text, changed, first_start(changed, found.delays))
+
+
+CHECKS = (
+    Check("distance", "is a known distance wrong?", "measure it again or leave it out", _distances),
+    Check("shape", "is a line, or a plane, none?", "put the boards as is said, or do not say so", _shapes),
+    Check("labels", "are two boards' labels exchanged?", "look at the labels of these two boards", _exchanged),
+)
+
+
+def misplaced(found: Solution) -> Iterator[Contradiction]:
+    """Yield what is wrong with orders that were said of boards on a line, once for each mistake.
+
+    What several arrangements have in common is one mistake.
+    """
+    network = found.network
+    points = network.positions(found.x)
+    mistakes: list[tuple[set[tuple[int, int]], list[int], Floats]] = []
+    for k in out_of_order(network, found.x):
+        boards = network.arrangements[k]
+        spot = line_coordinates(points[network.seats(k)], boards.tags, boards.order)
+        pairs = exchanged_boards(boards.order, spot)
+        same = next((n for n, (known, _, _) in enumerate(mistakes) if known & pairs), None)
+        if same is None:
+            mistakes.append((pairs, [k], spot))
+        else:
+            known, rows, first = mistakes[same]
+            mistakes[same] = known & pairs, [*rows, k], first
+    for pairs, rows, spot in mistakes:
+        wrong = [network.arrangements[k] for k in rows]
+        said = wrong[0].order
+        forward = np.corrcoef(np.arange(len(spot)), spot)[0, 1] > 0
+        way = [said[k] for k in np.argsort(spot if forward else -spot).tolist()]
+        words = ", or ".join(f"{i} and {j}" for i, j in sorted(pairs))
+        where = ", ".join(boards.name for boards in wrong)
+        orders = f"said was {'-'.join(map(str, said))}, the ranges of {wrong[0].name} say {'-'.join(map(str, way))}"
+        text = f"{where}: boards {words} stand in each other's place: {orders}; look at the labels of these two"
+        if not pairs:
+            text = f"{where}: boards stand in another order than said: {orders}; look at their labels"
+        yield Contradiction("labels", text, FALSE_ALARMS)

@@ -1,0 +1,356 @@
+"""The solution of a network: the unknowns that agree best with what was measured, how large errors are, and others.
+
+For given errors the unknowns come of the one loop (`calib.estimator.optimize`). The constant error of pairs and the
+spread of the curve are those of restricted maximum likelihood (Patterson and Thompson, Biometrika, 1971), with weak
+knowledge beforehand, since a small network says little of either. Likelihoods are those of everything measured,
+whatever the unknowns are (Laplace), so that solutions with other reflections, orders and spreads can be compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from calib.estimator.optimize import maximize
+from calib.surveys.network import DETOUR_M, Case, Lengths, Network
+from calib.surveys.orders import is_in_order, line_coordinates
+from calib.surveys.reflections import Marks, unlikely
+from calib.surveys.result import SecondBest
+from calib.surveys.starts import first_start, other_starts, start_in_order
+from uwblink.arrays import Floats, Ints
+
+PAIR_STD_M, PAIR_WORTH = 0.02, 3.0
+"""What a constant error of a pair is like before any data, and worth how many degrees of freedom."""
+
+CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
+"""Standard deviation of a curve before any data, and the factor by which that may be wrong (`BEND_DB`)."""
+
+WRONG_ORDER = 2 * math.log(100.0)
+"""-2 log of the chance that boards stand in another order than somebody said who put them so: one in a hundred."""
+
+APART_M = 0.03
+"""How far a board must be from where it was for a solution to be another one."""
+
+WORTH_A_LOOK = 60.0
+"""By how much another solution of one arrangement alone may be worse for it to be solved with all others."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Solution:
+    """The best unknowns `x` (p,) of a network, and the errors that go with them.
+
+    `unlikely` is -2 log of the likelihood of everything, up to a constant that all solutions of one set of means share;
+    `freedom` the degrees of freedom that are left. `chance` (n,) is how probable it is of each mean that it is
+    reflected, and `more` (p, p) what it adds to the covariance that others may be reflected, or spreads be others.
+    """
+
+    network: Network
+    x: Floats
+    case: Case
+    unlikely: float
+    freedom: float
+    settled: bool
+    chance: Floats
+    more: Floats
+
+    @property
+    def delays(self) -> Floats:
+        """The delays (tags,), ns."""
+        return self.x[self.network.layout.where["delay"]]
+
+    def residuals_m(self) -> Floats:
+        """Return what is left of each row; of means with the whole detour."""
+        return self.network.linear(self.x)[0]
+
+    def covariance(self) -> Floats:
+        """Return the covariance (p, p), with what is known of delays beforehand, so that there is always one."""
+        return _covariance(self.network, self.x, self.case) + self.more
+
+    def information(self) -> Floats:
+        """Return the information (p, p) of what was measured, and of what is known of the curve."""
+        prior = self.network.prior(self.case.curve_m)[0]
+        places_and_delays = self.network.layout.where["curve"].start
+        prior[:places_and_delays, :places_and_delays] = 0.0
+        found = _information(self.network, self.x, self.case) + prior
+        # Of the sum of two covariances, the first of which may be infinite.
+        wider = np.linalg.solve(np.eye(len(found)) + found @ self.more, found)
+        return np.asarray((wider + wider.T) / 2)
+
+
+def _information(network: Network, x: Floats, case: Case) -> Floats:
+    rows = network.linear(x)[1] / network.std_m(case)[:, None]
+    return rows.T @ rows
+
+
+def _covariance(network: Network, x: Floats, case: Case) -> Floats:
+    free = network.free()
+    found = np.zeros((len(x),) * 2)
+    whole = _information(network, x, case) + network.prior(case.curve_m)[0]
+    found[np.ix_(free, free)] = np.linalg.inv(whole[np.ix_(free, free)])
+    return found
+
+
+def settle(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[Floats, bool]:
+    """Return the best unknowns from a start, or those of `only` one arrangement, and whether the search ended."""
+    places = network.layout.where["place"]
+    found = maximize(
+        [Lengths(network, case)],
+        network.priors(case.curve_m, only),
+        x,
+        evidence_steps=0,
+        tolerance=1e-6,
+        longest=lambda step: 1 / max(1.0, float(np.abs(step[places]).max(initial=0.0))),
+    )
+    return found.x, found.success
+
+
+def unlikelihood(network: Network, x: Floats, case: Case, only: int | None = None) -> float:
+    """Return -2 log likelihood where a search settled, whatever the unknowns are (of `only` one arrangement)."""
+    free = network.free(only)
+    left, jacobian = network.linear(x)
+    left[: len(case.marks)] -= DETOUR_M * case.marks
+    std = network.std_m(case)
+    prior, centre = network.prior(case.curve_m)
+    rows, own = jacobian[:, free] / std[:, None], prior[np.ix_(free, free)]
+    away = x - centre
+    value = float(np.sum((left / std) ** 2) + away @ prior @ away) + 2 * float(np.log(std).sum())
+    value += float(np.linalg.slogdet(rows.T @ rows + own)[1] - np.linalg.slogdet(own)[1])
+    value += unlikely(int(case.marks.sum()), len(case.marks))
+    if case.marks.any():
+        value += float(Marks.at(network, x, case, only).penalties()[case.marks].sum())
+    return value + WRONG_ORDER * len(out_of_order(network, x))
+
+
+def out_of_order(network: Network, x: Floats) -> list[int]:
+    """Return the arrangements in which boards do not stand in the order that is said."""
+    points = network.positions(x)
+    return [
+        k
+        for k, boards in enumerate(network.arrangements)
+        if boards.order and not is_in_order(line_coordinates(points[network.seats(k)], boards.tags, boards.order))
+    ]
+
+
+def adjust(
+    network: Network, x: Floats, case: Case | None = None, *, pair_m: float | None = None, careful: bool = False
+) -> Solution:
+    """Return the best unknowns from a start, with the spreads and the reflected means estimated along.
+
+    `pair_m` is known where given. A `careful` one begins with larger errors of pairs, too (between those and what they
+    are if nothing is reflected), and takes what is likelier.
+    """
+    marks = np.zeros(len(network.means), dtype=bool) if case is None else case.marks
+    first = Case(marks, pair_m or PAIR_STD_M, CURVE_STD_M)
+    found = _alternated(network, x, first, pair_m)
+    if careful:
+        x, _ = settle(network, x, first)
+        large = _spreads(network, x, first, pair_m)
+        middle = replace(large, pair_m=math.sqrt(large.pair_m * first.pair_m))
+        found = min(found, _alternated(network, x, middle, pair_m), key=_unlikely)
+    return found
+
+
+def _unlikely(found: Solution) -> float:
+    return found.unlikely
+
+
+def _alternated(network: Network, x: Floats, case: Case, pair_m: float | None, rounds: int = 6) -> Solution:
+    """Return what comes of settling, of searching for reflections, and of estimating spreads, in turns."""
+    for _ in range(rounds):
+        before = case
+        x, _ = settle(network, x, case)
+        case = replace(case, marks=Marks.at(network, x, case).searched())
+        x, _ = settle(network, x, case)
+        case = _spreads(network, x, case, pair_m)
+        if abs(case.pair_m - before.pair_m) < 0.02 * case.pair_m and np.array_equal(case.marks, before.marks):
+            break
+    x, settled = settle(network, x, case)
+    covariance = _covariance(network, x, case)
+    # Lengths, and known coordinates that may be free.
+    dimensions = np.array([boards.dimensions for boards in network.arrangements])
+    rows = len(network.ends) + int(dimensions[network.owner[network.known.at]].sum())
+    return Solution(
+        network=network,
+        x=x,
+        case=case,
+        unlikely=unlikelihood(network, x, case) + _unlikely_spreads(case.pair_m, case.curve_m),
+        freedom=float(rows - np.sum(covariance * _information(network, x, case))),
+        settled=settled,
+        chance=case.marks.astype(float),
+        more=np.zeros((len(x),) * 2),
+    )
+
+
+def _unlikely_spreads(pair_m: float, curve_m: float) -> float:
+    """Return -2 log of what is known of the spreads beforehand."""
+    known = PAIR_WORTH * (2 * math.log(pair_m) + (PAIR_STD_M / pair_m) ** 2)
+    return known + (math.log(curve_m / CURVE_STD_M) / math.log(CURVE_FACTOR)) ** 2
+
+
+def _unlikely_by_spreads(network: Network, x: Floats, case: Case) -> Callable[[float, float], float]:
+    """Return -2 log likelihood as a function of the logarithms of the spreads of pairs and curve.
+
+    By error contrasts: combinations of rows in which neither coordinates nor delays are, as many as freedoms are left.
+    """
+    left, jacobian = network.linear(x)
+    left[: len(case.marks)] -= DETOUR_M * case.marks
+    curve = network.columns("curve")
+    basis, size, _ = np.linalg.svd(jacobian[:, np.setdiff1d(network.free(), curve)], full_matrices=True)
+    contrasts = basis[:, int(np.count_nonzero(size > 1e-9 * size[0])) :].T
+    curves = contrasts @ jacobian[:, curve]
+    seen = contrasts @ left + curves @ x[curve]
+    own = (contrasts * network.std_m(replace(case, pair_m=0.0)) ** 2) @ contrasts.T
+    shared = contrasts[:, : len(case.marks)] @ contrasts[:, : len(case.marks)].T
+    smooth = 0.0 if network.curve is None else curves @ np.linalg.inv(network.curve.precision) @ curves.T
+
+    def value(log_pair: float, log_curve: float) -> float:
+        found = _unlikely_spreads(math.exp(log_pair), math.exp(log_curve))
+        if len(seen):
+            root = np.linalg.cholesky(own + math.exp(2 * log_pair) * shared + math.exp(2 * log_curve) * smooth)
+            found += 2 * float(np.log(np.diag(root)).sum()) + float(np.sum(np.linalg.solve(root, seen) ** 2))
+        return found
+
+    return value
+
+
+def _spreads(network: Network, x: Floats, case: Case, pair_m: float | None) -> Case:
+    """Return a case with the spreads of pairs and curve that are likeliest."""
+    value = _unlikely_by_spreads(network, x, case)
+    start = np.log([case.pair_m, case.curve_m])
+    free = np.array([pair_m is None, network.curve is not None])
+
+    def unlikely_at(steps: Floats) -> float:
+        log_pair, log_curve = start + np.where(free, steps, 0.0)
+        outside = max(abs(log_pair - math.log(0.02)), abs(log_curve - math.log(0.02))) - 3.9
+        return value(float(log_pair), float(log_curve)) if outside < 0 else 1e9 * (1 + outside)
+
+    simplex = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
+    found = minimize(
+        unlikely_at, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 0.02}
+    )
+    pair, curve = np.exp(start + np.where(free, found.x, 0.0)).tolist()
+    return replace(case, pair_m=pair, curve_m=curve)
+
+
+def averaged(found: Solution, *, pair_known: bool) -> Solution:
+    """Return the mean over what is nearly as likely, with the covariance that the other possibilities add.
+
+    These are other choices of reflected means and, where there is a curve, other spreads of pairs and curve: few pairs
+    say little of how large a curve is, and what all delays share depends on it.
+    """
+    network, x, case = found.network, found.x, found.case
+    marks, weight = Marks.at(network, x, case).window()
+    mean, more = _mixed(found, [replace(case, marks=one) for one in marks], weight)
+    if network.curve is not None:
+        value = _unlikely_by_spreads(network, x, case)
+        # Steps of logarithms of about half of what a survey knows of either.
+        steps = [(0.3 * i, 0.4 * k) for i in range(-2, 3) for k in range(-4, 5) if not (pair_known and i)]
+        cases = [replace(case, pair_m=case.pair_m * math.exp(i), curve_m=case.curve_m * math.exp(k)) for i, k in steps]
+        worse = np.array([value(math.log(one.pair_m), math.log(one.curve_m)) for one in cases])
+        likely = np.exp(-0.5 * (worse - worse.min()))
+        kept = np.flatnonzero(likely > 1e-3)
+        step, wider = _mixed(found, [cases[k] for k in kept.tolist()], likely[kept] / likely[kept].sum())
+        mean, more = mean + step, more + wider
+    return replace(found, x=x + mean, chance=weight @ np.array(marks), more=more)
+
+
+def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floats, Floats]:
+    """Return the mean step over cases, linear, and what their covariance is more than that of one case, not below 0."""
+    network, x, free = found.network, found.x, found.network.free()
+    left, jacobian = network.linear(x)
+    rows = jacobian[:, free]
+
+    def solved(case: Case) -> tuple[Floats, Floats]:
+        std = network.std_m(case)
+        prior, centre = network.prior(case.curve_m)
+        weighed = rows / std[:, None] ** 2
+        spread = np.asarray(np.linalg.inv(rows.T @ weighed + prior[np.ix_(free, free)]), dtype=np.float64)
+        away = left - DETOUR_M * np.pad(case.marks.astype(float), (0, len(left) - len(case.marks)))
+        return spread @ (weighed.T @ away - (prior @ (x - centre))[free]), spread
+
+    here = solved(found.case)[1]
+    every = [solved(case) for case in cases]
+    steps = np.array([step for step, _ in every])
+    mean = weight @ steps
+    around = steps - mean
+    wider = (
+        sum(w * (spread - here) for w, (_, spread) in zip(weight, every, strict=True)) + (around.T * weight) @ around
+    )
+    values, vectors = np.linalg.eigh((wider + wider.T) / 2)
+    step, more = np.zeros(len(x)), np.zeros((len(x),) * 2)
+    step[free] = mean
+    more[np.ix_(free, free)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return step, more
+
+
+def solve(network: Network, *, pair_m: float | None, moves: int = 6) -> tuple[Solution, SecondBest | None]:
+    """Return the best solution that any start leads to, and the second-best."""
+    found = adjust(network, first_start(network), pair_m=pair_m, careful=True)
+    # Once more with the delays that came out: the first guess of places was made without any.
+    found = min(found, adjust(network, first_start(network, found.delays), pair_m=pair_m), key=_unlikely)
+    wrong = out_of_order(network, found.x)
+    if wrong:
+        start = start_in_order(network, found.x, wrong)
+        found = min(found, adjust(network, start, pair_m=pair_m), key=_unlikely)
+    worse: list[tuple[float, tuple[str, tuple[int, ...]]]] = []
+    for _ in range(moves):
+        here = unlikelihood(network, found.x, found.case)
+        others = [other for k in range(len(network.arrangements)) for other in _others(found, k)]
+        worse = [(value - here, who) for value, _, _, who in others if value >= here - 1e-3]
+        better = [other for other in others if other[0] < here - 1e-3]
+        if not better:
+            break
+        _, x, case, _ = min(better, key=lambda other: other[0])
+        moved = adjust(network, x, case, pair_m=pair_m)
+        if moved.unlikely > found.unlikely - 1e-3:
+            break
+        found = moved
+    if not worse:
+        return found, None
+    gap, (name, tags) = min(worse)
+    return found, SecondBest(name, tags, max(gap, 0.0))
+
+
+def settle_with_marks(network: Network, x: Floats, case: Case, only: int | None = None) -> tuple[float, Floats, Case]:
+    """Return -2 log likelihood, the unknowns and the case with what is likeliest reflected, from a start."""
+    for _ in range(2):
+        x, _ = settle(network, x, case, only)
+        marks = Marks.at(network, x, case, only).searched()
+        if np.array_equal(marks, case.marks):
+            break
+        case = replace(case, marks=marks)
+        x, _ = settle(network, x, case, only)
+    return unlikelihood(network, x, case, only), x, case
+
+
+def _others(found: Solution, arrangement: int) -> Iterator[tuple[float, Floats, Case, tuple[str, tuple[int, ...]]]]:
+    """Yield other solutions that differ in one arrangement: how likely, unknowns, errors, and who is elsewhere."""
+    network, mine = found.network, found.network.rows_of(arrangement)
+    seats = network.seats(arrangement)
+    if not mine.any():
+        return
+    straight = replace(found.case, marks=found.case.marks & ~mine)
+    seen = [_signature(network, found.x, seats)]
+    here = unlikelihood(network, found.x, found.case, arrangement)
+    for start in other_starts(network, found.x, arrangement):
+        value, x, case = settle_with_marks(network, start, straight, arrangement)
+        mark = _signature(network, x, seats)
+        if value > here + WORTH_A_LOOK or any(float(np.abs(mark - one).max()) < APART_M for one in seen):
+            continue
+        seen.append(mark)
+        value, x, case = settle_with_marks(network, x, case)
+        change = np.abs(_signature(network, x, seats) - seen[0]).max(axis=1)
+        if change.max() >= APART_M:
+            tags = np.array(network.arrangements[arrangement].tags)[change > max(APART_M, 0.5 * change.max())]
+            yield value, x, case, (network.arrangements[arrangement].name, tuple(tags.tolist()))
+
+
+def _signature(network: Network, x: Floats, seats: Ints) -> Floats:
+    """Return what tells two solutions apart (points, k): distances to all others, and places where a frame is known."""
+    place = network.positions(x)[seats]
+    apart = np.linalg.norm(place[:, None] - place, axis=2)
+    return np.hstack([apart, place]) if len(network.known.at) else apart
