@@ -16,10 +16,9 @@ from itertools import combinations
 import numpy as np
 
 from calib.surveys.network import Network
-from calib.surveys.orders import exchanged_boards, line_coordinates
 from calib.surveys.result import Contradiction
 from calib.surveys.solution import Solution, adjust, out_of_order, settle_with_marks, unlikelihood
-from calib.surveys.starts import first_start
+from calib.surveys.starts import exchanged_boards, first_start, line_coordinates
 from uwblink.arrays import Floats
 
 FALSE_ALARMS = 0.01

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from io import BytesIO
-from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,46 +13,30 @@ from matplotlib.patches import Ellipse
 from calib.surveys.result import SurveyedArrangement
 from uwblink.arrays import Floats
 
-ACROSS: Final = 3
-PANEL_IN: Final = 3.0
-LINE_IN: Final = 1.1
-NARROWEST_IN: Final = 2.2
-CHI_SQUARE_95: Final = 5.991
-"""95 % quantile of chi-square with two degrees of freedom."""
-
-SMALLEST: Final = 0.01
-"""Share of the picture's width below which an ellipse would not be seen: it is then drawn larger, and dashed."""
-
-INK: Final = "#0072B2"
-LOOSE: Final = "#D55E00"
+INK, LOOSE = "#0072B2", "#D55E00"
+"""Colours of boards whose place is determined, and of others (Okabe and Ito, told apart by the colour-blind)."""
 
 
-def board_picture(arrangements: tuple[SurveyedArrangement, ...], form: str) -> bytes:
-    """Return a picture of arrangements, a panel each, as bytes of a form that matplotlib writes ("svg", "png", "pdf").
+def board_figure(arrangements: Sequence[SurveyedArrangement], width_in: float | None = None) -> Figure:
+    """Return a figure of arrangements, a panel each: as many panels beside each other as are 2.2 inch wide.
 
-    Ellipses too small to be seen are drawn ten times as large and dashed.
+    `width_in` is its width in inches, by default up to three panels of 3 inch. Ellipses too small to be seen are drawn
+    ten times as large and dashed.
     """
-    figure = board_figure(arrangements, PANEL_IN * min(ACROSS, len(arrangements)))
-    out = BytesIO()
-    figure.savefig(out, format=form, dpi=150, metadata={"Date": None} if form == "svg" else None)
-    return out.getvalue()
-
-
-def board_figure(arrangements: Sequence[SurveyedArrangement], width_in: float) -> Figure:
-    """Return the same as a figure of a width in inches: as many panels beside each other as are 2.2 inch wide."""
-    across = max(1, min(ACROSS, len(arrangements), int(width_in / NARROWEST_IN)))
+    width = 3.0 * min(3, len(arrangements)) if width_in is None else width_in
+    across = max(1, min(3, len(arrangements), int(width / 2.2)))
     down = -(-len(arrangements) // across)
-    tall = LINE_IN if all(one.known == "line" for one in arrangements) else min(PANEL_IN, width_in / across)
-    figure = Figure(figsize=(width_in, (tall + 0.4) * down), layout="constrained")
+    tall = 1.1 if all(one.known == "line" for one in arrangements) else min(3.0, width / across)
+    figure = Figure(figsize=(width, (tall + 0.4) * down), layout="constrained")
     panels = figure.subplots(down, across, squeeze=False).ravel()
     for axes, one in zip(panels, arrangements, strict=False):
-        draw_boards(axes, one)
+        _draw_boards(axes, one)
     for axes in panels[len(arrangements) :]:
         axes.set_visible(False)
     return figure
 
 
-def draw_boards(axes: Axes, one: SurveyedArrangement) -> Axes:
+def _draw_boards(axes: Axes, one: SurveyedArrangement) -> None:
     """Draw the boards of an arrangement from above, each with its ellipse, into axes."""
     place = np.array([board.position_m for board in one.boards])
     width = float(np.ptp(place[:, :2], axis=0).max()) or 1.0
@@ -76,13 +58,12 @@ def draw_boards(axes: Axes, one: SurveyedArrangement) -> Axes:
     axes.set_xlabel("m", fontsize=8)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
-    return axes
 
 
 def _ellipse(centre: tuple[float, float], covariance: Floats, width: float, colour: str) -> Ellipse:
+    """Return the ellipse of 95 % in a picture so wide: 5.991 is that quantile of chi-square with two freedoms."""
     values, vectors = np.linalg.eigh(covariance)
-    long, short = (2 * math.sqrt(CHI_SQUARE_95 * max(float(v), 0.0)) for v in values[::-1])
-    factor = 10.0 if long < SMALLEST * width else 1.0
+    long, short = 2 * np.sqrt(5.991 * np.maximum(values[::-1], 0.0))
+    factor, style = (10.0, "--") if long < 0.01 * width else (1.0, "-")
     turn = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
-    style = "--" if factor > 1 else "-"
     return Ellipse(centre, factor * long, factor * short, angle=turn, fill=False, ec=colour, lw=1.0, ls=style)

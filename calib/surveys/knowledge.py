@@ -6,29 +6,17 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from calib.errors import BadInputError
 from uwblink.recording.schema import SHAPES, Arrangement, KnownDistance
 from uwblink.text_files import TomlReader, is_number
 
-TAPE_M: Final = 0.005
-"""Standard deviation of a distance by tape where none is stated."""
+TAPE_M, PLACE_M = 0.005, 0.01
+"""Standard deviations of a distance by tape, and of each coordinate of a position, where none is stated."""
 
-PLACE_M: Final = 0.01
-"""Standard deviation of each coordinate of a position where none is stated."""
-
-LARGEST_ID: Final = 254
-FARTHEST_M: Final = 1e6
-LEAST_SIGMA_M: Final = 1e-6
+FARTHEST_M, LEAST_SIGMA_M = 1e6, 1e-6
 """From a micrometre to a thousand kilometres, squares and weights are numbers that can be computed with."""
-
-LATEST_S: Final = 1e9
-"""Of seconds within a recording: thirty years either way."""
-
-
-DISTANCE_KEYS: Final = ("between", "distance_m", "sigma_m", "arrangement")
-POSITION_KEYS: Final = ("tag", "position_m", "sigma_m", "arrangement")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,86 +76,73 @@ def load_knowledge(path: str | os.PathLike[str]) -> Knowledge:
     """
     file = TomlReader(Path(path), BadInputError, "file of what is known")
     file.known(file.table, ("known", "arrangements", "distances", "positions"))
-    shapes, spans, orders = _arrangements(file)
-    return Knowledge(
-        shape=_shape(file, "known", file.table.get("known", "")),
-        shapes=shapes,
-        spans_s=spans,
-        orders=orders,
-        distances=tuple(
-            _distance(file, f"distances[{k}].", row) for k, row in enumerate(file.rows("distances", DISTANCE_KEYS))
-        ),
-        positions=tuple(
-            _position(file, f"positions[{k}].", row) for k, row in enumerate(file.rows("positions", POSITION_KEYS))
-        ),
-    )
-
-
-def _shape(file: TomlReader, key: str, value: Any) -> str:
-    return str(file.choice(key, value, SHAPES))
-
-
-def _arrangements(
-    file: TomlReader,
-) -> tuple[dict[str, str], dict[str, tuple[float, float]], dict[str, tuple[int, ...]]]:
     shapes: dict[str, str] = {}
     spans: dict[str, tuple[float, float]] = {}
     orders: dict[str, tuple[int, ...]] = {}
-    names: set[str] = set()
+    names: list[str] = []
     for k, row in enumerate(file.rows("arrangements", ("name", "known", "order", "start_s", "end_s"))):
         where = f"arrangements[{k}]."
         name = _word(file, f"{where}name", row.get("name"))
         file.check(f"{where}name", name, name not in names, "each name once")
-        names.add(name)
+        names.append(name)
         if "order" in row:
-            orders[name] = _order(file, f"{where}order", row["order"], row.get("known", "line"))
+            orders[name] = _tags(file, f"{where}order", row["order"], "two tags or more, each once, as in [3, 1, 2]")
+            good = row.get("known", "line") == "line"
+            file.check(f"{where}order", row["order"], good, 'an order of boards on a line, known = "line"')
         if "known" in row:
-            shapes[name] = _shape(file, f"{where}known", row["known"])
-        if ("start_s" in row) != ("end_s" in row):
-            raise BadInputError(f"{file.path}: {where}start_s: give both start_s and end_s, or neither")
+            shapes[name] = str(file.choice(f"{where}known", row["known"], SHAPES))
+        good = ("start_s" in row) == ("end_s" in row)
+        file.check(where[:-1], row, good, "start_s and end_s, both or neither")
         if "start_s" in row:
             start, end = row["start_s"], row["end_s"]
-            file.check(f"{where}start_s", start, _is_time(start), "a number of seconds")
-            file.check(f"{where}end_s", end, _is_time(end) and end > start, f"a number above start_s, {start}")
+            # Thirty years either way.
+            file.check(f"{where}start_s", start, is_number(start) and abs(start) <= 1e9, "a number of seconds")
+            good = is_number(end) and start < end <= 1e9
+            file.check(f"{where}end_s", end, good, f"a number above start_s, {start}")
             spans[name] = (float(start), float(end))
-    return shapes, spans, orders
-
-
-def _order(file: TomlReader, key: str, order: Any, shape: Any) -> tuple[int, ...]:
-    good = isinstance(order, list) and len(order) > 1 and all(map(_is_id, order)) and len(set(order)) == len(order)
-    file.check(key, order, good, "two tags or more, each once, as in [3, 1, 2]")
-    file.check(key, order, shape == "line", 'an order of boards on a line, known = "line"')
-    return tuple(order)
+    return Knowledge(
+        shape=str(file.choice("known", file.table.get("known", ""), SHAPES)),
+        shapes=shapes,
+        spans_s=spans,
+        orders=orders,
+        distances=tuple(
+            _distance(file, f"distances[{k}].", row)
+            for k, row in enumerate(file.rows("distances", ("between", "distance_m", "sigma_m", "arrangement")))
+        ),
+        positions=tuple(
+            _position(file, f"positions[{k}].", row)
+            for k, row in enumerate(file.rows("positions", ("tag", "position_m", "sigma_m", "arrangement")))
+        ),
+    )
 
 
 def _distance(file: TomlReader, where: str, row: dict[str, Any]) -> KnownDistance:
-    ends: Any = row.get("between")
+    ends = _tags(file, f"{where}between", row.get("between"), "two different tags, as in [1, 2]", count=2)
     length: Any = row.get("distance_m")
-    good = isinstance(ends, list) and len(ends) == 2 and all(map(_is_id, ends)) and ends[0] != ends[1]
-    file.check(f"{where}between", ends, good, "two different tags, as in [1, 2]")
     file.check(f"{where}distance_m", length, is_number(length) and length > 0, "a number above 0 (metres)")
-    sigma = _sigma(file, where, row, TAPE_M)
-    return KnownDistance(min(ends), max(ends), float(length), sigma, _arrangement(file, where, row))
+    return KnownDistance(min(ends), max(ends), float(length), *_sigma_and_arrangement(file, where, row, TAPE_M))
 
 
 def _position(file: TomlReader, where: str, row: dict[str, Any]) -> KnownPosition:
-    tag: Any = row.get("tag")
-    place: Any = row.get("position_m")
-    file.check(f"{where}tag", tag, _is_id(tag), f"a whole number 0 to {LARGEST_ID}")
+    tag, place = row.get("tag"), row.get("position_m")
+    (tag,) = _tags(file, f"{where}tag", [tag], "a whole number 0 to 254", count=1)
     good = isinstance(place, list) and len(place) == 3 and all(map(is_number, place))
     file.check(f"{where}position_m", place, good, "three numbers (metres)")
-    x, y, z = map(float, place)
-    return KnownPosition(int(tag), (x, y, z), _sigma(file, where, row, PLACE_M), _arrangement(file, where, row))
+    x, y, z = map(float, place or ())
+    return KnownPosition(tag, (x, y, z), *_sigma_and_arrangement(file, where, row, PLACE_M))
 
 
-def _sigma(file: TomlReader, where: str, row: dict[str, Any], default: float) -> float:
+def _tags(file: TomlReader, key: str, value: Any, expected: str, count: int | None = None) -> tuple[int, ...]:
+    good = isinstance(value, list) and all(type(one) is int and 0 <= one <= 254 for one in value)
+    good = good and len(set(value)) == len(value) and (len(value) == count if count else len(value) > 1)
+    file.check(key, value, good, expected)
+    return tuple(value)
+
+
+def _sigma_and_arrangement(file: TomlReader, where: str, row: dict[str, Any], default: float) -> tuple[float, str]:
     sigma = row.get("sigma_m", default)
     file.check(f"{where}sigma_m", sigma, is_number(sigma) and sigma > 0, "a number above 0 (metres)")
-    return float(sigma)
-
-
-def _arrangement(file: TomlReader, where: str, row: dict[str, Any]) -> str:
-    return _word(file, f"{where}arrangement", row["arrangement"]) if "arrangement" in row else ""
+    return float(sigma), _word(file, f"{where}arrangement", row["arrangement"]) if "arrangement" in row else ""
 
 
 def _word(file: TomlReader, key: str, value: Any) -> str:
@@ -175,17 +150,13 @@ def _word(file: TomlReader, key: str, value: Any) -> str:
     return str(value)
 
 
-def _is_id(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_ID
-
-
 def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
     """Raise `BadInputError` for what names an arrangement or tags that are not there; `tags` are those by arrangement.
 
     Lengths that come from Python are checked here, too.
     """
-    named = {*knowledge.shapes, *knowledge.orders, *(d.arrangement for d in knowledge.distances)}
-    named |= {p.arrangement for p in knowledge.positions}
+    known = (*knowledge.distances, *knowledge.positions)
+    named = {*knowledge.shapes, *knowledge.orders, *(one.arrangement for one in known)}
     strangers = sorted(named - {"", *tags})
     if strangers:
         raise BadInputError(
@@ -194,30 +165,19 @@ def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
     bad = sorted({shape for shape in (knowledge.shape, *knowledge.shapes.values()) if shape not in SHAPES})
     if bad:
         raise BadInputError(f"found {bad[0]!r:.40}, allowed: line, plane", parameter="known")
-    for d in knowledge.distances:
-        _check_tags((d.first, d.second), d.arrangement, tags, f"a distance of {d.first} and {d.second}")
-        if not (0 < d.distance_m <= FARTHEST_M and _is_sigma(d.sigma_m)):
-            text = (
-                f"a distance of {d.first} and {d.second} of {d.distance_m} ± {d.sigma_m} m, expected more than 0, and "
-                f"up to {FARTHEST_M:g} m ± {LEAST_SIGMA_M:g} m or more"
-            )
+    for one in known:
+        if isinstance(one, KnownDistance):
+            who, what = {one.first, one.second}, f"a distance of {one.first} and {one.second}"
+            good = 0 < one.distance_m <= FARTHEST_M
+            value = f"{one.distance_m} ± {one.sigma_m} m, expected more than 0, and"
+        else:
+            who, what = {one.tag}, f"a position of {one.tag}"
+            good = all(abs(x) <= FARTHEST_M for x in one.position_m)
+            value = f"{one.position_m} ± {one.sigma_m} m, expected numbers"
+        where = {one.arrangement: tags[one.arrangement]} if one.arrangement else tags
+        if not any(who <= there for there in where.values()):
+            place = f"arrangement {one.arrangement}" if one.arrangement else "any arrangement"
+            raise BadInputError(f"{what}, which do not range in {place}", parameter="known")
+        if not (good and LEAST_SIGMA_M <= one.sigma_m <= FARTHEST_M):
+            text = f"{what} of {value} up to {FARTHEST_M:g} m ± {LEAST_SIGMA_M:g} m or more"
             raise BadInputError(text, parameter="known")
-    for p in knowledge.positions:
-        _check_tags((p.tag,), p.arrangement, tags, f"a position of {p.tag}")
-        if not all(abs(x) <= FARTHEST_M for x in p.position_m) or not _is_sigma(p.sigma_m):
-            raise BadInputError(f"a position of {p.tag} that is no number, or without sigma", parameter="known")
-
-
-def _is_sigma(value: float) -> bool:
-    return LEAST_SIGMA_M <= value <= FARTHEST_M
-
-
-def _check_tags(ids: tuple[int, ...], name: str, tags: dict[str, set[int]], what: str) -> None:
-    wanted = {name: tags[name]} if name else tags
-    if not any(set(ids) <= there for there in wanted.values()):
-        where = f"arrangement {name}" if name else "any arrangement"
-        raise BadInputError(f"{what}, which do not range in {where}", parameter="known")
-
-
-def _is_time(value: Any) -> bool:
-    return is_number(value) and abs(value) <= LATEST_S

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -200,12 +201,15 @@ class SurveyResult:
 
         Raises `BadInputError` for another suffix.
         """
-        from calib.surveys.figures import board_picture
+        from calib.surveys.figures import board_figure
 
         place = Path(path)
         if place.suffix.lower() not in (".svg", ".png", ".pdf"):
             raise BadInputError(f"found {place.suffix or 'no suffix'}, expected .svg, .png or .pdf", parameter="plot")
-        write_bytes(place, board_picture(self.arrangements, place.suffix.lower()[1:]), force=force)
+        form, out = place.suffix.lower()[1:], BytesIO()
+        metadata = {"Date": None} if form == "svg" else None
+        board_figure(self.arrangements).savefig(out, format=form, dpi=150, metadata=metadata)
+        write_bytes(place, out.getvalue(), force=force)
 
     def arrangement(self, name: str | None = None) -> SurveyedArrangement:
         """Return an arrangement by name, the only one where none is given; raises `BadInputError`."""

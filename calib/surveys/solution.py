@@ -17,10 +17,9 @@ from scipy.optimize import minimize
 
 from calib.estimator.optimize import maximize
 from calib.surveys.network import DETOUR_M, Case, Lengths, Network
-from calib.surveys.orders import is_in_order, line_coordinates
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
-from calib.surveys.starts import first_start, other_starts, start_in_order
+from calib.surveys.starts import first_start, is_in_order, line_coordinates, other_starts, start_in_order
 from uwblink.arrays import Floats, Ints
 
 PAIR_STD_M, PAIR_WORTH = 0.02, 3.0

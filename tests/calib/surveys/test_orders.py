@@ -10,7 +10,7 @@ from benchmarks.standing import standing_boards
 from benchmarks.surveys import orders_of
 from calib.errors import BadInputError, UnanswerableError
 from calib.surveys.knowledge import load_knowledge
-from calib.surveys.orders import exchanged_boards, in_said_order, is_in_order, line_coordinates
+from calib.surveys.starts import exchanged_boards, in_said_order, is_in_order, line_coordinates
 
 FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
 
