@@ -155,7 +155,7 @@ def check_knowledge(knowledge: Knowledge, tags: dict[str, set[int]]) -> None:
 
     Lengths that come from Python are checked here, too.
     """
-    known = (*knowledge.distances, *knowledge.positions)
+    known: list[KnownDistance | KnownPosition] = [*knowledge.distances, *knowledge.positions]
     named = {*knowledge.shapes, *knowledge.orders, *(one.arrangement for one in known)}
     strangers = sorted(named - {"", *tags})
     if strangers:

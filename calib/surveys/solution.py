@@ -20,10 +20,13 @@ from calib.surveys.network import DETOUR_M, Case, Lengths, Network
 from calib.surveys.reflections import Marks, unlikely
 from calib.surveys.result import SecondBest
 from calib.surveys.starts import first_start, is_in_order, line_coordinates, other_starts, start_in_order
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
 
 PAIR_STD_M, PAIR_WORTH = 0.02, 3.0
 """What a constant error of a pair is like before any data, and worth how many degrees of freedom."""
+
+PAIR_STARTS_M = (0.01, 0.015, 0.02, 0.03, 0.045, 0.07)
+"""Errors of pairs from which a search begins: with small ones too much looks reflected, with large ones too little."""
 
 CURVE_STD_M, CURVE_FACTOR = 0.1, 1.7
 """Standard deviation of a curve before any data, and the factor by which that may be wrong (`BEND_DB`)."""
@@ -134,23 +137,13 @@ def out_of_order(network: Network, x: Floats) -> list[int]:
     ]
 
 
-def adjust(
-    network: Network, x: Floats, case: Case | None = None, *, pair_m: float | None = None, careful: bool = False
-) -> Solution:
+def adjust(network: Network, x: Floats, *, marks: Bools | None = None, pair_m: float | None = None) -> Solution:
     """Return the best unknowns from a start, with the spreads and the reflected means estimated along.
 
-    `pair_m` is known where given. A `careful` one begins with larger errors of pairs, too (between those and what they
-    are if nothing is reflected), and takes what is likelier.
+    `pair_m` is the constant error of pairs where that is known; `marks` (n,) are means that are reflected at first.
     """
-    marks = np.zeros(len(network.means), dtype=bool) if case is None else case.marks
-    first = Case(marks, pair_m or PAIR_STD_M, CURVE_STD_M)
-    found = _alternated(network, x, first, pair_m)
-    if careful:
-        x, _ = settle(network, x, first)
-        large = _spreads(network, x, first, pair_m)
-        middle = replace(large, pair_m=math.sqrt(large.pair_m * first.pair_m))
-        found = min(found, _alternated(network, x, middle, pair_m), key=_unlikely)
-    return found
+    none = np.zeros(len(network.means), dtype=bool)
+    return _alternated(network, x, Case(none if marks is None else marks, pair_m or PAIR_STD_M, CURVE_STD_M), pair_m)
 
 
 def _unlikely(found: Solution) -> float:
@@ -288,7 +281,10 @@ def _mixed(found: Solution, cases: Sequence[Case], weight: Floats) -> tuple[Floa
 
 def solve(network: Network, *, pair_m: float | None, moves: int = 6) -> tuple[Solution, SecondBest | None]:
     """Return the best solution that any start leads to, and the second-best."""
-    found = adjust(network, first_start(network), pair_m=pair_m, careful=True)
+    start, none = first_start(network), np.zeros(len(network.means), dtype=bool)
+    spreads = PAIR_STARTS_M if pair_m is None else (pair_m,)
+    every = [_alternated(network, start, Case(none, spread, CURVE_STD_M), pair_m) for spread in spreads]
+    found = min(every, key=_unlikely)
     # Once more with the delays that came out: the first guess of places was made without any.
     found = min(found, adjust(network, first_start(network, found.delays), pair_m=pair_m), key=_unlikely)
     wrong = out_of_order(network, found.x)
@@ -304,7 +300,7 @@ def solve(network: Network, *, pair_m: float | None, moves: int = 6) -> tuple[So
         if not better:
             break
         _, x, case, _ = min(better, key=lambda other: other[0])
-        moved = adjust(network, x, case, pair_m=pair_m)
+        moved = adjust(network, x, marks=case.marks, pair_m=pair_m)
         if moved.unlikely > found.unlikely - 1e-3:
             break
         found = moved
