@@ -346,6 +346,6 @@ def _locations(ranges: Ranges, group: Ints, ends: Ints) -> tuple[Floats, Floats,
     inverse = np.exp(-2 * values["noise"])
     told = np.bincount(group, inverse) * float(np.sum(slope**2) / np.sum(inverse))
     of_parts = np.where(count >= 4 * PARTS, np.var(sums, axis=1, ddof=1) * PARTS, 0.0)
-    std = np.maximum(1.05 / np.sqrt(told), np.sqrt(of_parts) / told)
+    std = np.maximum(1 / np.sqrt(told), np.sqrt(of_parts) / told)
     noise = np.exp(np.bincount(group, values["noise"]) / count)
     return median + found.of("mean"), std, noise
