@@ -9,7 +9,6 @@ import calib
 from benchmarks.standing import standing_boards
 from benchmarks.surveys import orders_of
 from calib.errors import BadInputError, UnanswerableError
-from calib.surveys.knowledge import load_knowledge
 from calib.surveys.starts import exchanged_boards, in_said_order, is_in_order, line_coordinates
 
 FIVE = standing_boards(4, boards=5, arrangements=5, reflected=0.05, each=20)
@@ -77,23 +76,6 @@ def test_points_are_put_in_the_order_that_is_said():
     assert near[:, 0].tolist() == [0.0, 1.0, 3.0]
     assert far[:, 0].tolist() == [3.0, 1.0, 0.0]
     assert is_in_order(line_coordinates(near, (4, 7, 9), (4, 7, 9)))
-
-
-def test_the_file_of_what_is_known_states_orders(tmp_path):
-    file = tmp_path / "known.toml"
-    file.write_text('[[arrangements]]\nname = "A"\norder = [3, 1, 2]\n')
-    known = load_knowledge(file)
-    assert (dict(known.orders), dict(known.shapes)) == ({"A": (3, 1, 2)}, {})
-    for text, message in (
-        ("order = [3, 3]", "each once"),
-        ("order = [3]", "each once"),
-        ('order = "3 1"', "each once"),
-        ('order = [3, 1]\nknown = "plane"', 'known = "line"'),
-        ('order = [3, 1]\n[[arrangements]]\nname = "A"', "each name once"),
-    ):
-        file.write_text(f'[[arrangements]]\nname = "A"\n{text}\n')
-        with pytest.raises(BadInputError, match=message):
-            load_knowledge(file)
 
 
 @pytest.mark.parametrize("orders", [{"1": (1, 2, 9)}, {"1": (1, 2, 2)}, {"Z": (1, 2)}])
