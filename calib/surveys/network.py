@@ -274,17 +274,12 @@ class Network:
 
     def priors(self, curve_m: float, only: int | None = None) -> Priors:
         """Return the same for a search, in which all but `only` one arrangement's places are known if that is given."""
-        precision, _ = self.prior(curve_m)
-        known = np.ones(self.layout.size, dtype=bool)
+        precision, centre = self.prior(curve_m)
+        size = self.layout.size
+        known = np.ones(size, dtype=bool)
         known[self.free(only)] = False
-        blocks = []
-        for block in self.layout.blocks:
-            own = self.layout.where[block.kind]
-            prior = Prior(weight=1.0, structure=precision[own, own], centre=block.start, rows=len(block.start))
-            blocks.append(
-                Unknown(kind=block.kind, names=block.names, start=block.start, known=known[own], priors=(prior,))
-            )
-        return Priors(Layout(tuple(blocks)))
+        prior = Prior(weight=1.0, structure=precision, centre=centre, rows=size)
+        return Priors(Layout((Unknown(kind="survey", names=("",) * size, start=centre, known=known, priors=(prior,)),)))
 
 
 @dataclass(frozen=True, slots=True)
