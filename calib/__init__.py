@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from calib.data.sources import load_ranges
     from calib.doctor.examine import examine
     from calib.errors import BadInputError, CalibError, UnanswerableError
-    from calib.estimation.fitting import fit
     from calib.estimation.losses import register_loss
     from calib.estimation.new_tag import add_tag
     from calib.estimation.result import FitResult
+    from calib.estimator.fitting import fit
     from calib.evaluation.localization import localize
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
@@ -100,7 +100,7 @@ _HOMES: Final = {
     "evaluate": "calib.evaluation.statistics",
     "examine": "calib.doctor.examine",
     "export": "calib.calibration.formats",
-    "fit": "calib.estimation.fitting",
+    "fit": "calib.estimator.fitting",
     "fit_from_ranges": "calib.trajectories.fitting",
     "load_calibration": "calib.calibration.model",
     "load_ranges": "calib.data.sources",

@@ -23,8 +23,8 @@ from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.row_order import stable_order
 from calib.estimation.spacing import bins_of, splines
-from calib.estimation.time_blocks import in_order, time_blocks
 from calib.estimation.unknowns import Unknowns
+from calib.estimator.time_blocks import in_order, time_blocks
 from calib.long_columns import EVERY, computed, empty, let_go, picked, put
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT

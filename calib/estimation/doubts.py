@@ -20,10 +20,10 @@ from calib.estimation.misfit import (
     examine,
     told,
 )
-from calib.estimation.persistence import FEWEST_STRETCHES
 from calib.estimation.places import OfPlaces, of_places
 from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
+from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.long_columns import computed, let_go, spans
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT

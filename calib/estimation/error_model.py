@@ -15,9 +15,8 @@ import numpy as np
 from calib.calibration.error_model import ErrorModel, PairErrors
 from calib.estimation.mixture_slopes import Errors
 from calib.estimation.pair_mixture import PairMixture, fit_pair_mixture
-from calib.estimation.persistence import lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
-from calib.estimation.time_blocks import TimeBlocks
+from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.long_columns import few, let_go, picked, spans
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints

@@ -7,9 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.scores import Scores
-from calib.estimation.time_blocks import TimeBlocks
+from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 

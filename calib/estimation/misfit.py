@@ -16,10 +16,9 @@ import numpy as np
 from scipy.special import stdtr, stdtrit
 
 from calib.estimation.alternatives import Family, segments
-from calib.estimation.persistence import Persistence, persistence
 from calib.estimation.row_order import Runs
 from calib.estimation.scores import Scores
-from calib.estimation.time_blocks import TimeBlocks
+from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from calib.long_columns import let_go
 from uwblink.arrays import Floats, Ints
 

@@ -13,11 +13,11 @@ from calib.estimation.intervals import intervals
 from calib.estimation.losses import MIXTURE
 from calib.estimation.mixture_slopes import Errors
 from calib.estimation.pair_mixture import PairMixture, climbed, described, foot_of
-from calib.estimation.persistence import Persistence, lasting_in_pairs
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of, terms
 from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import reml_penalty, unsure
+from calib.estimator.time_blocks import Persistence, lasting_in_pairs
 from calib.long_columns import computed
 from uwblink.arrays import Floats
 

@@ -1,86 +1,115 @@
 """The one covariance: slopes summed over blocks of time, between the inverses of what rows and priors know.
 
-Errors that share a cause (a reflection, a pose) come in stretches. Slopes are therefore summed over blocks of time
-within a pair, and of all pairs together, of several lengths; the length that makes the asked unknowns least certain
-counts. Few blocks make an uncertain variance: intervals are those of Student's t. What the fit itself used of the data
-is given back (HC1 of MacKinnon and White 1985, for a penalised fit), and what priors may pull is added (Wahba 1983).
+Errors that share a cause (a reflection, a pose) come in stretches, and a sum of many blocks then varies more than
+independent blocks would. How much more is read off the variances of sums over 1, 2, 4 ... blocks, all components
+pooled, and fitted with an autocorrelation a rho^h (`persistence`). What the fit itself used of the data is given back
+(HC1 of MacKinnon and White 1985, for a penalised fit), and what priors may pull is added (Wahba 1983; Nychka 1988).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy import sparse
 
 from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
 from calib.estimator.rows import projected
+from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
-FINEST = 960
-"""Shortest blocks of time: so many in a recording."""
+CURVE_SERIES = 5
+"""So many values of a smooth curve are about independent."""
 
-LENGTHS = (1, 2, 4, 8, 16, 32, 64, 120)
-"""Lengths of blocks, in the shortest ones; eight of the longest cover a recording."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kept:
+    """Unknowns (k,) whose errors last alike: the `combinations` (m, k) of them, of which so many are independent, tell
+    for how long."""
+
+    indices: Ints
+    combinations: Floats
+    independent: int
+
+    @classmethod
+    def delays(cls, indices: Ints) -> Kept:
+        """Return delays; what all of them share is the curve's constant, and would hide how long their errors last."""
+        count = len(indices)
+        apart = np.eye(count) - (1 / count if count > 1 else 0.0)
+        return cls(indices=indices, combinations=apart, independent=max(count - 1, 1))
+
+    @classmethod
+    def curve(cls, indices: Ints) -> Kept:
+        """Return the coefficients of a smooth curve."""
+        return cls(indices=indices, combinations=np.eye(len(indices)), independent=CURVE_SERIES)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Covariance:
-    """Covariance (k, k) of the asked unknowns, and how long errors last: seconds of a block, and how many there are."""
+    """Covariance (k, k) of all kept unknowns in their order, and how long the errors of each sort last.
+
+    1.96 of its standard errors make 95 % intervals: what a small sample takes is in it already.
+    """
 
     matrix: Floats
-    block_s: float
-    stretches: float
+    lasting: tuple[Persistence, ...]
+    used: float
 
 
-def sandwich(
-    optimum: Optimum, rows: RangeRows, keep: Ints, pair: Ints, time: Ints, seconds: float, rank_by: Floats | None = None
-) -> Covariance:
-    """Return the covariance of the unknowns `keep` (k,) at an optimum.
-
-    `pair` (n,) and `time` (n,) number the pair and the shortest block of time of each given range, which cover
-    `seconds`; `rank_by` (m, k) are the combinations whose certainty chooses the length, by default all.
-    """
+def sandwich(optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: TimeBlocks) -> Covariance:
+    """Return the covariance of the kept unknowns at an optimum of ranges, which lie in blocks of time."""
+    keep = np.concatenate([sort.indices for sort in kept])
     reach = optimum.covariance[:, keep]
-    blocks = int(time.max()) + 1
-    pairs = int(pair.max()) + 1
-    sums = np.zeros((pairs * blocks, len(keep)))
-    squares = np.zeros((len(keep),) * 2)
-    at = 0
-    for pull in projected(rows, optimum.x, reach):
-        own = rows.order[at : at + len(pull)]
-        at += len(pull)
-        np.add.at(sums, pair[own] * blocks + time[own], pull)
-        squares += pull.T @ pull
-    series = sums.reshape(pairs, blocks, -1)
-    combination = np.eye(len(keep)) if rank_by is None else rank_by
-    best: Floats = squares
-    chosen, several = 0.0, float(len(rows))
-    largest = float(np.trace(combination @ squares @ combination.T))
-    for length in LENGTHS:
-        count = -(-blocks // length)
-        if count < min(8, blocks):
-            continue
-        within = _summed(series, length)
-        for sum_of, freedom in ((within.reshape(-1, len(keep)), count - 1.0), (within.sum(axis=0), count - 1.0)):
-            if len(sum_of) < 24 and length > 1:
-                continue
-            wider = float(stdtrit(max(freedom, 2.0), 0.975) / TWO_SIDED_95) ** 2
-            matrix = wider * (sum_of.T @ sum_of)
-            size = float(np.trace(combination @ matrix @ combination.T))
-            if size > largest:
-                best, largest, chosen, several = matrix, size, length * seconds / blocks, count
+    series = block_sums(rows, optimum.x, reach, blocks)
+    lasting, width, at = [], np.ones(len(keep)), 0
+    for sort in kept:
+        own = slice(at, at + len(sort.indices))
+        at = own.stop
+        found = persistence(series[:, own] @ sort.combinations.T, blocks, sort.independent)
+        lasting.append(found)
+        width[own] = np.sqrt(found.factor) * found.quantile95 / TWO_SIDED_95
+    # Slopes at the optimum are smaller than at the truth: with information I and penalty P, the squares of so many
+    # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the unknowns that ranges determine by their
+    # number.
     count = len(rows)
     used = trace_of_product(optimum.covariance, optimum.information)
     fresh = count / max(count - used, 0.2 * count)
     prior = reach.T @ optimum.priors.precision() @ reach
-    return Covariance(matrix=fresh * best + prior, block_s=chosen, stretches=several)
+    matrix = fresh * (series.T @ series) * width[:, None] * width + prior + of_weights(optimum, keep)
+    return Covariance(matrix=np.asarray(matrix), lasting=tuple(lasting), used=used)
 
 
-def _summed(series: Floats, length: int) -> Floats:
-    """Return sums over `length` blocks that follow each other, (pairs, blocks / length, k)."""
-    starts = np.arange(0, series.shape[1], length)
-    return np.asarray(np.add.reduceat(series, starts, axis=1))
+def of_weights(optimum: Optimum, keep: Ints) -> Floats:
+    """Return the covariance (k, k) that not knowing the weights of priors adds to that of some unknowns (k,).
+
+    A prior pulls the unknowns by covariance times precision times what they are off its centre, for each unit of the
+    weight's logarithm, which is known to 2 over what the prior leaves free, as a variance of so many values is (the
+    first-order correction of Kass and Steffey 1989).
+    """
+    found = np.zeros((len(keep),) * 2)
+    priors = optimum.priors
+    for weight, rank, (where, prior) in zip(priors.weights, priors.ranks, priors.all, strict=True):
+        if prior.bounds is None:
+            continue
+        size = where.stop - where.start
+        structure = sparse.eye(size, format="csc") if prior.structure is None else prior.structure
+        pulled = np.zeros(optimum.layout.size)
+        pulled[where] = weight * np.asarray(structure @ (optimum.x[where] - prior.centre))
+        pull = (optimum.covariance @ pulled)[keep]
+        free = rank - weight * trace_of_product(optimum.covariance, structure, where)
+        found += np.outer(pull, pull) * (2 / max(free, 1.0))
+    return found
+
+
+def block_sums(rows: RangeRows, x: Floats, reach: Floats, blocks: TimeBlocks) -> Floats:
+    """Return the slopes of ranges times `reach` (p, k), summed within blocks of time (blocks, k)."""
+    found = np.zeros((blocks.count, reach.shape[1]))
+    at = 0
+    for pull in projected(rows, x, reach):
+        np.add.at(found, blocks.number[rows.order[at : at + len(pull)]], pull)
+        at += len(pull)
+    return found

@@ -6,7 +6,7 @@ much of what their slope promised they kept; the weights of priors that data det
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,13 @@ import numpy as np
 from calib.estimator.inverse import Inverse, Matrix, inverse_of
 from calib.estimator.rows import Rows, sum_rows
 from calib.estimator.unknowns import Layout, Priors
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 
 SETTLED = 1e-2
 """A step that promises less log likelihood than this moves no unknown by more than a tenth of its standard error."""
+
+ROUGHLY = 0.3
+"""The same for all unknowns together, where only some are asked for: a share of nothing may be any small number."""
 
 EVIDENCE_STEPS = 12
 """Steps in which weights of priors are estimated: they converge as fast as the unknowns do, and then stand."""
@@ -52,9 +55,9 @@ def maximize(
     steps: int = 60,
     tolerance: float = SETTLED,
     evidence_steps: int = EVIDENCE_STEPS,
-    longest: Callable[[Floats], float] | None = None,
+    asked: Ints | None = None,
 ) -> Optimum:
-    """Climb from unknowns (p,) to the likeliest ones; `longest` returns by how much a step (p,) must be shortened.
+    """Climb from unknowns (p,) to the likeliest ones; of those that are `asked` for the search settles more closely.
 
     A likelihood that falls halves the step. Squared slopes are not quite the curvature: a step to the top keeps half of
     what its slope promises, one that keeps nearly all was short, and the next one is taken longer.
@@ -69,17 +72,21 @@ def maximize(
             x = top + step
             continue
         if promised > 0:
+            # Along a parabola the best length keeps a half of what the slope promises, one h times as long 1 - h/2.
             kept = (value - best) / promised
-            length = min(2 * length, 8.0) if kept > 0.8 else max(length / 2, 0.25) if kept < 0.3 else length
+            length = float(np.clip(length * np.clip(0.5 / max(1 - kept, 1e-3), 0.5, 2.0) ** 0.7, 0.25, 8.0))
         sums, shorter = found, 0
         covariance = inverse_of(sums.information + priors.precision(), free)
         slope = sums.gradient + priors.pull(x)
         step = covariance @ slope
         gain = float(slope @ step)
         settled = gain < tolerance
+        if asked is not None:
+            settled = abs(float(slope[asked] @ step[asked])) < tolerance and gain < max(ROUGHLY, tolerance)
         if taken <= evidence_steps:
             before = list(priors.weights)
-            priors.update(x, covariance)
+            # At the start nothing has moved yet, and says nothing of how far it may.
+            priors.update(x + step, covariance)
             moved = [abs(np.log(a / b)) for a, b in zip(priors.weights, before, strict=True)]
             settled = settled and max(moved, default=0.0) < CHANGE
             best = sums.value + priors.value(x)
@@ -96,8 +103,8 @@ def maximize(
                 steps=taken,
                 success=True,
             )
-        step *= min(length, 1.0 if longest is None else longest(step))
-        promised = float(slope @ step) if taken > evidence_steps else 0.0
+        step *= length
+        promised = float(slope @ step)
         top, x = x, x + step
     return Optimum(
         layout=layout,

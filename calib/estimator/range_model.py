@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lifted_power, populated
 from calib.data.ranges import Ranges
-from calib.errors import BadInputError
+from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
@@ -24,8 +24,12 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
 METRES_A_NS = SPEED_OF_LIGHT * 1e-9
-DELAY_NS = 2.0
-"""How far a delay may be from what was configured, before anything is measured: published ones differ by 0.6 ns."""
+DELAY_NS = 600.0
+"""How far a delay may be from what was configured: that of a board that is programmed with none is 514 ns.
+
+It holds combinations that no range determines, at the smallest delays that agree with the data, and weighs nothing
+elsewhere.
+"""
 
 CURVE_M = 0.5
 """How large a bias over power may be: published curves reach 0.2 m (DW1000 user manual, APS011)."""
@@ -40,13 +44,15 @@ SEGMENTS_A_FOLD, SEGMENTS = 4.5, (10, 28)
 """Pieces of a bias curve where lifted power grows e-fold, and bounds of their number; roughness is estimated, so that
 more change nothing (the study of `make accuracy`)."""
 
+FEWEST_OF_GROUP = 20
+"""Ranges from which a curve of a group is estimated: fewer do not tell its level."""
+
 SAME_POWER = 1e-6
 """Lifted powers that differ by no more are one."""
 
-SHORTEST_DETOUR = 3.0
-"""Least mean of the first kind of detour, in spreads of the residuals: below, it would explain a core that is not
-normal. In a fit without a curve, whose errors follow power, it moves delays by 0.14 ns from 1.8 spreads, and none
-from 2.5."""
+DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
+"""Mean of the shorter kind of exponential detours before anything is measured, how many reflections that knowledge is
+worth, and the detour that all have at least (published ones are 0.1 to 0.5 m: MILUV's and STAR-loc's flights)."""
 
 ODDS = -2.2
 """Log odds of a reflection before anything is measured: one range in ten."""
@@ -105,6 +111,7 @@ class RangeModel:
     gauged: tuple[bool, ...]
     reference: float | None
     constants: str
+    looked_for_curve: bool
 
     @classmethod
     def of(  # noqa: PLR0913 - keyword-only settings of one fit
@@ -133,7 +140,7 @@ class RangeModel:
         ordered = np.sort(lifted)
         low, high = populated(ordered)
         varied = high - low > SAME_POWER
-        curve = curve and varied
+        looked_for, curve = curve, curve and varied
         if curve and trimmed:
             inside = (lifted >= low) & (lifted <= high)
             ranges, lifted, powered = ranges[inside], lifted[inside], powered[inside]
@@ -156,7 +163,9 @@ class RangeModel:
         if powered.all() and varied:
             noise = Spline.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
-            _add_offsets(ranges, pairs, tags, unknowns, parts)
+            _add_offsets(
+                ranges, pairs, tags, unknowns, parts, told=_told_apart(pairs, tags, fixed_ns, constants, gauged)
+            )
         return cls(
             ranges=ranges,
             lifted=lifted,
@@ -173,6 +182,7 @@ class RangeModel:
             gauged=tuple(gauged),
             reference=reference,
             constants=constants,
+            looked_for_curve=looked_for,
         )
 
     def curve_kinds(self) -> list[str]:
@@ -205,7 +215,7 @@ class RangeModel:
             if gauged
         ]
 
-    def error_model(self, residual: Floats) -> tuple[Errors, tuple[Unknown, ...], tuple[Part, ...]]:
+    def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
         """Return the mixture with its unknowns and parts, begun at robust spreads of residuals (n,)."""
         spread = max(robust_spread(residual), 1e-3)
         names = tuple(f"{a}-{b}" for a, b in self.pairs.ends.tolist())
@@ -216,8 +226,8 @@ class RangeModel:
                 "noise level", np.log(0.9 * spread), Prior.of_deviation((2 * NOISE_WORTH) ** -0.5, np.log(NOISE_M))
             ),
             _scalar("odds level", ODDS, Prior.of_deviation(2.0, ODDS)),
-            _scalar("detour level", np.log(spread), Prior.of_deviation(1.0, np.log(spread))),
-            _scalar("least detour", np.log(0.5 * spread), Prior.of_deviation(2**0.5, np.log(0.5 * spread))),
+            _scalar("detour level", np.log(DETOUR_M), Prior.of_deviation(DETOUR_WORTH**-0.5, np.log(DETOUR_M))),
+            _scalar("least detour", np.log(LEAST_DETOUR_M), Prior.of_deviation(2**0.5, np.log(LEAST_DETOUR_M))),
             _scalar("outliers", -6.0, Prior.of_deviation(3.0, -6.0)),
             _scalar("long detours", LONG_ODDS, Prior.of_deviation(1.0, LONG_ODDS)),
             _of_pairs("noise of pair", names, (0.1, 0.01, 2.0)),
@@ -229,28 +239,16 @@ class RangeModel:
         parts = [Part(parameter=name, kind=kind, columns=everyone) for name, kind in (*level, *alone)]
         parts += [Part(parameter=name, kind=f"{name} of pair", columns=by_pair) for name, _ in level]
         if self.noise is not None:
-            rough = curvature(self.noise.knots)
+            rough = Prior(weight=1.0, structure=curvature(self.noise.knots), bounds=(1e-3, 1e6))
             several = tuple(map(str, range(self.noise.size)))
-            start = np.zeros(self.noise.size)
-            unknowns += [
-                Unknown(
-                    kind="noise curve",
-                    names=several,
-                    start=start,
-                    priors=(Prior(weight=1.0, structure=rough, bounds=(1e-3, 1e6)), Prior.of_deviation(1.0)),
-                ),
-                Unknown(
-                    kind="odds curve",
-                    names=several,
-                    start=start,
-                    priors=(Prior(weight=1.0, structure=rough, bounds=(1e-3, 1e6)), Prior.of_deviation(0.7)),
-                ),
-            ]
-            parts += [
-                Part(parameter=name, kind=f"{name} curve", columns=self.noise.columns, values=self.noise.values)
-                for name in ("noise", "odds")
-            ]
-        return Mixture(shortest_m=SHORTEST_DETOUR * spread), tuple(unknowns), tuple(parts)
+            for name, share in _shares(self.ranges, self.groups):
+                values = self.noise.values if share is None else share[:, None] * self.noise.values
+                for parameter, deviation in (("noise", 1.0), ("odds", 0.7)):
+                    kind = f"{parameter} curve {name}".strip()
+                    priors = (rough, Prior.of_deviation(deviation))
+                    unknowns.append(Unknown(kind=kind, names=several, start=np.zeros(len(several)), priors=priors))
+                    parts.append(Part(parameter=parameter, kind=kind, columns=self.noise.columns, values=values))
+        return Mixture(), tuple(unknowns), tuple(parts)
 
     def build(
         self,
@@ -313,12 +311,15 @@ OFFSETS = (0.01, 1e-4, 1.0)
 """Standard deviation of what else is constant in the ranges of a pair, such as a wall: start, least and most, m."""
 
 
-def _add_offsets(ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[Unknown], parts: list[Part]) -> None:
+def _add_offsets(
+    ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[Unknown], parts: list[Part], *, told: bool
+) -> None:
     """Add what is constant in the ranges of a pair, and of pairs and tags in one of several sessions."""
     names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
     number = pairs.number[:, None]
-    unknowns.append(_of_pairs("offset of pair", names, OFFSETS))
-    parts.append(Part(parameter=RESIDUAL, kind="offset of pair", columns=number))
+    if told:
+        unknowns.append(_of_pairs("offset of pair", names, OFFSETS))
+        parts.append(Part(parameter=RESIDUAL, kind="offset of pair", columns=number))
     count = len(ranges.sessions)
     if count < 2:
         return
@@ -331,6 +332,18 @@ def _add_offsets(ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[U
         several = tuple(f"{name} in {where}" for name in whose for where in ranges.sessions)
         unknowns.append(_of_pairs(kind, several, OFFSETS))
         parts.append(Part(parameter=RESIDUAL, kind=kind, columns=columns.astype(np.int32), values=values))
+
+
+def _told_apart(
+    pairs: Pairs, tags: list[int], fixed: Mapping[int, float], constants: str, gauged: Sequence[bool]
+) -> bool:
+    """Return whether anything tells offsets of pairs from delays, or from constants of curves."""
+    if constants == "pair":
+        return False
+    free = [tag for tag in tags if tag not in fixed]
+    ends = (pairs.ends[:, :, None] == np.array(free, dtype=np.int64)).sum(axis=1)
+    taken = np.linalg.matrix_rank(ends) if ends.size else 0
+    return len(pairs.ends) > taken + sum(not zero for zero in gauged)
 
 
 def _check_tags(
@@ -352,9 +365,16 @@ def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple
     """Return for each group its share of the curve in each range (n,): a half for each end; None for all of it."""
     if not groups:
         return [("", None)]
-    return [
+    shares = [
         (name, 0.5 * np.isin(ranges.initiator, own) + 0.5 * np.isin(ranges.target, own)) for name, own in groups.items()
     ]
+    for name, share in shares:
+        if np.count_nonzero(share) < FEWEST_OF_GROUP:
+            raise UnanswerableError(
+                f"group {name!r} has too few ranges for a curve, at least {FEWEST_OF_GROUP} are needed",
+                parameter="groups",
+            )
+    return shares
 
 
 def _delays_absorb(pairs: Pairs, tags: list[int], fixed: Mapping[int, float], group: tuple[int, ...] | None) -> bool:

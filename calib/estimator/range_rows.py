@@ -66,13 +66,12 @@ class Errors(Protocol):
 class Mixture:
     """Direct, reflected or an outlier (`calib.range_errors.density`): the likelihood of ranges."""
 
-    shortest_m: float
     span_m: float = OUTLIERS_OVER_M
     parameters: tuple[str, ...] = ("noise", "odds", "detour", "least", "outliers", "long")
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,) and slopes by each parameter (n,)."""
-        found = error_slopes(values[RESIDUAL], values, shortest_m=self.shortest_m, span_m=self.span_m)
+        found = error_slopes(values[RESIDUAL], values, span_m=self.span_m)
         return found.log_density, found.by, None
 
 
@@ -86,14 +85,30 @@ class Robust:
     weights: Callable[[Floats], tuple[Floats, Floats]]
     scale_m: float
     reweighted: bool = True
+    dispersion: float = 1.0
     parameters: tuple[str, ...] = ()
 
+    def tempered(self, residual: Floats) -> Robust:
+        """Return the loss divided by its dispersion at residuals (n,): squares of its slopes over its curvature."""
+        weight, slope = self.weights(residual / self.scale_m)
+        square = float(np.mean((weight * residual / self.scale_m) ** 2))
+        return replace(self, dispersion=max(square / max(float(np.mean(slope)), 1e-3), 1e-9))
+
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return minus half the weighted squares (n,), the slope by the residual (n,) and what each tells (n,)."""
+        """Return minus the loss (n,), its slope by the residual (n,) and what each tells (n,)."""
         u = values[RESIDUAL] / self.scale_m
         weight, slope = self.weights(u)
-        tells = (weight if self.reweighted else slope) / self.scale_m**2
-        return -0.5 * weight * u * u, {RESIDUAL: -weight * u / self.scale_m}, tells
+        by, tells = -weight * u / self.scale_m, (weight if self.reweighted else slope) / self.scale_m**2
+        # Near zero a loss is half the square, which the table's straight lines are not.
+        value = -np.where(np.abs(u) < 0.05, 0.5 * u * u, np.interp(np.abs(u), *_loss_table(self.weights)))
+        return value / self.dispersion, {RESIDUAL: by / self.dispersion}, tells / self.dispersion
+
+
+def _loss_table(weights: Callable[[Floats], tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Return residuals over scale and the loss there: the integral of u times its weight, by the trapezoidal rule."""
+    u = np.concatenate([np.linspace(0, 10, 2001), np.geomspace(10.1, 1e7, 1000)])
+    slope = u * weights(u)[0]
+    return u, np.concatenate([[0.0], np.cumsum(np.diff(u) * (slope[1:] + slope[:-1]) / 2)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,9 +189,14 @@ class RangeRows:
 
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all ranges, some blocks at a time."""
+        for terms, _ in self.terms_and_scores(x):
+            yield terms
+
+    def terms_and_scores(self, x: Floats) -> Iterator[tuple[Terms, Floats]]:
+        """Yield the same with the slope of the log likelihood of each range by its residual (n,)."""
         for blocks, rows, values, moved in self._pieces(x):
             log_density, by, tells = self.errors.slopes(values)
-            yield self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved)
+            yield self._as_terms(blocks, rows, float(np.sum(log_density)), by, tells, moved), by[RESIDUAL]
 
     def residuals(self, x: Floats) -> Floats:
         """Return the residuals (n,) at unknowns (p,), in the order in which rows were given; a sample's in its own."""

@@ -122,7 +122,7 @@ class Priors:
         self.layout = layout
         self.all = [(layout.where[block.kind], prior) for block in layout.blocks for prior in block.priors]
         self.weights = [prior.weight for _, prior in self.all] if weights is None else list(weights)
-        self._ranks = [prior.rank for _, prior in self.all]
+        self.ranks = [where.stop - where.start if prior.rank is None else prior.rank for where, prior in self.all]
 
     def precision(self) -> Matrix:
         """Return the precision of all priors (p, p); a sparse one for many unknowns."""
@@ -162,8 +162,7 @@ class Priors:
             if prior.bounds is None:
                 continue
             away, structure = x[where] - prior.centre, _structure(prior, where)
-            rank = len(away) if self._ranks[k] is None else self._ranks[k]
-            left = float(rank or 0) - self.weights[k] * trace_of_product(covariance, structure, where)
+            left = self.ranks[k] - self.weights[k] * trace_of_product(covariance, structure, where)
             used = max(left, 1e-2)
             size = max(float(away @ structure @ away), 1e-300)
             self.weights[k] = float(np.clip(used / size, *prior.bounds))

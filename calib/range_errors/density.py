@@ -32,19 +32,19 @@ class ErrorSlopes:
     inlier: Floats
 
 
-def error_slopes(residual: Floats, parameters: dict[str, Floats], *, shortest_m: float, span_m: float) -> ErrorSlopes:
+def error_slopes(residual: Floats, parameters: dict[str, Floats], *, span_m: float) -> ErrorSlopes:
     """Return the log density of errors (n,) in metres and its slopes.
 
-    `parameters` are "noise" (log sigma), "odds" (log odds of a reflection), "detour" (log of the first kind's mean
-    beyond `shortest_m`), "least" (log of the least detour), "outliers" and "long" (log odds), arrays (n,) or (1,).
+    `parameters` are "noise" (log sigma), "odds" (log odds of a reflection), "detour" (log of the first kind's
+    mean), "least" (log of the least detour), "outliers" and "long" (log odds), arrays (n,) or (1,).
     Outliers have the density 1/`span_m`.
     """
     sigma = np.exp(parameters["noise"])
     share = _share(parameters["odds"])
-    above = np.exp(parameters["detour"])
+    detour = np.exp(parameters["detour"])
     least, wild, long_share = np.exp(parameters["least"]), _share(parameters["outliers"]), _share(parameters["long"])
     long = LongDetours(share=float(long_share[0]), factor=LONG_FACTOR)
-    found = densities(residual, sigma, float(least[0]), long.mean * (shortest_m + above), long)
+    found = densities(residual, sigma, float(least[0]), long.mean * detour, long)
     inside = 1 - float(wild[0])
     core, tail = inside * (1 - share) * found.direct, inside * share
     total = core + tail * found.reflected + float(wild[0]) / span_m
@@ -66,7 +66,7 @@ def error_slopes(residual: Floats, parameters: dict[str, Floats], *, shortest_m:
             "residual": -(core * z + tail_noise) * inverse,
             "noise": noise,
             "odds": reflected - share * both,
-            "detour": mean * (above / (shortest_m + above)),
+            "detour": mean,
             "least": tail_noise * inverse * least,
             "outliers": inside - both,
             "long": tails[1] - long_share * reflected,

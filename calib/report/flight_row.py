@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.sources import Data, load_ranges
-from calib.estimation.fitting import fit
+from calib.estimator.fitting import fit
 from calib.evaluation.statistics import evaluate
 
 

@@ -21,12 +21,11 @@ from calib.estimation.misfit import (
     spans_of,
     widening_of_pairs,
 )
-from calib.estimation.persistence import persistence
 from calib.estimation.places import of_places
 from calib.estimation.problem import Problem
 from calib.estimation.scores import Scores
 from calib.estimation.solver import Solved
-from calib.estimation.time_blocks import TimeBlocks
+from calib.estimator.time_blocks import TimeBlocks, persistence
 from calib.trajectories.arrow import Factored
 from uwblink.arrays import Floats, Ints
 

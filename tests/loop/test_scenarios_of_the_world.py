@@ -7,7 +7,7 @@ import pytest
 
 from calib.data.sources import load_ranges
 from calib.errors import UnanswerableError
-from calib.estimation.fitting import fit
+from calib.estimator.fitting import fit
 from calib.evaluation.statistics import evaluate, pair_rows
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calib.errors import BadInputError
-from calib.estimation.fitting import fit
 from calib.estimation.new_tag import add_tag
+from calib.estimator.fitting import fit
 from tests.calib.synthetic import ranges
 
 

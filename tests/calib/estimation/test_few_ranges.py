@@ -1,4 +1,4 @@
-"""Recordings of few ranges a pair: which loss they get, that the fit settles, and a real flight among obstacles."""
+"""Recordings of few ranges a pair: that the fit settles, and a real flight among obstacles."""
 
 import tarfile
 
@@ -15,16 +15,14 @@ FEW = "twelve tags, six ranges a pair"
 
 
 @pytest.mark.parametrize("seed", [104, 105])
-def test_few_ranges_are_fitted_with_a_robust_loss_that_settles(seed):
+def test_few_ranges_settle(seed):
     # These two went on for hundreds of steps in directions that no range determines.
     found = calib.fit(make(CLEAN[FEW], seed).ranges)
-    assert found.calibration.loss == "cauchy"
     assert found.success
 
 
-def test_enough_ranges_and_a_loss_that_was_asked_for_are_left_alone():
+def test_a_loss_that_was_asked_for_is_taken():
     assert calib.fit(make(CLEAN[FEW], 1).ranges, loss="huber").calibration.loss == "huber"
-    assert calib.fit(make(CLEAN["short, 30 s"], 1).ranges).calibration.loss == "mixture"
 
 
 def test_a_real_flight_among_obstacles_agrees_with_the_published_delays(tmp_path):
@@ -32,7 +30,7 @@ def test_a_real_flight_among_obstacles_agrees_with_the_published_delays(tmp_path
         archive.extractall(tmp_path, filter="data")
     ranges = calib.load_ranges(read_source(tmp_path / "cirObstacles_3_random_0", importer="miluv"))
     published = read_miluv(shared("miluv_published_calibration.json"))
-    known = calib.fit(ranges, minimum_norm=True).calibration
+    known = calib.fit(ranges, minimum_norm=True, loss="cauchy").calibration
     tags = list(known.uncertainty.tags)
     centre = np.eye(len(tags)) - 1 / len(tags)
     error = centre @ [known.delays_ns[tag] - published.delays_ns[tag] for tag in tags]

