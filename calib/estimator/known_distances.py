@@ -34,7 +34,7 @@ PILOT = 6000
 """Rows of the sample on which a start is found."""
 
 ASTRAY_M = 0.3
-"""Beyond what any pair's reflections move its median: a likelihood can climb to a top where a pair is left out whole."""
+"""Beyond what any pair's reflections move its median: a likelihood can climb to where a pair is left out."""
 
 FIRST_SAMPLE, GROWTH = 9000, 6
 """Rows of the first sample on which the likelihood is climbed, and how much larger each next one is."""

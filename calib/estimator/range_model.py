@@ -365,11 +365,11 @@ def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple
     """Return for each group its share of the curve in each range (n,): a half for each end; None for all of it."""
     if not groups:
         return [("", None)]
-    shares = [
+    shares: list[tuple[str, Floats | None]] = [
         (name, 0.5 * np.isin(ranges.initiator, own) + 0.5 * np.isin(ranges.target, own)) for name, own in groups.items()
     ]
     for name, share in shares:
-        if np.count_nonzero(share) < FEWEST_OF_GROUP:
+        if share is not None and np.count_nonzero(share) < FEWEST_OF_GROUP:
             raise UnanswerableError(
                 f"group {name!r} has too few ranges for a curve, at least {FEWEST_OF_GROUP} are needed",
                 parameter="groups",
