@@ -66,6 +66,7 @@ class Finding:
     effect_ns: Floats
     otherwise_ns: Floats | None = None
     sessions: tuple[str, str] = ("", "")
+    fitted: bool = False
 
     @property
     def effects_ns(self) -> list[Floats]:
@@ -74,7 +75,13 @@ class Finding:
 
     @property
     def spread_ns2(self) -> Floats:
-        """Return the covariance (tags, tags) that delays have when nothing says which side of a difference is off."""
+        """Return the covariance (tags, tags) that delays have when nothing says which side of a difference is off.
+
+        Where offsets are fitted delays lie halfway between both sides, and their variance is in the intervals already.
+        """
+        if self.fitted:
+            apart = np.zeros_like(self.effect_ns) if self.otherwise_ns is None else self.effect_ns - self.otherwise_ns
+            return np.asarray(np.outer(apart, apart) / 4)
         return np.asarray(np.mean([np.outer(effect, effect) for effect in self.effects_ns], axis=0))
 
     @property
@@ -215,6 +222,7 @@ def findings(tested: Tested, several: int, rate: float) -> Iterator[Finding]:
             effect_ns=tested.effects[:, top] * offset,
             otherwise_ns=otherwise,
             sessions=sessions,
+            fitted=len(family.fitted) > 0,
         )
         # With this offset fitted too, the others keep what it does not explain.
         step = np.eye(len(total))
