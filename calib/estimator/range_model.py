@@ -325,13 +325,13 @@ def _add_offsets(
         return
     session = ranges.session[:, None].astype(np.int64)
     ends = np.searchsorted(tags, pairs.ends)[pairs.number]
-    for kind, whose, columns, values in (
-        ("offset of pair in session", names, number * count + session, None),
-        ("offset of tag in session", tuple(map(str, tags)), ends * count + session, np.full((len(ranges), 2), 0.5)),
+    for kind, whose, columns in (
+        ("offset of pair in session", names, number * count + session),
+        ("offset of tag in session", tuple(map(str, tags)), ends * count + session),
     ):
         several = tuple(f"{name} in {where}" for name in whose for where in ranges.sessions)
         unknowns.append(_of_pairs(kind, several, OFFSETS))
-        parts.append(Part(parameter=RESIDUAL, kind=kind, columns=columns.astype(np.int32), values=values))
+        parts.append(Part(parameter=RESIDUAL, kind=kind, columns=columns.astype(np.int32)))
 
 
 def _told_apart(

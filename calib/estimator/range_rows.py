@@ -255,7 +255,9 @@ class RangeRows:
             for part in parts
         ]
         columns = [np.broadcast_to(own, (several, own.shape[1])) for own in columns]
-        entries = [np.ones((1, count)) if part.values is None else part.values[:, rows] for part in parts]
+        entries = [
+            np.ones((part.columns.shape[1], count)) if part.values is None else part.values[:, rows] for part in parts
+        ]
         slopes = [by[part.parameter] * own for part, own in zip(parts, entries, strict=True)]
         starts = self.starts[blocks.start : blocks.stop + 1] - rows.start
         if moved is not None and self.geometry is not None:
