@@ -129,7 +129,7 @@ def simulating(*settings: str, passive: bool = False, contention: bool = True) -
 def fitting(recording: Path) -> float:
     """Return the time to fit what is already in memory, in seconds."""
     from calib.data.sources import load_ranges
-    from calib.estimation.fitting import fit
+    from calib.fitting.fitting import fit
 
     ranges = load_ranges(recording)
     return timed(lambda: fit(ranges))

@@ -39,8 +39,8 @@ def one(share: float, seed: int, duration_s: float | None = None) -> dict[str, O
     """Simulate, fit with each loss, and compare with what was planted."""
     import uwbsim
     from calib.data.sources import load_ranges
-    from calib.estimation.fitting import fit
     from calib.evaluation.statistics import evaluate
+    from calib.fitting.fitting import fit
 
     settings = [f"run.seed={seed}", f"radio.multipath.share={share}"]
     settings += [f"run.duration_s={duration_s}"] if duration_s else []

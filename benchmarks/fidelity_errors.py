@@ -15,8 +15,8 @@ import numpy as np
 from calib.calibration.formats import read_miluv
 from calib.data.ranges import concatenate
 from calib.data.sources import load_ranges
-from calib.estimation.fitting import fit
 from calib.evaluation.statistics import evaluate
+from calib.fitting.fitting import fit
 from uwblink.arrays import Floats, Ints
 from uwblink.importers import import_recording, read_source
 from uwblink.ticks import SPEED_OF_LIGHT

@@ -66,7 +66,7 @@ def processor_time(work: Callable[[], object], runs: int) -> float:
 
 def settled(ranges: Ranges, loss: str | None) -> None:
     """Fit ranges, and end where the fit did not settle: its time would say nothing."""
-    from calib.estimation.fitting import fit
+    from calib.fitting.fitting import fit
 
     if not fit(ranges, loss=loss).success:
         sys.exit("the fit did not converge")

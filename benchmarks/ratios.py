@@ -48,7 +48,7 @@ def pairs(folder: Path) -> list[Pair]:
     import uwblink
     import uwbsim
     from benchmarks.importing import TABLE
-    from calib.estimation.fitting import fit
+    from calib.fitting.fitting import fit
     from uwblink.protocols.table import PROTOCOLS
     from uwblink.ticks import SPEED_OF_LIGHT
     from uwbsim.protocols.conditions import STATES, Conditions

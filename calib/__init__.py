@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from calib.data.sources import load_ranges
     from calib.doctor.examine import examine
     from calib.errors import BadInputError, CalibError, UnanswerableError
-    from calib.estimation.losses import register_loss
-    from calib.estimation.new_tag import add_tag
-    from calib.estimation.result import FitResult
-    from calib.estimator.fitting import fit
+    from calib.estimator.losses import register_loss
     from calib.evaluation.localization import localize
     from calib.evaluation.onboard import OnboardSettings, localize_onboard
     from calib.evaluation.statistics import evaluate
+    from calib.fitting.fitting import fit
+    from calib.fitting.new_tag import add_tag
+    from calib.fitting.result import FitResult
     from calib.planning.flight_result import FlightPlan
     from calib.planning.flights import plan_flight
     from calib.planning.result import Plan
@@ -84,7 +84,7 @@ _HOMES: Final = {
     "CalibError": "calib.errors",
     "Calibration": "calib.calibration.model",
     "CorrectedRanges": "calib.calibration.parts",
-    "FitResult": "calib.estimation.result",
+    "FitResult": "calib.fitting.result",
     "FitSettings": "calib.settings",
     "FlightPlan": "calib.planning.flight_result",
     "Knowledge": "calib.surveys.knowledge",
@@ -94,13 +94,13 @@ _HOMES: Final = {
     "Ranges": "calib.data.ranges",
     "SurveyResult": "calib.surveys.result",
     "UnanswerableError": "calib.errors",
-    "add_tag": "calib.estimation.new_tag",
+    "add_tag": "calib.fitting.new_tag",
     "apply": "calib.calibration.correction",
     "compare": "calib.calibration.comparison",
     "evaluate": "calib.evaluation.statistics",
     "examine": "calib.doctor.examine",
     "export": "calib.calibration.formats",
-    "fit": "calib.estimator.fitting",
+    "fit": "calib.fitting.fitting",
     "fit_from_ranges": "calib.trajectories.fitting",
     "load_calibration": "calib.calibration.model",
     "load_ranges": "calib.data.sources",
@@ -108,7 +108,7 @@ _HOMES: Final = {
     "localize_onboard": "calib.evaluation.onboard",
     "plan": "calib.planning.surveys",
     "plan_flight": "calib.planning.flights",
-    "register_loss": "calib.estimation.losses",
+    "register_loss": "calib.estimator.losses",
     "register_report_section": "calib.report.sections",
     "run_campaign": "calib.report.campaign",
     "sample_arrangements": "calib.surveys.sample",

@@ -95,7 +95,7 @@ class FitSettings:
 
     `loss` is "mixture", the likelihood of direct ranges, reflections and outliers with a share of reflections by pair,
     or a robust loss of residuals: "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added; None chooses the
-    mixture, and "cauchy" for a sequential fit and for fewer than 15 ranges a pair. `scale_ns` is the scale of a robust
+    mixture, and "cauchy" for a sequential fit and for one without a curve. `scale_ns` is the scale of a robust
     loss in time of flight, None to estimate it. `lift` and `alpha_dbm` make the lifted power of an exchange.
 
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
@@ -112,8 +112,8 @@ class FitSettings:
 
     loss: str | None = setting(
         None,
-        "Likelihood or loss that is fitted. mixture (the default): reflections by pair; cauchy: for --sequential, and "
-        "for fewer than 15 ranges per pair; l2: least squares; or a registered loss.",
+        "Likelihood or loss that is fitted. mixture (the default): reflections by pair; cauchy: for --sequential and "
+        "--delays-only; l2: least squares; or a registered loss.",
         names=("mixture", "cauchy", "huber", "soft_l1", "l2"),
         rich_help_panel=ERRORS_PANEL,
     )

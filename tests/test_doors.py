@@ -69,9 +69,9 @@ def test_commands_go_through_doors(package):
 @pytest.mark.parametrize(
     ("package", "source", "found"),
     [
-        ("calib", "def f():\n    from calib.estimation.fitting import fit", ["calib.estimation.fitting.fit"]),
+        ("calib", "def f():\n    from calib.fitting.fitting import fit", ["calib.fitting.fitting.fit"]),
         ("calib", "from calib.report import layout", ["calib.report.layout"]),
-        ("calib", "import calib.estimation.fitting", ["calib.estimation.fitting"]),
+        ("calib", "import calib.fitting.fitting", ["calib.fitting.fitting"]),
         ("calib", "import calib\ncalib.estimation.x", ["calib.estimation"]),
         ("uwbsim", "from uwblink.errors import UwblinkError", ["uwblink.errors.UwblinkError"]),
         ("calib", "import calib\nfrom uwblink.cli import shared\nfrom calib.errors import CalibError\ncalib.fit", []),

@@ -157,7 +157,7 @@ def test_a_shell_completes_the_tags_of_a_recording(tmp_path):
 
 
 def test_what_the_help_lists_is_what_the_packages_know():
-    from calib.estimation import known_losses
+    from calib.fitting import known_losses
     from uwblink import PROTOCOLS
     from uwblink.exporters import EXPORTERS
 

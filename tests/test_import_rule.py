@@ -24,7 +24,7 @@ CONFINED = {
     "threadpoolctl": lambda path: (
         path
         in {
-            "calib/estimation/fitting.py",
+            "calib/fitting/fitting.py",
             "calib/planning/flights.py",
             "calib/surveys/survey.py",
             "calib/trajectories/fitting.py",
@@ -62,7 +62,7 @@ def test_package_keeps_the_import_rule(package):
 @pytest.mark.parametrize(
     ("package", "path", "source"),
     [
-        ("uwblink", "uwblink/x.py", "import calib.estimation.fitting"),
+        ("uwblink", "uwblink/x.py", "import calib.fitting.fitting"),
         ("calib", "calib/x.py", "def f():\n    from uwbsim import clock"),
         ("calib", "calib/x.py", "import simpy"),
         ("uwbsim", "uwbsim/x.py", "from matplotlib.figure import Figure"),

@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, equal_bins, lifted_power
+from calib.checks.confounding import explained_by_distance, some_of
 from calib.data.clocks import LeftSkew, corrected
 from calib.data.ranges import NO_STAMPS, Ranges
-from calib.estimation.confounding import explained_by_distance, some_of
-from calib.estimation.pairs import pairs_of
 from calib.estimator.known_distances import KnownDistances
+from calib.estimator.pairs import pairs_of
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
 from uwblink.ticks import SPEED_OF_LIGHT

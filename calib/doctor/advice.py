@@ -9,7 +9,7 @@ import numpy as np
 from calib.data.ranges import Ranges
 from calib.doctor.base import RecordingView
 from calib.errors import CalibError
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 
 CLEARLY: Final = 0.6
 """One loss is recommended over another when its halves disagree by no more than this share of the other's."""

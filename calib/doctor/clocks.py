@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
+from calib.checks.limits import told
+from calib.checks.plausibility import robust_slope
 from calib.data.clocks import corrected, left_skew
 from calib.doctor.base import RecordingView, pair_ids
 from calib.doctor.checks import BUDGET, Seen, exceeds
 from calib.doctor.levels import DOF, OF_MEDIAN, medians
-from calib.estimation.limits import told
-from calib.estimation.plausibility import robust_slope
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.protocols.table import single_sided

@@ -19,11 +19,11 @@ from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.design import PIECES_AT_ONCE, Design
 from calib.estimation.identifiability import identifiable_directions, require_determined
-from calib.estimation.pairs import Pairs, pairs_of
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.row_order import stable_order
 from calib.estimation.spacing import bins_of, splines
 from calib.estimation.unknowns import Unknowns
+from calib.estimator.pairs import Pairs, pairs_of
 from calib.estimator.time_blocks import in_order, time_blocks
 from calib.long_columns import EVERY, computed, empty, let_go, picked, put
 from uwblink.arrays import Floats, Ints
@@ -52,7 +52,7 @@ def build_problem(
     sequential: bool = False,
     unknowns: Unknowns | None = None,
 ) -> Problem:
-    """Put a fit into columns; raises what `calib.estimation.fitting.fit` raises.
+    """Put a fit into columns; raises what `calib.fitting.fitting.fit` raises.
 
     In a `sequential` one the curves keep their constants, and ranges of all powers stay, for the delays; so do they
     without a curve. Where power never changes no curve is looked for.

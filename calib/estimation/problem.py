@@ -14,8 +14,8 @@ from calib.calibration.power_curves import (
 )
 from calib.data.ranges import COLUMNS, Ranges
 from calib.estimation.design import Design
-from calib.estimation.pairs import Pairs
 from calib.estimation.unknowns import Unknowns
+from calib.estimator.pairs import Pairs
 from calib.estimator.time_blocks import TimeBlocks
 from calib.long_columns import computed, let_go
 from uwblink.arrays import Bools, Floats, Ints

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from calib.estimation.design import Design, as_design
-from calib.estimation.losses import LOSSES, Weights
+from calib.estimator.losses import LOSSES, Weights
 from calib.long_columns import computed, empty, let_go, put, spans
 from calib.spread import robust_spread
 from uwblink.arrays import Floats

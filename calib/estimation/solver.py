@@ -10,13 +10,13 @@ import numpy as np
 from calib.estimation.design import Design
 from calib.estimation.gauge import stating
 from calib.estimation.intervals import intervals
-from calib.estimation.losses import MIXTURE
 from calib.estimation.mixture_slopes import Errors
 from calib.estimation.pair_mixture import PairMixture, climbed, described, foot_of
 from calib.estimation.problem import CELLS, Problem
 from calib.estimation.robust import Solution, quadratic_model, robust_fit, scale_of, terms
 from calib.estimation.scores import Scores, inverse_of
 from calib.estimation.smoothing import reml_penalty, unsure
+from calib.estimator.losses import MIXTURE
 from calib.estimator.time_blocks import Persistence, lasting_in_pairs
 from calib.long_columns import computed
 from uwblink.arrays import Floats

@@ -14,8 +14,8 @@ from scipy import sparse
 
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.losses import LOSSES, MIXTURE
 from calib.estimator.covariance import Covariance, Kept, sandwich
+from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust

@@ -25,6 +25,9 @@ ROUGHLY = 0.3
 EVIDENCE_STEPS = 12
 """Steps in which weights of priors are estimated: they converge as fast as the unknowns do, and then stand."""
 
+MOST_STEPS = 60
+"""Steps after which a search is given up: sound ones take ten to thirty."""
+
 CHANGE = 0.05
 """Relative change of a weight below which it has settled."""
 
@@ -52,7 +55,7 @@ def maximize(
     priors: Priors,
     x: Floats,
     *,
-    steps: int = 60,
+    steps: int | None = None,
     tolerance: float = SETTLED,
     evidence_steps: int = EVIDENCE_STEPS,
     asked: Ints | None = None,
@@ -64,7 +67,8 @@ def maximize(
     """
     layout, free = priors.layout, priors.layout.free()
     best, top, step, shorter, length, promised = -np.inf, x, np.zeros_like(x), 0, 1.0, 0.0
-    for taken in range(1, steps + 1):
+    most = MOST_STEPS if steps is None else steps
+    for taken in range(1, most + 1):
         found = sum_rows(rows, x)
         value = found.value + priors.value(x)
         if value < best - tolerance and shorter < 8:
@@ -113,6 +117,6 @@ def maximize(
         covariance=covariance,
         information=sums.information,
         value=best,
-        steps=steps,
+        steps=most,
         success=False,
     )

@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline
 from calib.calibration.power_curves import DEGREE, SIGMA_SEGMENTS, curvature, knots_for, lifted_power, populated
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.pairs import Pairs, pairs_of
+from calib.estimator.pairs import Pairs, pairs_of
 from calib.estimator.range_rows import RESIDUAL, Errors, Geometry, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout, Prior, Unknown

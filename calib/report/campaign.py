@@ -16,11 +16,11 @@ from calib.data.sources import Data, each, held_open, load_each, opened
 from calib.doctor.base import Finding
 from calib.doctor.examine import examine
 from calib.errors import UnanswerableError
-from calib.estimation.losses import MIXTURE
-from calib.estimation.passive_listeners import heard_delays
-from calib.estimation.result import FitResult
-from calib.estimator.fitting import fit
+from calib.estimator.losses import MIXTURE
 from calib.evaluation.localization import Localization, localize, summarize
+from calib.fitting.fitting import fit
+from calib.fitting.passive_listeners import heard_delays
+from calib.fitting.result import FitResult
 from calib.report.results import Results, origin_of
 from calib.report.sections import document
 from calib.report.writing import check_places

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from calib.data.sources import Data, load_ranges
-from calib.estimator.fitting import fit
 from calib.evaluation.statistics import evaluate
+from calib.fitting.fitting import fit
 
 
 def evaluate_flight(flight: Data) -> Mapping[str, Any]:

@@ -19,9 +19,9 @@ from calib.evaluation.statistics import Evaluation, evaluate
 
 if TYPE_CHECKING:
     from calib.doctor.base import Finding
-    from calib.estimation.passive_listeners import OverheardDelay
-    from calib.estimation.result import FitResult
     from calib.evaluation.localization import Localization
+    from calib.fitting.passive_listeners import OverheardDelay
+    from calib.fitting.result import FitResult
 
 
 @dataclass(frozen=True, slots=True)

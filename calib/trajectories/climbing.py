@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from calib.estimation.losses import MIXTURE
 from calib.estimation.pair_mixture import PairMixture
 from calib.estimation.problem import Problem
 from calib.estimation.robust import QuadraticModel, scale_of
 from calib.estimation.smoothing import reml_penalty
+from calib.estimator.losses import MIXTURE
 from calib.spread import robust_spread
 from calib.trajectories.arrow import Factored, normal_of
 from calib.trajectories.coarseness import Coarseness, coarseness

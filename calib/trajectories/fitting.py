@@ -16,17 +16,17 @@ import uwblink
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
+from calib.checks.limits import limits
+from calib.checks.plausibility import implausible, one_way, refuse_refuted
+from calib.checks.power_levels import unlike_powers
+from calib.checks.warnings import warnings_of
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimation.building import build_problem
-from calib.estimation.limits import limits
-from calib.estimation.plausibility import implausible, one_way, refuse_refuted
-from calib.estimation.power_levels import unlike_powers
 from calib.estimation.problem import Problem
-from calib.estimation.result import FitResult
 from calib.estimation.stating import calibration_of
 from calib.estimation.unknowns import Unknowns
-from calib.estimation.warnings import warnings_of
+from calib.fitting.result import FitResult
 from calib.settings import FitSettings, check_choice
 from calib.trajectories.beginning import beginning
 from calib.trajectories.climbing import Climbed, climb

@@ -10,9 +10,9 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import basis
 from calib.errors import BadInputError
-from calib.estimation.known_delays import imported
 from calib.estimation.problem import Problem
 from calib.estimation.solver import Solved
+from calib.fitting.known_delays import imported
 from uwblink.arrays import Floats
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calib.estimation.fitting import fit
 from calib.figures import (
     bias_over_power,
     binned,
@@ -17,6 +16,7 @@ from calib.figures import (
     sigma_over_power,
     within_fence,
 )
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import bias_m, ranges
 from uwblink.pages.figures import style
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import calib
-from calib.estimation.losses import LOSSES
+from calib.estimator.losses import LOSSES
 from calib.report.sections import SECTIONS
 
 SECONDS = 0.25

@@ -7,8 +7,8 @@ import pytest
 
 from calib.data.sources import load_ranges
 from calib.errors import UnanswerableError
-from calib.estimator.fitting import fit
 from calib.evaluation.statistics import evaluate, pair_rows
+from calib.fitting.fitting import fit
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate

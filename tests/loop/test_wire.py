@@ -38,7 +38,7 @@ def test_a_flight_through_encode_and_decode_calibrates_to_the_same_bytes(tmp_pat
 
 def test_served_boards_calibrate_like_simulated_ones(tmp_path):
     from calib.data.sources import load_ranges
-    from calib.estimator.fitting import fit
+    from calib.fitting.fitting import fit
 
     scenario = load(TRAIN, ["run.duration_s=25"])
     tags, _ = load_places(TRAIN)

@@ -8,7 +8,7 @@ import pytest
 
 from calib.calibration.comparison import compare
 from calib.errors import UnanswerableError
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 

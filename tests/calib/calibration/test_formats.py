@@ -18,7 +18,7 @@ from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
 from calib.data.samples import sample_flight
 from calib.errors import BadInputError
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, ranges
 from tests.shared_data import shared
 from uwblink.importers import read_source

@@ -7,7 +7,7 @@ import pytest
 
 from calib.calibration.model import Calibration, load_calibration, rests_on
 from calib.errors import BadInputError
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 import calib
 from calib.cli.commands import app
-from calib.estimation import pair_mixture
+from calib.estimator import optimize
 from uwblink.recording.file import Recording
 
 
@@ -27,7 +27,7 @@ def run(*words):
 
 @pytest.fixture
 def stopped(flight, monkeypatch, tmp_path):
-    monkeypatch.setattr(pair_mixture, "MAX_STEPS", 2)
+    monkeypatch.setattr(optimize, "MOST_STEPS", 2)
     return run("fit", flight, "-o", tmp_path / "c.json"), tmp_path / "c.json"
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calib.errors import BadInputError
-from calib.estimation.new_tag import add_tag
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
+from calib.fitting.new_tag import add_tag
 from tests.calib.synthetic import ranges
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 

@@ -11,9 +11,9 @@ import pytest
 import calib
 from calib.data.samples import sample_flight
 from calib.errors import BadInputError
-from calib.estimation.losses import LOSSES, register_loss
 from calib.estimation.robust import robust_fit
-from calib.estimator.fitting import fit
+from calib.estimator.losses import LOSSES, register_loss
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, design, ranges
 from uwblink.recording.file import Recording
 
@@ -84,7 +84,7 @@ def test_a_registered_loss_is_replaced_only_when_asked(own_loss):
 
 PLUGIN = """
 import numpy as np
-from calib.estimation.losses import RobustLoss
+from calib.estimator.losses import RobustLoss
 
 def weights(u):
     weight = np.exp(-(u**2) / 2)

@@ -8,8 +8,8 @@ import pytest
 
 from calib.data.sources import load_ranges
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.new_tag import add_tag
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
+from calib.fitting.new_tag import add_tag
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 ROOT = Path(__file__).parents[3]

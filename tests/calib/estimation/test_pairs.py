@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calib.estimation.pairs import pairs_of, places_of
+from calib.estimator.pairs import pairs_of, places_of
 
 
 def test_pairs_are_numbered_by_their_tags_and_a_single_range_makes_one():

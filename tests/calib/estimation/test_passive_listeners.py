@@ -9,8 +9,8 @@ import pytest
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import Curve
 from calib.data.sources import load_ranges
-from calib.estimation.passive_listeners import heard_delays
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
+from calib.fitting.passive_listeners import heard_delays
 from uwblink.ticks import METRES_PER_TICK, SPEED_OF_LIGHT
 from uwbsim.scenario.loading import load
 from uwbsim.simulation.run import simulate

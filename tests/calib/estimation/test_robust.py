@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from calib.estimation.losses import LOSSES
 from calib.estimation.robust import robust_fit, sandwich
+from calib.estimator.losses import LOSSES
 from tests.calib.synthetic import DELAYS_NS, design, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 

@@ -157,6 +157,6 @@ def test_two_sound_sessions_know_more_than_one():
 
 def test_the_p_value_counts_all_tests():
     # A difference that is just named: by its own test alone, one of some fifty, it would be fifty times as unlikely.
-    _, parts = sessions(6, moved_ns=0.125, recipe=replace(RECIPE, seconds=10, per_second=60))
+    _, parts = sessions(6, moved_ns=0.2, recipe=replace(RECIPE, seconds=10, per_second=60))
     (said,) = between(calib.fit(parts))
     assert 2e-4 < float(said.split("p = ")[1].split(")")[0]) <= 5e-3

@@ -6,7 +6,7 @@ from scipy.optimize import lsq_linear
 
 from calib.errors import UnanswerableError
 from calib.estimation.sigma_curve import FEWEST, _above, _penalised
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import ranges
 
 FLOOR = 0.1

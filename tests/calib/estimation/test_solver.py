@@ -17,7 +17,7 @@ from calib.estimation.robust import quadratic_model, robust_fit
 from calib.estimation.smoothing import reml_penalty
 from calib.estimation.solver import solve
 from calib.estimator import known_distances
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, design, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 

@@ -7,11 +7,11 @@ import pytest
 
 from calib.estimation import robust, solver
 from calib.estimation.identifiability import UNDETERMINED, identifiable_directions
-from calib.estimation.losses import LOSSES
 from calib.estimation.robust import quadratic_model, robust_fit, sandwich
 from calib.estimation.smoothing import reml_penalty
 from calib.estimation.solver import PILOT, _first_ridge, _pilot, solve
-from calib.estimator.fitting import fit
+from calib.estimator.losses import LOSSES
+from calib.fitting.fitting import fit
 from tests.calib.estimation.test_solver import problem_of
 from tests.calib.synthetic import ranges
 

@@ -12,10 +12,10 @@ from calib.calibration.power_curves import Curve
 from calib.data.samples import sample_flight
 from calib.data.sources import Flight, load_flight
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimator.fitting import fit
 from calib.evaluation.localization import FixedStd, filter_runs, fixed_std, localize, summarize
 from calib.evaluation.output import as_tum, localization_json, localization_text, write_tum
 from calib.evaluation.tracking import FilterRanges, Run, Settings, run_filters
+from calib.fitting.fitting import fit
 from calib.report.figures import rmse_bars
 from uwblink.pages.figures import style
 from uwbsim.scenario.loading import load

@@ -8,8 +8,8 @@ import pytest
 from rich.console import Console
 
 from calib.cli.judging import print_table
-from calib.estimator.fitting import fit
 from calib.evaluation.statistics import evaluate, pair_rows, statistics
+from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 

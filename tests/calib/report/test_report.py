@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from pypdf import PdfReader
 
 from calib.cli.judging import spread_tests
-from calib.estimator.fitting import fit
+from calib.fitting.fitting import fit
 from calib.report.writing import render
 from tests import processes
 from tests.browser import chromium, lies_well

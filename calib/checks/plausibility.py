@@ -11,8 +11,8 @@ import numpy as np
 
 from calib.data.ranges import STATIC, Ranges
 from calib.errors import UnanswerableError
-from calib.estimation.pairs import pairs_of
 from calib.estimation.row_order import stable_order
+from calib.estimator.pairs import pairs_of
 from calib.long_columns import computed, let_go, picked
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints

@@ -12,8 +12,8 @@ from calib.calibration.power_curves import equal_bins
 from calib.data.sources import Data, load_ranges
 from calib.error_mixture import fit_error_mixture
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.losses import LOSSES
 from calib.estimation.robust import robust_fit, sandwich
+from calib.estimator.losses import LOSSES
 from calib.settings import check_choice, check_tag
 from uwblink.recording.antenna_delays import delays_differ, known_delays
 from uwblink.ticks import SPEED_OF_LIGHT

@@ -72,7 +72,7 @@ def register_loss(name: str, weights: Weights, *, replace: bool = False) -> None
 
     And out again:
 
-    >>> from calib.estimation.losses import LOSSES
+    >>> from calib.estimator.losses import LOSSES
     >>> LOSSES.remove("geman-mcclure")
     """
     try:

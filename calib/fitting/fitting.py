@@ -18,16 +18,16 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import limits
+from calib.checks.plausibility import implausible, one_way, refuse_impossible, refuse_refuted
+from calib.checks.power_levels import unlike_powers
+from calib.checks.warnings import warnings_of
 from calib.data.ranges import Ranges
 from calib.data.sources import Data, load_ranges
-from calib.estimation.known_delays import imported, std_taken_over, taken_over
-from calib.estimation.losses import MIXTURE, check_loss
-from calib.estimation.plausibility import implausible, one_way, refuse_impossible, refuse_refuted
-from calib.estimation.power_levels import unlike_powers
-from calib.estimation.result import FitResult
-from calib.estimation.warnings import warnings_of
 from calib.estimator.known_distances import KnownDistances, Recipe, fit_known_distances
+from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
+from calib.fitting.known_delays import imported, std_taken_over, taken_over
+from calib.fitting.result import FitResult
 from calib.settings import FitSettings
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -104,6 +104,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         *warnings_of(ranges, float(np.mean(inliers)), found.free, found.blocks.seconds),
     ]
     provenance = _provenance(ranges, found, recipe, inliers, warnings, reference)
+    if settings.changed():
+        provenance["settings"] = settings.changed()
     provenance["error_std_m"] = {
         "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
         "corrected": float(np.std(residuals)),

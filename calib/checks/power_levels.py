@@ -14,8 +14,8 @@ import numpy as np
 
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lifted_power
+from calib.checks.plausibility import MEDIAN
 from calib.data.ranges import Ranges
-from calib.estimation.plausibility import MEDIAN
 from calib.spread import TWO_SIDED_95, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
