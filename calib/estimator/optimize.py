@@ -6,7 +6,7 @@ much of what their slope promised they kept; the weights of priors that data det
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,8 +59,11 @@ def maximize(
     tolerance: float = SETTLED,
     evidence_steps: int = EVIDENCE_STEPS,
     asked: Ints | None = None,
+    longest: Callable[[Floats], float] | None = None,
 ) -> Optimum:
     """Climb from unknowns (p,) to the likeliest ones; of those that are `asked` for the search settles more closely.
+
+    `longest` returns which share of a step (p,) may be taken at most, where unknowns are not linear.
 
     A likelihood that falls halves the step. Squared slopes are not quite the curvature: a step to the top keeps half of
     what its slope promises, one that keeps nearly all was short, and the next one is taken longer.
@@ -107,7 +110,7 @@ def maximize(
                 steps=taken,
                 success=True,
             )
-        step *= length
+        step *= min(length, np.inf if longest is None else longest(step))
         promised = float(slope @ step)
         top, x = x, x + step
     return Optimum(
