@@ -17,7 +17,7 @@ from scipy import sparse
 from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
 from calib.estimator.range_rows import RangeRows
-from calib.estimator.rows import projected
+from calib.estimator.rows import Rows, projected, sum_rows
 from calib.estimator.time_blocks import Persistence, TimeBlocks, persistence
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
@@ -60,8 +60,13 @@ class Covariance:
     used: float
 
 
-def sandwich(optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: TimeBlocks) -> Covariance:
-    """Return the covariance of the kept unknowns at an optimum of ranges, which lie in blocks of time."""
+def sandwich(
+    optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
+) -> Covariance:
+    """Return the covariance of the kept unknowns at an optimum of ranges, which lie in blocks of time.
+
+    What is known `beside` ranges (poses, tapes) is taken to be as uncertain as it is said to be.
+    """
     keep = np.concatenate([sort.indices for sort in kept])
     reach = optimum.covariance[:, keep]
     series = block_sums(rows, optimum.x, reach, blocks)
@@ -76,9 +81,12 @@ def sandwich(optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: Ti
     # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the unknowns that ranges determine by their
     # number.
     count = len(rows)
-    used = trace_of_product(optimum.covariance, optimum.information)
+    information = sum_rows([rows], optimum.x).information if beside else optimum.information
+    used = trace_of_product(optimum.covariance, information)
     fresh = count / max(count - used, 0.2 * count)
-    prior = reach.T @ optimum.priors.precision() @ reach
+    prior = reach.T @ (optimum.priors.precision() @ reach)
+    if beside:
+        prior = prior + reach.T @ (sum_rows(beside, optimum.x).information @ reach)
     matrix = fresh * (series.T @ series) * width[:, None] * width + prior + of_weights(optimum, keep)
     return Covariance(matrix=np.asarray(matrix), lasting=tuple(lasting), used=used)
 

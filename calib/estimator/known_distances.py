@@ -19,7 +19,7 @@ from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
 from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robust
-from calib.estimator.rows import NormalRows
+from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.time_blocks import TimeBlocks, in_order, time_blocks
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.information import Unknown as NamedUnknown
@@ -131,12 +131,15 @@ def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
         fitted = pilot
     if not isinstance(fitted.rows.errors, Mixture):
         fitted = robust_fit(model, error, robust, recipe.scale_m, [u.kind for u in model.unknowns], start=pilot)
-    return _described(model, fitted, blocks, verdict)
+    return described(model, fitted, blocks, verdict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """Where a search ended, and the rows that it was of; `residuals` (n,) in the order of the model's ranges."""
+    """Where a search ended, and the rows that it was of; `residuals` (n,) in the order of the model's ranges.
+
+    `beside` are rows of what is known beside ranges.
+    """
 
     rows: RangeRows
     gauge: tuple[NormalRows, ...]
@@ -145,6 +148,7 @@ class Fitted:
     loss: str
     scale_m: float
     steps: int
+    beside: tuple[Rows, ...] = ()
 
 
 def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeModel:
@@ -310,7 +314,7 @@ def _from(layout: Layout, start: Fitted | None) -> Floats:
     return x
 
 
-def _described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, verdict: Verdict) -> KnownDistances:
+def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, verdict: Verdict) -> KnownDistances:
     """Return a fit with the covariances of what was fitted."""
     layout = fitted.optimum.layout
     noise = [kind for kind in layout.where if kind.startswith(("noise level", "noise curve"))]
@@ -321,7 +325,7 @@ def _described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, verdict: V
     }
     parts = {name: own for name, own in parts.items() if len(own)}
     kept = [Kept.delays(own) if name == "delay" else Kept.curve(own) for name, own in parts.items()]
-    lasting = sandwich(fitted.optimum, fitted.rows, kept, blocks)
+    lasting = sandwich(fitted.optimum, fitted.rows, kept, blocks, fitted.beside)
     whose = np.repeat(np.arange(len(parts)), [len(own) for own in parts.values()])
     covariances = {name: lasting.matrix[np.ix_(whose == k, whose == k)] for k, name in enumerate(parts)}
     if "offset of pair" in layout.where and "odds of pair" in layout.where:
@@ -365,12 +369,12 @@ def _in_sequence(
     The curves keep their constants and the delays are those of the first step, unless a reference is asked for.
     """
     free = replace(model, gauged=(False,) * len(model.gauged))
-    first = _described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks, verdict)
+    first = described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks, verdict)
     kinds = free.curve_kinds()
     # The curve bends with powers that are few at either end: it is fitted to those between them.
     inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
     second = robust_fit(free, first.residuals, recipe.loss, first.searches[0].scale_m, kinds, weight=inside)
-    curves = _described(free, second, blocks, verdict)
+    curves = described(free, second, blocks, verdict)
     values = first.values | {kind: curves.values[kind] for kind in kinds}
     if recipe.reference is not None:
         values = _stated(model, values, recipe)

@@ -21,6 +21,9 @@ from uwblink.arrays import Floats, Ints
 RESIDUAL = "residual"
 """The parameter that delays, curves and offsets add to."""
 
+SHARED = "shared"
+"""Name of the part of a residual's slope that the other parameters have, too."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
@@ -64,15 +67,46 @@ class Errors(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixture:
-    """Direct, reflected or an outlier (`calib.range_errors.density`): the likelihood of ranges."""
+    """Direct, reflected or an outlier (`calib.range_errors.density`): the likelihood of ranges.
+
+    With `expected` what a residual tells is what the model says on average (Fisher's information), not the square of
+    its slope: where few ranges determine an unknown, such as a place on a path, their squares are too unsteady. `used`
+    is the share of the ranges that such unknowns use up: noise is estimated as larger by it (restricted likelihood).
+    """
 
     span_m: float = OUTLIERS_OVER_M
+    expected: bool = False
+    used: float = 0.0
     parameters: tuple[str, ...] = ("noise", "odds", "detour", "least", "outliers", "long")
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,) and slopes by each parameter (n,)."""
         found = error_slopes(values[RESIDUAL], values, span_m=self.span_m)
-        return found.log_density, found.by, None
+        if self.used:
+            more = found.by | {"noise": found.by["noise"] + self.used}
+            found = replace(found, log_density=found.log_density + self.used * values["noise"], by=more)
+        if not self.expected:
+            return found.log_density, found.by, None
+        typical = {name: np.atleast_1d(np.median(values[name])) for name in self.parameters}
+        alone, shared = self._expected(typical)
+        sharper = np.exp(typical["noise"] - values["noise"])
+        direct = (1 + np.exp(typical["odds"])) / (1 + np.exp(values["odds"]))
+        by = sum(part * found.by[name] for part, name in zip(shared, self.parameters, strict=True)) * sharper
+        tells = np.broadcast_to(alone * sharper**2 * direct, found.log_density.shape)
+        return found.log_density, found.by | {SHARED: by}, tells
+
+    def _expected(self, typical: dict[str, Floats]) -> tuple[float, Floats]:
+        """Return what a residual tells beside the other parameters, 1/m^2, and how its slope follows theirs (k,)."""
+        sigma = float(np.exp(typical["noise"][0]))
+        longest = 8 * sigma + 30 * float(np.exp(typical["detour"][0]))
+        residual = np.concatenate([np.linspace(-8 * sigma, 8 * sigma, 321), np.geomspace(8.1 * sigma, longest, 120)])
+        found = error_slopes(residual, typical, span_m=self.span_m)
+        weight = np.exp(found.log_density) * np.gradient(residual)
+        weight /= weight.sum()
+        slope, others = found.by[RESIDUAL], np.array([found.by[name] for name in self.parameters])
+        square, across = (others * weight) @ others.T, (others * weight) @ slope
+        shared = np.linalg.lstsq(square + 1e-9 * np.eye(len(square)), across, rcond=1e-8)[0]
+        return float(weight @ slope**2 - shared @ across), shared
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,36 +280,42 @@ class RangeRows:
     def _as_terms(
         self, blocks: slice, rows: slice, value: float, by: dict[str, Floats], tells: Floats | None, moved: Any
     ) -> Terms:
+        """Return what rows say: by squares of slopes, or by what each residual tells and squares of what is beside."""
         count, several = rows.stop - rows.start, blocks.stop - blocks.start
-        parts = [part for part in self.parts if part.parameter in by]
-        columns = [
-            np.broadcast_to(part.columns + self.layout.where[part.kind].start, (1, part.columns.shape[1]))
-            if len(part.columns) == 1
-            else part.columns[blocks] + self.layout.where[part.kind].start
-            for part in parts
-        ]
-        columns = [np.broadcast_to(own, (several, own.shape[1])) for own in columns]
-        entries = [
-            np.ones((part.columns.shape[1], count)) if part.values is None else part.values[:, rows] for part in parts
-        ]
-        slopes = [by[part.parameter] * own for part, own in zip(parts, entries, strict=True)]
         starts = self.starts[blocks.start : blocks.stop + 1] - rows.start
+        columns, entries, names = [], [], []
+        for part in self.parts:
+            if part.parameter not in by:
+                continue
+            own = part.columns if len(part.columns) == 1 else part.columns[blocks]
+            columns.append(np.broadcast_to(own + self.layout.where[part.kind].start, (several, own.shape[1])))
+            entries.append(np.ones((own.shape[1], count)) if part.values is None else part.values[:, rows])
+            names.append(part.parameter)
         if moved is not None and self.geometry is not None:
-            own = self.geometry.columns[self.order[rows]]
-            columns = [np.repeat(one, np.diff(starts), axis=0) for one in columns] + [own]
+            columns = [np.repeat(one, np.diff(starts), axis=0) for one in columns]
+            columns.append(self.geometry.columns[self.order[rows]])
             starts = np.arange(count + 1)
             entries.append(-moved.T)
-            slopes.append(by[RESIDUAL] * entries[-1])
-        stacked = np.concatenate(slopes)
-        told = None if tells is None else np.concatenate(entries)
-        return Terms(
-            value=value,
-            slopes=stacked,
-            columns=np.concatenate(columns, axis=1),
+            names.append(RESIDUAL)
+        slopes = np.concatenate([by[name] * own for name, own in zip(names, entries, strict=True)])
+        stacked = np.concatenate(columns, axis=1)
+        of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
+        found = Terms(value=value, slopes=slopes, columns=stacked, starts=starts)
+        if tells is None:
+            return found
+        if len(of_residual) == len(names):
+            return replace(found, weight=tells, entries=np.concatenate(entries))
+        shared = [by[SHARED if name == RESIDUAL else name] * one for name, one in zip(names, entries, strict=True)]
+        residual = np.concatenate([entries[k] for k in of_residual])
+        beside = Terms(
+            value=0.0,
+            slopes=np.zeros_like(residual),
+            columns=np.concatenate([columns[k] for k in of_residual], axis=1),
             starts=starts,
             weight=tells,
-            entries=told,
+            entries=residual,
         )
+        return replace(found, entries=np.concatenate(shared), beside=beside)
 
 
 def _sorted(part: Part, order: Ints, starts: Ints) -> Part:

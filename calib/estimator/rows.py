@@ -31,7 +31,8 @@ class Terms:
 
     `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K); `starts`
     (blocks + 1,) bound the blocks. What rows know of the unknowns is the sum of `weight` (n,) times outer squares of
-    `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974).
+    `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974). What rows know
+    `beside` that is added.
     """
 
     value: float
@@ -40,6 +41,7 @@ class Terms:
     starts: Ints
     weight: Floats | None = None
     entries: Floats | None = None
+    beside: Terms | None = None
 
     def as_matrix(self, values: Floats, size: int) -> sparse.csr_matrix:
         """Return values (K, n) at the rows' columns as a sparse matrix (n, size)."""
@@ -77,24 +79,25 @@ def sum_rows(rows: Sequence[Rows], x: Floats, *, information: bool = True) -> Su
             value += terms.value
             sums = np.add.reduceat(terms.slopes, terms.starts[:-1], axis=1)
             gradient += np.bincount(terms.columns.ravel(), sums.T.ravel(), size)
-            if not information:
-                continue
-            entries = terms.slopes if terms.entries is None else terms.entries
-            weighed = entries if terms.weight is None else entries * terms.weight
-            if entries.shape[1] >= LONG_BLOCKS * len(terms.columns):
-                products = _block_products(weighed, entries, terms.starts).ravel()
-                place = (terms.columns[:, :, None] * size + terms.columns[:, None, :]).ravel()
+            for part in (terms, terms.beside) if information else ():
+                if part is None:
+                    continue
+                entries = part.slopes if part.entries is None else part.entries
+                weighed = entries if part.weight is None else entries * part.weight
+                if entries.shape[1] < LONG_BLOCKS * len(part.columns):
+                    loose.append(part.as_matrix(weighed, size).T @ part.as_matrix(entries, size))
+                    continue
+                products = _block_products(weighed, entries, part.starts).ravel()
+                place = (part.columns[:, :, None] * size + part.columns[:, None, :]).ravel()
                 if many:
                     loose.append(sparse.csr_matrix((products, divmod(place, size)), shape=(size, size)))
                 else:
                     np.add.at(square, place, products)
-            else:
-                loose.append(terms.as_matrix(weighed, size).T @ terms.as_matrix(entries, size))
     if many and information:
         return Sums(value, gradient, sparse.csc_matrix(sum(loose, sparse.csr_matrix((size, size)))))
     found = square.reshape((size, size) if information else (0, 0))
-    for part in loose:
-        found += part.toarray()
+    for product in loose:
+        found += product.toarray()
     return Sums(value, gradient, found)
 
 
@@ -129,11 +132,14 @@ class NormalRows:
     entries: Floats
     columns: Ints
 
+    def left(self, x: Floats) -> Floats:
+        """Return measured less predicted values (n,)."""
+        return np.asarray(self.value - np.sum(self.entries * x[self.columns], axis=1))
+
     def terms(self, x: Floats) -> Iterator[Terms]:
         """Yield all rows."""
         if len(self.value):
-            left = self.value - np.sum(self.entries * x[self.columns], axis=1)
-            yield normal_terms(left, self.std, self.entries.T, self.columns)
+            yield normal_terms(self.left(x), self.std, self.entries.T, self.columns)
 
 
 def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -> Terms:

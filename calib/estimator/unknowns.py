@@ -128,17 +128,17 @@ class Priors:
         """Return the precision of all priors (p, p); a sparse one for many unknowns."""
         size = self.layout.size
         if size > MOST_DENSE:
-            entries = [
-                (weight * own.data, own.row + where.start, own.col + where.start)
-                for weight, (where, prior) in zip(self.weights, self.all, strict=True)
-                for own in [sparse.coo_matrix(_structure(prior, where))]
-            ]
+            entries = []
+            for weight, (where, prior) in zip(self.weights, self.all, strict=True):
+                structure = sparse.eye(where.stop - where.start) if prior.structure is None else prior.structure
+                own = sparse.coo_matrix(structure)
+                entries.append((weight * own.data, own.row + where.start, own.col + where.start))
             value, row, column = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*entries, strict=True))
             return sparse.csc_matrix((value, (row.astype(np.int64), column.astype(np.int64))), shape=(size, size))
         found = np.zeros((size, size))
         for weight, (where, prior) in zip(self.weights, self.all, strict=True):
-            structure = _structure(prior, where)
-            found[where, where] += weight * (structure if isinstance(structure, np.ndarray) else structure.toarray())
+            own = _structure(prior, where)
+            found[where, where] += weight * (own if isinstance(own, np.ndarray) else own.toarray())
         return found
 
     def value(self, x: Floats) -> float:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from calib.information import Verdict
-from calib.planning.rehearsal import Flown
+from calib.planning.reference_motion import FlightInputs
 from calib.planning.result import NextBest
-from calib.trajectories.given import Usable
+from calib.trajectories.scene import Usable
 from uwblink.arrays import Floats
 
 
@@ -30,7 +30,7 @@ class FlightPlan:
     [1, 2, 3, 4, 11, 12, 13, 14]
     """
 
-    flown: Flown | None
+    flown: FlightInputs | None
     usable: Usable
     imu: str | None
     noise_m: float

@@ -6,43 +6,41 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calib.data.sources import Data
 from calib.errors import BadInputError
+from calib.planning.flight_information import Errors, Flight, Predicted, flight_of
 from calib.planning.flight_result import FlightPlan
-from calib.planning.flying import flying
-from calib.planning.foresight import Errors, Flight, Foreseen, best_tape, flight_of, foresee
-from calib.planning.rehearsal import Flown, rehearse
+from calib.planning.reference_motion import FlightInputs, flight_inputs, reference_motion
 from calib.planning.result import NextBest
 from calib.settings import check_choice
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.fitting import ANCHORS, usable_of
-from calib.trajectories.given import Usable
+from calib.trajectories.scene import Usable
 from uwblink.arrays import Floats
 
-GUESS_NS: Final = 1.5
+GUESS_NS = 1.5
 """How far a delay is known without any data, for means over tags of which some are not determined."""
 
-MORE_KNOWN_S: Final = 10.0
-MORE_ANCHORS: Final = 4
-STANDS_S: Final = 5.0
-MOST_TAPED: Final = 10
-HEADING_DEG: Final = 0.5
-DELAY_STD_NS: Final = 0.05
+MORE_KNOWN_S = 10.0
+MORE_ANCHORS = 4
+STANDS_S = 5.0
+MOST_TAPED = 10
+HEADING_DEG = 0.5
+DELAY_STD_NS = 0.05
 """How well another calibration, or a survey, says the delay of one tag."""
 
-ACCELEROMETERS: Final = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
+ACCELEROMETERS = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
 """Noise in m/s^2 a root of Hz, orders of magnitude of data sheets."""
 
-VIBRATION_M_S2: Final = 0.2
+VIBRATION_M_S2 = 0.2
 """What propellers leave of their shaking in a mean over a tenth of a second."""
 
-WINDOW_S: Final = 0.1
-TRUSTED: Final = 3.0
+WINDOW_S = 0.1
+TRUSTED = 3.0
 """By how much less a fit trusts an accelerometer than its residuals say."""
 
 Robots = int | Sequence[Sequence[int]]
@@ -117,7 +115,7 @@ def plan_flight(  # noqa: PLR0913 - what somebody may have, each with its defaul
     with threadpool_limits(limits=1, user_api="blas"):
         if not isinstance(robots, int | Sequence) or isinstance(robots, str):
             return _promise(asked, asked.flight(robots), None)
-        flown = flying(
+        flown = flight_inputs(
             robots,
             anchors,
             seconds=seconds,
@@ -129,7 +127,7 @@ def plan_flight(  # noqa: PLR0913 - what somebody may have, each with its defaul
             inertial=imu is not None or attitudes == "imu",
             seed=seed,
         )
-        return _promise(asked, asked.flight(rehearse(flown)), flown)
+        return _promise(asked, asked.flight(reference_motion(flown)), flown)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,12 +160,12 @@ class _Asked:
 
     def with_tape(self, flight: Flight) -> Flight | None:
         """Return the flight with one distance more, the best one; None where there is none."""
-        best = best_tape(flight, self.still_s, self.tape_sigma_m)
+        best = flight.best_tape(self.still_s, self.tape_sigma_m)
         return best and flight.taped([*flight.tapes, best], self.still_s, self.tape_sigma_m)
 
 
-def _promise(asked: _Asked, flight: Flight, flown: Flown | None) -> FlightPlan:
-    found = foresee(flight)
+def _promise(asked: _Asked, flight: Flight, flown: FlightInputs | None) -> FlightPlan:
+    found = flight.predicted()
     std = found.verdict.std
     known = np.isfinite(std)
     which = known if known.any() else np.ones(len(std), dtype=bool)
@@ -195,7 +193,7 @@ def _promise(asked: _Asked, flight: Flight, flown: Flown | None) -> FlightPlan:
         next_best=tuple(sorted(_more(asked, flight, flown, found), key=lambda one: one.mean_ns)),
         taped=tuple(flight.tapes),
         still_s=asked.still_s,
-        path_m=flight.path_m,
+        path_m=flight.path.position_m,
         stands=dict(flight.stands),
         bodies=flight.scene.moving,
     )
@@ -207,11 +205,11 @@ def _mean_ns(covariance: Floats) -> float:
     return TWO_SIDED_95 * float(np.sqrt(np.trace(np.linalg.inv(information)) / len(covariance)))
 
 
-def _more(asked: _Asked, flight: Flight, flown: Flown | None, found: Foreseen) -> Iterator[NextBest]:
+def _more(asked: _Asked, flight: Flight, flown: FlightInputs | None, found: Predicted) -> Iterator[NextBest]:
     """Yield what one thing more would bring; intervals are of the same tags."""
     now = _mean_ns(found.covariance_ns2)
     for what, changed in (*_better_known(asked, flight), *_flown_otherwise(asked, flown)):
-        with_it = foresee(changed())
+        with_it = changed().predicted()
         same = [with_it.tags.index(tag) for tag in found.tags]
         mean = _mean_ns(with_it.covariance_ns2[np.ix_(same, same)])
         if mean < now:
@@ -240,34 +238,34 @@ def _better_known(asked: _Asked, flight: Flight) -> Iterator[Change]:
         yield f"headings good to {HEADING_DEG:g} degrees", lambda: flight.with_headings(better)
 
 
-def _flown_otherwise(asked: _Asked, flown: Flown | None) -> Iterator[Change]:
+def _flown_otherwise(asked: _Asked, flown: FlightInputs | None) -> Iterator[Change]:
     """Yield other flights."""
     if flown is None:
         return
     if not asked.still_s:
         stands = replace(asked, still_s=STANDS_S, taped=asked.taped + 1)
         text = f"robots that stand for the first {STANDS_S:g} s, and the distance of two of their tags by tape"
-        yield text, lambda: stands.flight(rehearse(replace(flown, still_s=STANDS_S)))
+        yield text, lambda: stands.flight(reference_motion(replace(flown, still_s=STANDS_S)))
     longer = replace(flown, seconds=2 * flown.seconds)
-    yield f"a flight of {longer.seconds:g} s", lambda: asked.flight(rehearse(longer))
+    yield f"a flight of {longer.seconds:g} s", lambda: asked.flight(reference_motion(longer))
     if not flown.anchors:
         four = replace(flown, anchors=_fresh(flown, MORE_ANCHORS))
         fixed = replace(asked, usable=replace(asked.usable, anchors="given"))
-        yield f"{MORE_ANCHORS} anchors at known places", lambda: fixed.flight(rehearse(four))
+        yield f"{MORE_ANCHORS} anchors at known places", lambda: fixed.flight(reference_motion(four))
     elif asked.usable.anchors == "given":
         more = replace(flown, anchors=(*flown.anchors, *_fresh(flown, 1)))
-        yield "one anchor more at a known place", lambda: asked.flight(rehearse(more))
+        yield "one anchor more at a known place", lambda: asked.flight(reference_motion(more))
     if asked.imu is None and asked.usable.attitudes == "poses":
         sensed = replace(asked, imu="consumer")
-        yield "inertial readings", lambda: sensed.flight(rehearse(replace(flown, inertial=True)))
+        yield "inertial readings", lambda: sensed.flight(reference_motion(replace(flown, inertial=True)))
 
 
-def _fresh(flown: Flown, count: int) -> tuple[int, ...]:
+def _fresh(flown: FlightInputs, count: int) -> tuple[int, ...]:
     last = max(*(tag for robot in flown.robots for tag in robot), *flown.anchors, 0)
     return tuple(range(last + 1, last + 1 + count))
 
 
-def _one_delay(found: Foreseen) -> tuple[int, float]:
+def _one_delay(found: Predicted) -> tuple[int, float]:
     """Return which tag's delay is best known from elsewhere, and the mean half interval with it."""
     c = found.covariance_ns2
     after = [c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2) for k in range(len(c))]

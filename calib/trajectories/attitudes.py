@@ -1,12 +1,16 @@
-"""Attitudes of bodies as they are given, and how far they may be wrong."""
+"""Attitudes of bodies: as they are given, or by integrated gyroscopes; and mean specific forces of accelerometers."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from uwblink.arrays import Floats
+from uwblink.arrays import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,10 +30,7 @@ class Attitude:
 
     def headed(self, heading_rad: float) -> Attitude:
         """Return them turned about the world's vertical."""
-        s, c = np.sin(heading_rad / 2), np.cos(heading_rad / 2)
-        x, y, z, w = self.quaternion.T
-        turned = np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
-        return replace(self, quaternion=turned)
+        return replace(self, quaternion=(_about_vertical(heading_rad) * Rotation.from_quat(self.quaternion)).as_quat())
 
     @property
     def exact(self) -> bool:
@@ -40,30 +41,183 @@ class Attitude:
         """Return rotation matrices (n, 3, 3) at instants (n,), along the chords of quaternions; held at the ends."""
         time = np.clip(time_s, self.time_s[0], self.time_s[-1])
         if len(self.time_s) == 1:
-            return matrices(np.broadcast_to(self.quaternion[0], (len(time), 4)))
+            return np.asarray(Rotation.from_quat(np.tile(self.quaternion[0], (len(time), 1))).as_matrix())
         after = np.clip(np.searchsorted(self.time_s, time, side="right"), 1, len(self.time_s) - 1)
         span = self.time_s[after] - self.time_s[after - 1]
         share = (time - self.time_s[after - 1]) / np.where(span > 0, span, 1.0)
         first, second = self.quaternion[after - 1], self.quaternion[after]
         # q and -q are one attitude.
         sign = np.where(np.einsum("ij,ij->i", first, second) < 0, -1.0, 1.0)
-        return matrices((1 - share)[:, None] * first + (share * sign)[:, None] * second)
+        mixed = (1 - share)[:, None] * first + (share * sign)[:, None] * second
+        return np.asarray(Rotation.from_quat(mixed).as_matrix())
 
 
-def matrices(quaternion: Floats) -> Floats:
-    """Return the rotation matrices (n, 3, 3) of quaternions x y z w (n, 4) of any length but zero."""
-    x, y, z, w = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+def _about_vertical(heading_rad: float) -> Rotation:
+    return Rotation.from_rotvec([0.0, 0.0, heading_rad])
 
 
-def turned(turn_rad: Floats, vector: Floats) -> Floats:
-    """Return vectors (n, 3) turned by rotation vectors (n, 3) (Rodrigues)."""
-    angle = np.linalg.norm(turn_rad, axis=1, keepdims=True)
-    near = np.maximum(angle, 1e-12)
-    once = np.cross(turn_rad, vector)
-    return np.asarray(vector + np.sin(near) / near * once + (1 - np.cos(near)) / near**2 * np.cross(turn_rad, once))
+GRAVITY_M_S2 = 9.81
+WINDOW_S = 0.1
+"""Specific forces are averaged over so long: vibrations go, and accelerations of a spline hardly change."""
+
+STRONGEST_M_S2 = 4.0
+"""Mean accelerations beyond this are knocks, not flight."""
+
+FORCE_STD_M_S2 = 0.5
+"""What a mean specific force is off by, before the data say it better."""
+
+LEVELLING = 0.1
+"""Share of a tilt against the mean specific force that is taken back in a second (Mahony, Hamel, Pflimlin 2008)."""
+
+TILT_STD = float(np.radians(2.0))
+TILT_WANDER = float(np.radians(0.5))
+HEADING_WANDER = float(np.radians(0.5))
+"""Errors of integrated attitudes: tilts, which the accelerometer holds, and how all change in a second."""
+
+BIAS_STEP_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inertial:
+    """Windows of an accelerometer, which begin and end at `begin_s` and `end_s` (k,).
+
+    `force_m_s2` (k, 3) is the mean specific force in the world's axes by the given attitudes, `turn` (k, 3, 3) their
+    mean; `std_m_s2` is what a mean is off by.
+    """
+
+    begin_s: Floats
+    end_s: Floats
+    force_m_s2: Floats
+    turn: Floats
+    std_m_s2: float = FORCE_STD_M_S2
+
+    def within(self, begin_s: float, end_s: float) -> Inertial:
+        """Return the windows inside a span of time."""
+        rows = (self.begin_s >= begin_s) & (self.end_s <= end_s)
+        chosen = {name: getattr(self, name)[rows] for name in ("begin_s", "end_s", "force_m_s2", "turn")}
+        return replace(self, **chosen)
+
+    def headed(self, heading_rad: float) -> Inertial:
+        """Return them turned about the world's vertical."""
+        turn = _about_vertical(heading_rad).as_matrix()
+        return replace(self, force_m_s2=self.force_m_s2 @ turn.T, turn=turn @ self.turn)
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """One body's readings in order of time: seconds (n,), angular velocity (n, 3) in rad/s, specific force (n, 3)."""
+
+    time_s: Floats
+    gyro: Floats
+    force: Floats
+
+    @classmethod
+    def of(cls, table: Mapping[str, NDArray[Any]], body: str, began_ns: int) -> Readings | None:
+        """Return the readings of a body from a recording's table; None where it has too few."""
+        if not table:
+            return None
+        rows = np.flatnonzero(table["body"] == body)
+        columns = [np.column_stack([table[f"{kind}{axis}"][rows] for axis in "xyz"]) for kind in "wa"]
+        good: Bools = np.asarray(np.isfinite(np.hstack(columns)).all(axis=1))
+        rows, columns = rows[good], [column[good] for column in columns]
+        if len(rows) < 10:
+            return None
+        order = np.argsort(table["time_ns"][rows], kind="stable")
+        time = np.asarray((table["time_ns"][rows][order] - began_ns) * 1e-9, dtype=np.float64)
+        return cls(time, columns[0][order].astype(np.float64), columns[1][order].astype(np.float64))
+
+
+def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
+    """Return the windows of an accelerometer from the first range to the last."""
+    time = readings.time_s
+    inside = (time >= max(0.0, float(attitude.time_s[0]))) & (time < min(last_s, float(attitude.time_s[-1])))
+    turn = attitude.at(time[inside])
+    force = np.einsum("nij,nj->ni", turn, readings.force[inside])
+    slot = np.floor(time[inside] / WINDOW_S).astype(np.int64)
+    starts = np.flatnonzero(np.diff(slot, prepend=-1))
+    count = np.diff(starts, append=len(slot))
+    if not len(starts):
+        return Inertial(begin_s=np.zeros(0), end_s=np.zeros(0), force_m_s2=np.zeros((0, 3)), turn=np.zeros((0, 3, 3)))
+    mean_force = np.add.reduceat(force, starts) / count[:, None]
+    mean_turn = np.add.reduceat(turn, starts) / count[:, None, None]
+    kept = count >= 0.7 * np.median(count)
+    kept &= np.linalg.norm(mean_force - (0, 0, GRAVITY_M_S2), axis=1) < STRONGEST_M_S2
+    begin = slot[starts][kept] * WINDOW_S
+    return Inertial(begin_s=begin, end_s=begin + WINDOW_S, force_m_s2=mean_force[kept], turn=mean_turn[kept])
+
+
+def integrated(readings: Readings, known: Attitude | None, until_s: float) -> Attitude:
+    """Return attitudes by the gyroscope, levelled by the accelerometer.
+
+    They are those `known` before `until_s`, which also tell the gyroscope's bias, and go on from there. Without any,
+    the heading at first is 0 and unknown.
+    """
+    early = known is not None and bool(np.any(known.time_s < until_s)) and until_s > 0
+    bias, turn = np.zeros(3), _level(readings)
+    first = 0
+    if known is not None and early:
+        bias = _gyro_bias(readings, known, until_s)
+        first = int(np.clip(np.searchsorted(readings.time_s, until_s), 1, len(readings.time_s) - 1))
+        turn = known.at(readings.time_s[first : first + 1])[0]
+    time, found = readings.time_s[first:], _carried_on(readings, first, turn, bias)
+    wander = np.array([TILT_WANDER, TILT_WANDER, HEADING_WANDER])
+    if known is not None and early:
+        before = known.time_s < time[0]
+        time = np.concatenate([known.time_s[before], time])
+        found = np.concatenate([known.quaternion[before], found])
+    return Attitude(
+        time_s=time,
+        quaternion=found,
+        std_rad=np.array([TILT_STD, TILT_STD, np.inf]),
+        wander_rad=wander,
+        begun=early,
+    )
+
+
+def _carried_on(readings: Readings, first: int, turn: Floats, bias: Floats) -> Floats:
+    """Return quaternions (n - first, 4) from a first attitude on."""
+    steps = np.minimum(np.diff(readings.time_s[first:], append=readings.time_s[-1]), 0.1)
+    rates, pulls = readings.gyro[first:] - bias, _smoothed(readings)[first:]
+    sizes = np.linalg.norm(pulls, axis=1)
+    found, attitude = np.empty((len(steps), 3, 3)), turn
+    for k, dt in enumerate(steps.tolist()):
+        found[k] = attitude
+        rate = rates[k]
+        if 0.8 < sizes[k] / GRAVITY_M_S2 < 1.2:
+            # The last row of the rotation matrix is the world's vertical in the axes of the body.
+            rate = rate + LEVELLING * np.cross(pulls[k] / sizes[k], attitude[2])
+        attitude = attitude @ Rotation.from_rotvec(rate * dt).as_matrix()
+    return np.asarray(Rotation.from_matrix(found).as_quat())
+
+
+def _smoothed(readings: Readings) -> Floats:
+    """Return specific forces averaged over about a window (n, 3)."""
+    count = max(int(WINDOW_S / max(float(np.median(np.diff(readings.time_s))), 1e-4)), 1)
+    kernel = np.ones(count) / count
+    return np.column_stack([np.convolve(column, kernel, mode="same") for column in readings.force.T])
+
+
+def _level(readings: Readings) -> Floats:
+    """Return the attitude whose vertical is that of the first second's mean specific force."""
+    early = readings.time_s < readings.time_s[0] + 1.0
+    up = readings.force[early].mean(axis=0)
+    up = up / np.linalg.norm(up)
+    side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    return np.array([np.cross(side, up), side, up])
+
+
+def _gyro_bias(readings: Readings, known: Attitude, until_s: float) -> Floats:
+    """Return by how much the gyroscope reads more than known attitudes turn, rad/s."""
+    last = min(until_s, float(known.time_s[-1]), float(readings.time_s[-1]))
+    first = max(float(known.time_s[0]), float(readings.time_s[0]))
+    edges = np.arange(first, last, BIAS_STEP_S)
+    if len(edges) < 2:
+        return np.zeros(3)
+    at = Rotation.from_matrix(known.at(edges))
+    turned = (at[:-1].inv() * at[1:]).as_rotvec() / BIAS_STEP_S
+    slot = np.searchsorted(edges, readings.time_s, side="right") - 1
+    there = [k for k in range(len(edges) - 1) if np.any(slot == k)]
+    if not there:
+        return np.zeros(3)
+    return np.asarray(np.median([readings.gyro[slot == k].mean(axis=0) - turned[k] for k in there], axis=0))

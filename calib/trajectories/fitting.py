@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,31 +16,34 @@ import uwblink
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
+from calib.checks.fitted import examine_fit
 from calib.checks.limits import limits
-from calib.checks.plausibility import implausible, one_way, refuse_refuted
-from calib.checks.power_levels import unlike_powers
-from calib.checks.warnings import warnings_of
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.building import build_problem
-from calib.estimation.problem import Problem
-from calib.estimation.stating import calibration_of
-from calib.estimation.unknowns import Unknowns
+from calib.fitting.known_delays import imported
+from calib.estimator.losses import MIXTURE
+from calib.checks.plausibility import implausible, one_way, refuse_refuted
+from calib.checks.power_levels import unlike_powers
 from calib.fitting.result import FitResult
+from calib.checks.warnings import warnings_of
+from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
+from calib.estimator.range_model import RangeModel
+from calib.estimator.time_blocks import time_blocks
+from calib.estimator.to_calibration import calibration_of
+from calib.information import Unknown, judge
 from calib.settings import FitSettings, check_choice
-from calib.trajectories.beginning import beginning
-from calib.trajectories.climbing import Climbed, climb
-from calib.trajectories.given import Usable, scene_from
-from calib.trajectories.judging import Judged, judged
-from calib.trajectories.scene import Scene
-from calib.trajectories.taken_curve import curve_source, less_curve, with_curve
+from calib.trajectories.judging import Judged, curve_uncertainty, judged
+from calib.trajectories.scene import Scene, Usable, scene_from
+from calib.trajectories.search import Found, search
+from calib.trajectories.start import begin
+from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
 
-ATTITUDES: Final = ("poses", "imu", "none")
-ANCHORS: Final = ("given", "sought")
-HEIGHTS: Final = ("used", "ignored")
-SIGMAS: Final = 3.0
-FOLLOWING: Final = 0.3
+ATTITUDES = ("poses", "imu", "none")
+ANCHORS = ("given", "sought")
+HEIGHTS = ("used", "ignored")
+INLIER_SIGMAS = 3.0
+FOLLOWED = 0.3
 """Share of the work that is done when trajectories have been followed, for a bar of progress."""
 
 
@@ -89,7 +92,7 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     """
     fixed = {int(tag): float(delay) for tag, delay in (fixed_ns or {}).items()}
     groups = {name: tuple(map(int, tags)) for name, tags in (groups or {}).items()}
-    known = curve_source(curve_from, "delays_only" if delays_only else "groups" if groups else "")
+    known = _curve_source(curve_from, "delays_only" if delays_only else "groups" if groups else "")
     if known is not None:
         lift, alpha_dbm = known.lift, known.alpha_dbm
         reference_power_dbm = known.provenance.get("reference_power_dbm", alpha_dbm)
@@ -109,15 +112,16 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     # The same bytes on any machine; SciPy brings a linear algebra of its own, which must be there to be held.
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
-        problem, scene = problem_of(scene, asked)
-        begun = beginning(scene, lambda share: done(FOLLOWING * share))
-        climbed = climb(begun.scene, problem, begun.state, lambda share: done(FOLLOWING + (1 - FOLLOWING) * share))
-        problem = _with_distances(problem, climbed)
-        found = judged(climbed, problem, asked.reference, asked.known)
-        result = _result(climbed, problem, found, asked, begun.rival)
+        model, scene = asked.model(scene)
+        scene, state, rival = begin(scene, lambda share: done(FOLLOWED * share))
+        error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
+        top = search(scene, model, error, state, lambda share: done(FOLLOWED + (1 - FOLLOWED) * share))
+        found = _described(model, top, known)
+        verdict = judged(found, top)
+        result = _result(found, top, verdict, asked, rival)
     done(1.0)
     if not minimum_norm:
-        _refuse_undetermined(found, problem, scene)
+        _refuse_undetermined(verdict, model, scene)
     return result
 
 
@@ -159,64 +163,92 @@ class Asked:
     curve: bool
     known: Calibration | None = None
 
-    @property
-    def reference(self) -> float:
-        """Return the power at which curves are zero, lifted."""
-        return float(lift_power(np.array(self.reference_dbm), self.alpha_dbm))
+    def model(self, scene: Scene, *, offsets: bool = True) -> tuple[RangeModel, Scene]:
+        """Return unknowns and parts of delays, curves and offsets, and the scene of their ranges."""
+        if len(scene.ranges) < FEWEST_RANGES:
+            raise UnanswerableError(
+                f"{scene.source}: {len(scene.ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
+            )
+        # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
+        numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
+        model = RangeModel.of(
+            numbered,
+            lift=self.lift,
+            alpha_dbm=self.alpha_dbm,
+            fixed_ns=self.fixed,
+            groups=self.groups,
+            curve=self.curve,
+            reference=float(lift_power(np.array(self.reference_dbm), self.alpha_dbm)),
+            offsets=offsets,
+        )
+        return model, scene.only(model.ranges.truth_m.astype(np.int64))
 
 
-def problem_of(scene: Scene, asked: Asked) -> tuple[Problem, Scene]:
-    """Return the columns of delays and curves, without any distance in them, and the scene of their ranges."""
-    # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
-    numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
-    problem = build_problem(
-        numbered,
-        lift=asked.lift,
-        alpha_dbm=asked.alpha_dbm,
-        fixed=asked.fixed,
-        groups=asked.groups,
-        minimum_norm=False,
-        unknowns=Unknowns(curve=asked.curve),
+def _curve_source(curve_from: Calibration | str | os.PathLike[str] | None, other: str) -> Calibration | None:
+    """Return the calibration whose curve is taken; raises `BadInputError` for one that has not one curve of all.
+
+    `other` names a parameter of the fit that says otherwise what curves there are, or is empty.
+    """
+    known = imported(curve_from, "curve_from")
+    if known is not None and other:
+        raise BadInputError(f"gives the curve of all tags, and does not go with `{other}`", parameter="curve_from")
+    if known is not None and (known.groups or known.power_at != "exchange"):
+        what = "curves of groups of tags" if known.groups else "a curve of each reception"
+        raise BadInputError(f"has {what}, expected one curve of all exchanges", parameter="curve_from")
+    return known
+
+
+def _described(model: RangeModel, top: Found, known: Calibration | None) -> KnownDistances:
+    """Return what was found as a fit to the distances that were found, which knows how far they are uncertain."""
+    distances = top.geometry.distances(top.optimum.x)[0]
+    model = replace(model, ranges=replace(model.ranges, truth_m=distances))
+    fitted = Fitted(
+        rows=top.rows,
+        gauge=top.gauge,
+        optimum=top.optimum,
+        residuals=top.rows.residuals(top.optimum.x),
+        loss=MIXTURE,
+        scale_m=float(np.median(np.exp(top.rows.values(top.optimum.x)["noise"]))),
+        steps=top.steps,
+        beside=tuple(top.known.values()),
     )
-    rows = problem.ranges.truth_m
-    bare = replace(problem.ranges, truth_m=np.zeros(len(rows)))
-    problem = replace(problem, ranges=bare, error=problem.error + rows)
-    if asked.known is not None:
-        problem = less_curve(problem, asked.known)
-    return problem, scene.only(rows.astype(np.int64))
+    # What the ranges determine is judged later, with what trajectories take of it.
+    everything = judge(1e3 * np.eye(1), [Unknown("delay", "")])
+    found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session), everything)
+    if known is not None:
+        more = curve_uncertainty(found, known)
+        found = replace(found, covariances=found.covariances | {"delay": found.covariances["delay"] + more})
+    return found
 
 
-def _with_distances(problem: Problem, climbed: Climbed) -> Problem:
-    """Return the columns of delays and curves with the distances that were found."""
-    ranges = replace(problem.ranges, truth_m=climbed.rows.distances(climbed.state))
-    return replace(problem, ranges=ranges, error=problem.error - ranges.truth_m)
-
-
-def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, rival: str) -> FitResult:
-    ranges, solved, covariance = problem.ranges, found.solved, found.covariance_ns2
+def _result(found: KnownDistances, top: Found, judgement: Judged, asked: Asked, rival: str) -> FitResult:
+    ranges = found.model.ranges
+    doubts = examine_fit(found)
+    covariance = judgement.beyond_linear(doubts.covariance_ns2)
     calibration = calibration_of(
-        problem, solved, covariance, climbed.told, asked.lift, asked.alpha_dbm, asked.fixed, asked.groups
+        found, covariance, lift=asked.lift, alpha_dbm=asked.alpha_dbm, fixed=asked.fixed, groups=asked.groups
     )
     if asked.known is not None:
-        calibration = with_curve(calibration, asked.known)
-    std = calibration.delays_std_ns | dict.fromkeys(found.free_tags, math.inf)
+        calibration = _with_curve(calibration, asked.known)
+    std = calibration.delays_std_ns | dict.fromkeys(judgement.free_tags, math.inf)
     calibration = replace(calibration, delays_std_ns=std)
     applied = replace(calibration, errors=None).apply(ranges)
     residuals = applied.corrected_m - ranges.truth_m
     refuse_refuted(calibration.delays_ns, residuals, ranges)
-    inliers = np.abs(residuals) < SIGMAS * applied.sigma_m
+    inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
     warnings = [
-        *found.open_ends(),
-        *_of_search(climbed, rival),
-        *climbed.scene.tapes.left_out,
-        *limits(ranges, problem, residuals, asked.fixed),
-        *found.doubts,
+        *judgement.left_open(covariance),
+        *_of_search(top, rival),
+        *top.scene.tapes.left_out,
+        *limits(found, ranges, residuals, asked.fixed),
+        *judgement.sentences,
+        *doubts.sentences,
         *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
-        *warnings_of(ranges, float(np.mean(inliers)), [], problem.blocks.seconds),
+        *warnings_of(ranges, float(np.mean(inliers)), [], found.blocks.seconds),
     ]
-    provenance = _provenance(climbed, problem, found, asked) | {
+    provenance = _provenance(found, top, judgement, asked, covariance) | {
         "inliers": int(np.count_nonzero(inliers)),
         "warnings": warnings,
     }
@@ -225,37 +257,50 @@ def _result(climbed: Climbed, problem: Problem, found: Judged, asked: Asked, riv
         ranges=ranges,
         residuals_m=residuals,
         inliers=inliers,
-        success=climbed.settled,
-        message=f"{'converged' if climbed.settled else 'stopped'} after {climbed.steps} steps",
+        success=top.success,
+        message=f"{'converged' if top.success else 'stopped'} after {top.steps} steps",
         warnings=warnings,
     )
 
 
-def _of_search(climbed: Climbed, rival: str) -> Iterator[str]:
-    if not climbed.settled:
-        yield f"the fit stopped after {climbed.steps} steps before it settled: delays are not final"
+def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
+    """Return a calibration with the curve of another, and what is known of it."""
+    uncertainty = calibration.uncertainty
+    if uncertainty is not None:
+        size = len(known.bias_curve.coefficients)
+        of_curve = known.uncertainty.bias_m2 if known.uncertainty else tuple((0.0,) * size for _ in range(size))
+        uncertainty = replace(uncertainty, bias_m2=of_curve)
+    return replace(calibration, bias_curve=known.bias_curve, uncertainty=uncertainty)
+
+
+def _of_search(top: Found, rival: str) -> Iterator[str]:
+    if not top.success:
+        yield f"the fit stopped after {top.steps} steps before it settled: delays are not final"
     if rival:
         yield rival
 
 
-def _refuse_undetermined(found: Judged, problem: Problem, scene: Scene) -> None:
-    free = found.free_tags
-    if not free or len(free) < len(problem.tags):
+def _refuse_undetermined(judgement: Judged, model: RangeModel, scene: Scene) -> None:
+    free = judgement.free_tags
+    if not free or len(free) < len([tag for tag in model.tags if tag in judgement.tags]):
         return
     raise UnanswerableError(
-        f"{scene.source}: {found.open_ends()[0]}; let positions be known for some seconds (`poses_until_s`), give the "
+        f"{scene.source}: {judgement.said}; let positions be known for some seconds (`poses_until_s`), give the "
         "places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits regardless, and says so)",
         undetermined=[free],
     )
 
 
-def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: Asked) -> dict[str, Any]:
-    scene, ranges, known = climbed.scene, problem.ranges, climbed.scene.places.time_s
+def _provenance(
+    found: KnownDistances, top: Found, judgement: Judged, asked: Asked, covariance: Floats
+) -> dict[str, Any]:
+    scene, ranges, known = top.scene, found.model.ranges, top.scene.places.time_s
     more: dict[str, Any] = {}
-    if found.free_tags:
-        more |= {"undetermined": [found.free_tags], "left_open": found.open_ends()[0]}
+    if judgement.free_tags:
+        more |= {"undetermined": [judgement.free_tags], "left_open": judgement.left_open(covariance)[0]}
     if asked.fixed:
         more["fixed_ns"] = {str(tag): delay for tag, delay in sorted(asked.fixed.items())}
+    pinned = set(found.model.tags) <= set(asked.fixed)
     return more | {
         "writer": f"uwbcal {uwblink.__version__}",
         "recordings": [scene.source],
@@ -263,7 +308,7 @@ def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: Asked)
         "excluded": ranges.excluded,
         "recipe": "trajectories",
         "truth": "ranges",
-        "fitted": problem.unknowns.told(len(problem.tags)),
+        "fitted": "delays only" if found.model.curve is None else "curve only" if pinned else "delays and curve",
         "rests_on": {
             "known_s": float(np.ptp(known)) if len(known) else 0.0,
             "moving": list(scene.moving),
@@ -274,13 +319,13 @@ def _provenance(climbed: Climbed, problem: Problem, found: Judged, asked: Asked)
             "distances": len(scene.tapes.told),
             "heights": sorted({scene.moving[body] for body in scene.heights.body.tolist()}),
         },
-        "distance_std_m": float(np.sqrt(np.mean(found.distance_std_m**2))),
-        "absorbed": found.absorbed,
-        "used": climbed.used,
-        "jerk_m_s3": climbed.jerk_m_s3,
-        "converged": climbed.settled,
+        "distance_std_m": judgement.distance_std_m,
+        "absorbed": judgement.absorbed,
+        "used": top.used,
+        "jerk_m_s3": top.jerk_m_s3,
+        "converged": top.success,
         "reference_power_dbm": asked.reference_dbm,
-        "standard_errors": f"sandwich over {found.solved.lasting.stretches:.0f} independent stretches of time",
+        "standard_errors": f"sandwich over {found.lasting.lasting[0].stretches:.0f} independent stretches of time",
         "gauge": f"the bias curve{' was taken, and' if asked.known else ''} is zero at {asked.reference_dbm:g} dBm; "
         "the delays carry the constant",
     }

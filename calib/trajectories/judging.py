@@ -1,265 +1,210 @@
-"""What the ranges say of delays and curve when trajectories are unknown too: intervals, and what stays open."""
+"""What ranges say of delays when trajectories are unknown too: which are determined, and what contradicts the rest."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from calib.calibration.model import Calibration
-from calib.estimation.gauge import stating
-from calib.estimation.intervals import intervals
-from calib.estimation.mixture_start import SPREADS
-from calib.estimation.problem import Problem
-from calib.estimation.scores import Scores, inverse_of
-from calib.estimation.smoothing import unsure
-from calib.estimation.solver import Solved
+from calib.calibration.power_curves import basis
+from calib.estimator.inverse import Matrix, inverse_of
+from calib.estimator.known_distances import KnownDistances
+from calib.estimator.rows import sum_rows
+from calib.estimator.unknowns import Layout
 from calib.information import Unknown, Verdict, judge
 from calib.spread import TWO_SIDED_95
-from calib.trajectories.arrow import Factored, normal_of
-from calib.trajectories.climbing import Climbed
-from calib.trajectories.coarseness import coarseness
-from calib.trajectories.contradictions import contradictions
-from calib.trajectories.doubts import Taken, doubted
-from calib.trajectories.scene import Scene
-from calib.trajectories.taken_curve import unsure_of_curve
-from uwblink.arrays import Floats
+from calib.trajectories.motion import TapeRows
+from calib.trajectories.search import MOTION, Found
+from uwblink.arrays import Floats, Ints
 
-PRIOR_NS: Final = 2.0
+PRIOR_NS = 2.0
 """Delays of boards of one kind differ by less: what a direction is known by where nothing else says anything."""
 
-GUESS_NS: Final = 0.2
-LOOSEST: Final = 0.5
+GUESS_NS, LOOSEST = 0.2, 0.5
 """A direction of delays counts as determined if it is known to half of so much (3 cm of range), by standard error.
 
-Calibrated by simulation (docs/theory.md): intervals beyond were seen not to hold.
+Calibrated by simulation (docs/fit-from-ranges.md): intervals beyond were seen not to hold.
 """
 
-GROWTH: Final = 3.0
+GROWTH = 3.0
 """Few ranges leave delays less known than that even where distances are given; then so many times as much will do."""
 
-ALONE: Final = 3.0
+ALONE = 3.0
 """By geometry alone a fit is linear no further: errors of up to 4.2 of its standard errors were seen, which are so many
-times as large there as linear propagation has them (docs/theory.md)."""
+times as large there as linear propagation has them (docs/fit-from-ranges.md)."""
 
-LOOKED_AT: Final = 400
+LOOKED_AT = 400
+"""Distances whose standard errors are averaged."""
+
+TAPE_ALONE, TAPE_SURELY, TAPE_MATTERS_M = 0.999, 4.0, 0.03
+"""A tape that is known by itself alone, to such a share, contradicts nothing; others do by so many standard errors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judged:
-    """A solution as a fit with known distances would have it, and the verdict on the delays of `problem.tags`.
+    """The verdict on the delays of `tags` that are not pinned, whose covariance (tags, tags) is `covariance_ns2`.
 
     `absorbed` says for the least known direction of delays how many times its variance grew because distances are not
-    known; `distance_std_m` (k,) are standard errors of some distances, `covariance_ns2` (tags, tags) is that of the
-    delays, with what does not fit, and `doubts` are sentences of that.
+    known; `distance_std_m` is the root mean square of standard errors of distances, `sentences` say what contradicts.
     """
 
-    solved: Solved
-    verdict: Verdict | None
-    absorbed: float
-    distance_std_m: Floats
+    tags: tuple[int, ...]
+    verdict: Verdict
     covariance_ns2: Floats
-    doubts: list[str]
+    absorbed: float
+    distance_std_m: float
+    by_geometry_alone: bool
+    sentences: tuple[str, ...]
 
     @property
     def free_tags(self) -> list[int]:
         """Return the tags whose delays are not determined."""
-        return [] if self.verdict is None else [int(tag) for tag in self.verdict.named("delay")]
+        return [int(tag) for tag in self.verdict.named("delay") if tag]
 
-    def open_ends(self) -> list[str]:
-        """Return as a sentence what is not determined; none where everything is."""
-        free, verdict = self.free_tags, self.verdict
-        if verdict is None or not free:
+    @property
+    def said(self) -> str:
+        """Return as a sentence what is not determined."""
+        return "".join(self.left_open(self.covariance_ns2))
+
+    def beyond_linear(self, covariance: Floats) -> Floats:
+        """Return a covariance of delays, wider where geometry alone tells them."""
+        return covariance * ALONE**2 if self.by_geometry_alone else covariance
+
+    def left_open(self, covariance_ns2: Floats) -> list[str]:
+        """Return as a sentence what is not determined; none where everything is. Delays have a covariance by tag."""
+        free = self.free_tags
+        if not free:
             return []
-        tags = [int(unknown.of) for unknown in verdict.unknowns]
-        if len(free) < len(tags):
-            return [f"the ranges do not determine the delays of tags {', '.join(map(str, free))}{self._known_to(free)}"]
-        count = len(tags)
-        common = np.full((1, count), 1 / count)
-        apart = np.eye(count)[1:] - np.eye(count)[0]
+        if len(free) < len(self.tags):
+            known = np.sqrt([covariance_ns2[k, k] for k, tag in enumerate(self.tags) if tag in free])
+            return [
+                f"the ranges do not determine the delays of tags {', '.join(map(str, free))}: known to ± "
+                f"{TWO_SIDED_95 * float(known.max()):.2f} ns (95 %) at worst"
+            ]
+        count = len(self.tags)
+        rows = np.full((1, count), 1 / count), np.eye(count)[1:] - np.eye(count)[0]
         spread, differences = (
-            TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(rows @ self.covariance_ns2 @ rows.T))))
-            for rows in (common, apart)
+            TWO_SIDED_95 * float(np.sqrt(np.max(np.diag(row @ covariance_ns2[:count, :count] @ row.T)))) for row in rows
         )
         return [
             f"the ranges determine no delay: what all have in common is known to ± {spread:.2f} ns (95 %), and "
             f"differences to ± {differences:.2f} ns"
         ]
 
-    def _known_to(self, free: list[int]) -> str:
-        verdict = self.verdict
-        tags = [] if verdict is None else [int(unknown.of) for unknown in verdict.unknowns]
-        std = [math.sqrt(self.covariance_ns2[tags.index(tag), tags.index(tag)]) for tag in free]
-        return f": known to ± {TWO_SIDED_95 * max(std):.2f} ns (95 %) at worst"
 
-
-def judged(climbed: Climbed, problem: Problem, reference: float | None, curve: Calibration | None = None) -> Judged:
-    """Return intervals and verdict of a solution whose delays are stated at the lifted power `reference`.
-
-    `problem` has the distances that were found; `curve` is the calibration whose curve was taken.
-    """
-    reduced = _reduced(climbed)
-    solved, precision = _solved(climbed, problem, reduced, reference)
-    spread = _spread(climbed, reduced.taken)
-    doubts = doubted(problem, solved, reduced.taken)
-    sentences = [*_of_motion(climbed, reduced), *doubts.sentences]
-    if not problem.rank:
-        return Judged(
-            solved=solved,
-            verdict=None,
-            absorbed=1.0,
-            distance_std_m=spread,
-            covariance_ns2=np.zeros((0, 0)),
-            doubts=sentences,
-        )
-    columns, delays, covariance = climbed.columns.design, solved.delays, doubts.covariance_ns2
-    if curve is not None:
-        covariance = covariance + unsure_of_curve(problem, curve, solved, climbed.informed)
-    covariance = beyond_linear(covariance, climbed.scene)
-    # What places add is no matter of what ranges determine: with motion capture it is as large.
-    of_ranges = covariance - beyond_linear(doubts.of_places_ns2, climbed.scene)
-    ridge = climbed.ridge[:columns, :columns]
-    with_truth = delays @ np.linalg.pinv(_information(climbed.rows.design, climbed.informed) + ridge) @ delays.T
-    plain = np.linalg.pinv(_information(reduced.design, climbed.informed) + precision[:columns, :columns])
+def judged(found: KnownDistances, top: Found) -> Judged:
+    """Return the verdict on a fit's delays, and what contradicts its trajectories."""
+    layout, optimum = top.optimum.layout, top.optimum
+    where = layout.where["delay"]
+    own = np.intersect1d(np.arange(where.start, where.stop), layout.free())
+    tags = tuple(int(layout.blocks[0].names[k - where.start]) for k in own)
+    some = np.ix_(own - where.start, own - where.start)
+    by_geometry_alone = top.scene.by_geometry_alone
+    covariance = found.covariances["delay"][some] * (ALONE**2 if by_geometry_alone else 1.0)
+    information = sum_rows([top.rows, *top.gauge], optimum.x).information + optimum.priors.precision()
+    with_truth = with_known_distances(information, layout, own)
     return Judged(
-        solved=solved,
-        verdict=verdict_on(of_ranges, with_truth, problem),
-        absorbed=_absorbed(delays @ plain @ delays.T, with_truth),
-        distance_std_m=spread,
+        tags=tags,
+        verdict=verdict_on(covariance, with_truth, tags),
         covariance_ns2=covariance,
-        doubts=sentences,
+        absorbed=_absorbed(optimum.covariance[:, own][own], with_truth),
+        distance_std_m=_distance_std(top),
+        by_geometry_alone=by_geometry_alone,
+        sentences=(*_of_motion(top), *_of_tapes(top)),
     )
 
 
-def _of_motion(climbed: Climbed, reduced: _Reduced) -> Iterator[str]:
-    """Yield what contradicts the trajectories."""
-    scene, columns, state = climbed.scene, climbed.columns, climbed.state
-    left = coarseness(scene, columns, climbed.rows, state, climbed.loss, climbed.informed)
-    yield from left.told(columns.places.step_s)
-    yield from contradictions(climbed.known, scene.tapes, state, reduced.taken.whole, reduced.schur)
+def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floats:
+    """Return the covariance of some unknowns (k, k) that a fit with known distances would leave.
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Reduced:
-    """What is left of derivatives by delays and curve when trajectories, standing bodies and biases took what they can.
-
-    `design` (n, m) are those of the ranges, `held` (k, m) those of what is known beside them, `schur` (b, b) what is
-    known of the border.
+    `information` (p, p) is what ranges and priors know; nothing of motion is unknown then.
     """
-
-    taken: Taken
-    schur: Floats
-    design: Floats
-    held: Floats
-
-
-def _reduced(climbed: Climbed) -> _Reduced:
-    _, local, border = climbed.rows.linear(climbed.state)
-    known = climbed.known.linear(climbed.state)
-    whole = Factored(normal_of(local, border, climbed.informed) + known.normal)
-    columns, size = climbed.columns.design, climbed.columns.border
-    schur = whole.schur + climbed.ridge
-    turn = np.zeros((size, columns))
-    turn[:columns] = np.eye(columns)
-    if size > columns:
-        turn[columns:] = -np.linalg.lstsq(schur[columns:, columns:], schur[columns:, :columns], rcond=1e-13)[0]
-    left, held = border - local @ whole.reach, known.border - known.local @ whole.reach
-    taken = Taken(
-        local=local,
-        whole=whole,
-        rest=left[:, columns:],
-        schur=schur[columns:, columns:],
-        held=known.local,
-        held_design=held @ turn,
-        informed=climbed.informed,
-    )
-    return _Reduced(taken=taken, schur=schur, design=left @ turn, held=held @ turn)
+    others = np.setdiff1d(layout.free(), layout.indices(MOTION))
+    some = information[others][:, others]
+    dense = some.toarray() if sparse.issparse(some) else some
+    place = np.searchsorted(others, own)
+    return np.asarray(inverse_of(dense, np.arange(len(others)))[:, place])[place]
 
 
-def _solved(climbed: Climbed, problem: Problem, reduced: _Reduced, reference: float | None) -> tuple[Solved, Floats]:
-    """Return the solution as a fit with known distances would have it, and the whole prior."""
-    columns = climbed.columns.design
-    ridge, found = climbed.ridge[:columns, :columns], climbed.state.border[:columns]
-    slope, _ = climbed.loss.slopes(climbed.rows.residuals(climbed.state))
-    prior = ridge + reduced.held.T @ reduced.held
-    scores, inverse, precision = _slopes(climbed, problem, reduced.design, -slope, prior)
-    stated = stating(problem, reference)
-    delays = problem.directions @ stated[: problem.rank]
-    of_blocks = intervals(scores, inverse, precision, delays, problem.rank, problem.blocks)
-    shares = [_of_curve(ridge, curve) for _, curve in problem.curves()]
-    # Residuals are smaller by what trajectories have taken of them (as HC3 has it; MacKinnon and White 1985).
-    covariance = of_blocks.covariance / (1 - climbed.used) ** 2 + unsure(inverse[:columns, :columns], found, shares)
-    solved = Solved(
-        parameters=stated @ found,
-        covariance=stated @ covariance @ stated.T,
-        residuals=climbed.rows.residuals(climbed.state) / np.sqrt(1 - climbed.used),
-        scale=float(np.sqrt(1 / np.median(climbed.informed))),
-        steps=climbed.steps,
-        success=climbed.settled,
-        scores=scores,
-        by_block=of_blocks.by_block,
-        inverse=inverse,
-        delays=delays,
-        lasting=of_blocks.lasting,
-        mixture=climbed.mixture,
-    )
-    return solved, precision
-
-
-def _slopes(
-    climbed: Climbed, problem: Problem, design: Floats, score: Floats, prior: Floats
-) -> tuple[Scores, Floats, Floats]:
-    """Return the slopes of all ranges, the inverse of what they and a prior (m, m) say, and the whole prior."""
-    if climbed.mixture is None:
-        kept = problem.design.kept
-        scores = Scores(design=problem.design.like(design), score=kept(score), curvature=kept(climbed.informed))
-        return scores, inverse_of(scores.information() + prior), prior
-    known = climbed.mixture.scores
-    scores = replace(known, design=known.design.like(design), score=known.design.kept(score))
-    precision = climbed.mixture.precision.copy()
-    precision[: len(prior), : len(prior)] = prior
-    return scores, inverse_of(scores.information() + precision, len(problem.pairs.ends), len(SPREADS)), precision
-
-
-def beyond_linear(covariance: Floats, scene: Scene) -> Floats:
-    """Return a covariance of delays (tags, tags), wider where geometry alone tells them."""
-    return covariance * ALONE**2 if scene.by_geometry_alone else covariance
-
-
-def verdict_on(covariance: Floats, with_truth: Floats, problem: Problem) -> Verdict:
+def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
     """Return what delays of a covariance (tags, tags) are determined, beside that of a fit with known distances."""
+    if not tags:
+        return judge(np.eye(1) * 1e6, [Unknown("delay", "")])
     guess = np.maximum(GUESS_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
-    information = (information + information.T) / 2
-    unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(problem.tags, guess.tolist(), strict=True)]
-    return judge(information, unknowns, loosest=LOOSEST)
-
-
-def _information(design: Floats, informed: Floats) -> Floats:
-    return np.asarray((design * informed[:, None]).T @ design)
+    unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
+    return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
 
 
 def _absorbed(covariance: Floats, with_truth: Floats) -> float:
     """Return the largest ratio of two covariances over all directions."""
+    if not len(with_truth):
+        return 1.0
     values, vectors = np.linalg.eigh(with_truth)
     kept = values > 1e-9 * values[-1]
     root = vectors[:, kept] / np.sqrt(values[kept])
     return float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1])
 
 
-def _spread(climbed: Climbed, taken: Taken) -> Floats:
-    """Return the standard errors of some distances, given delays and curve."""
-    rows, count = taken.local, taken.local.shape[0]
-    some = np.unique(np.linspace(0, count - 1, LOOKED_AT).astype(np.int64))
-    few = np.asarray(rows[some].todense())
-    variance = np.einsum("kl,lk->k", few, taken.whole.inverse_on(np.ascontiguousarray(few.T)))
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+def _distance_std(top: Found) -> float:
+    """Return the root mean square of the standard errors of some distances."""
+    some = np.unique(np.linspace(0, len(top.rows) - 1, LOOKED_AT).astype(np.int64))
+    moved, columns = top.geometry.distances(top.optimum.x, some)[1], top.geometry.columns[some]
+    rows = np.zeros((len(some), top.optimum.layout.size))
+    np.add.at(rows, (np.arange(len(some))[:, None], columns), moved)
+    return float(np.sqrt(np.mean(np.einsum("kp,pk->k", rows, top.optimum.covariance @ rows.T))))
 
 
-def _of_curve(prior: Floats, columns: slice) -> Floats:
-    found = np.zeros_like(prior)
-    found[columns, columns] = prior[columns, columns]
-    return found
+def _of_motion(top: Found) -> Iterator[str]:
+    if top.coarse.shows:
+        yield (
+            f"bodies move faster than control points every {top.motion.places.step_s:.1f} s follow: about "
+            f"{100 * top.coarse.motion_m:.0f} cm of their motion is not in the trajectories, and distances are off by "
+            "it; fly more calmly"
+        )
+
+
+def _of_tapes(top: Found) -> Iterator[str]:
+    """Yield in sentences which distances are not what the fit would say without them (deleted residuals; Cook 1982)."""
+    rows = top.known.get("tape")
+    if not isinstance(rows, TapeRows):
+        return
+    left, moved = rows.residuals(top.optimum.x), rows.geometry.distances(top.optimum.x)[1]
+    for number, one in enumerate(top.scene.tapes.told):
+        mine = np.flatnonzero(top.scene.tapes.number == number)
+        row = np.zeros(top.optimum.layout.size)
+        np.add.at(row, rows.geometry.columns[mine], moved[mine] / len(mine))
+        share = min(float(row @ (top.optimum.covariance @ row)) / one.sigma_m**2, 1.0)
+        off = -float(left[mine].mean())
+        if share > TAPE_ALONE or abs(off) < TAPE_SURELY * one.sigma_m * math.sqrt(1 - share):
+            continue
+        if abs(off) < TAPE_MATTERS_M * (1 - share):
+            continue
+        deviation, without = off / (one.sigma_m * math.sqrt(1 - share)), -off / (1 - share)
+        way = "more" if without > 0 else "less"
+        yield (
+            f"the distance of tags {one.first} and {one.second}, {one.distance_m:.3f} m, is {100 * abs(without):.0f} "
+            f"cm {way} than all else says ({abs(deviation):.0f} standard errors): measure it again"
+        )
+
+
+def curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
+    """Return what a taken curve's own covariance adds to that of the delays (tags, tags) in ns^2; 0 without one."""
+    optimum, rows, model = found.searches[0].optimum, found.searches[0].rows, found.model
+    size = len(found.delays)
+    if known.uncertainty is None or len(known.uncertainty.bias_m2) != len(known.bias_curve.coefficients):
+        return np.zeros((size, size))
+    low, high = known.bias_curve.range
+    splines = basis(np.clip(model.lifted, low, high), np.array(known.bias_curve.knots))[rows.order]
+    # By how much unknowns move with an error of each range: their covariance times what it tells of them.
+    linked, at = np.zeros((optimum.layout.size, splines.shape[1])), 0
+    for terms, score in rows.terms_and_scores(optimum.x):
+        here = slice(at, at + len(score))
+        linked += terms.as_matrix(terms.slopes, optimum.layout.size).T @ (score[:, None] * splines[here])
+        at = here.stop
+    reach = (optimum.covariance @ linked)[optimum.layout.where["delay"]]
+    return np.asarray(reach @ np.array(known.uncertainty.bias_m2) @ reach.T)

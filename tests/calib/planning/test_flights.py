@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 import calib
 from calib.cli.commands import app
-from calib.planning import flight_commands, foresight
-from calib.planning.foresight import Errors, Linearised, best_tape, flight_of, foresee
-from calib.planning.rehearsal import Flown, rehearse
-from calib.trajectories.given import Usable
+from calib.planning import flight_commands, flight_information
+from calib.planning.flight_information import Errors, Information, flight_of
+from calib.planning.reference_motion import FlightInputs, reference_motion
+from calib.trajectories.scene import Usable
 from tests import processes
 from tests.calib.trajectories.sines import flight
 
@@ -32,12 +32,12 @@ def mean(plan):
 def rehearsed(**other):
     given: Any = {"robots": ROBOTS, "anchors": ANCHORS, "inertial": False, "seconds": 10.0, "rate_hz": 50.0, "seed": 1}
     given |= {"still_s": 0.0, "apart_m": 0.5, "size_m": (6.0, 5.0, 2.5), "speed_m_s": 1.0}
-    return rehearse(Flown(**(given | other)))
+    return reference_motion(FlightInputs(**(given | other)))
 
 
 def covariance_ns2(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
     errors = Errors(noise_m=noise_m, reflected=reflected)
-    return foresee(flight_of(seen, Usable(**usable), errors, curve=curve, force_std_m_s2=force)).covariance_ns2
+    return flight_of(seen, Usable(**usable), errors, curve=curve, force_std_m_s2=force).predicted().covariance_ns2
 
 
 def foreseen_ns(seen, **given):
@@ -65,7 +65,7 @@ def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
     )
     exact = planned.scene.places
     object.__setattr__(exact, "std_m", np.full(len(exact.std_m), 1e-5))
-    found = foresee(planned)
+    found = planned.predicted()
     both = np.column_stack([planned.scene.ranges.initiator, planned.scene.ranges.target])
     rows = 0.5 * C_M_PER_NS * (both[:, :, None] == np.array(found.tags)).sum(axis=1)
     expected = np.linalg.inv(rows.T @ rows / 0.04**2)
@@ -150,7 +150,7 @@ def test_trajectories_are_held_as_jerky_as_they_are_planned():
         for k in (1, 2, 3)
     ]
     inside = (time[:-3] > 1.0) & (time[:-3] < 15.0)
-    planned = Linearised(flight_of(seen, Usable(poses_until_s=8.0), PLAIN, curve=True, force_std_m_s2=None))
+    planned = Information(flight_of(seen, Usable(poses_until_s=8.0), PLAIN, curve=True, force_std_m_s2=None))
     # A spline with points 0.4 s apart takes off some of the quickest part.
     assert planned.jerk_m_s3 == pytest.approx(math.sqrt(np.mean([j[inside] ** 2 for j in jerks])), rel=0.15)
 
@@ -159,7 +159,7 @@ def test_trajectories_of_few_ranges_that_nothing_holds_tell_less(monkeypatch):
     """A curve that so few ranges cannot tell is held with a weight of 1e15, beside which nothing may be lost."""
     seen = rehearsed(rate_hz=8.0, seconds=20.0)
     held = foreseen_ns(seen, poses_until_s=5.0)
-    monkeypatch.setattr(foresight, "_jerk", lambda *_: 50.0)
+    monkeypatch.setattr(flight_information, "_jerk", lambda *_: 50.0)
     assert 1.1 * held < foreseen_ns(seen, poses_until_s=5.0) < 2 * held
 
 
@@ -180,12 +180,13 @@ def test_the_best_tape_is_the_best_of_all():
         rehearsed(seconds=8.0), Usable(poses_until_s=4.0, anchors="sought"), PLAIN, curve=True, force_std_m_s2=None
     )
     spreads = {
-        pair: float(np.trace(foresee(seen.taped([pair], 0.0, 0.01)).covariance_ns2)) for pair in seen.pairs_to_tape(0.0)
+        pair: float(np.trace(seen.taped([pair], 0.0, 0.01).predicted().covariance_ns2))
+        for pair in seen.pairs_to_tape(0.0)
     }
     assert len(spreads) == 6
-    near, pair = Linearised(seen), (11, 12)
+    near, pair = Information(seen), (11, 12)
     assert near.mean_variance_with(near.tape(pair, 0.0), 0.01) == pytest.approx(spreads[pair] / 8, rel=1e-3)
-    assert best_tape(seen, 0.0, 0.01) == min(spreads, key=spreads.__getitem__)
+    assert seen.best_tape(0.0, 0.01) == min(spreads, key=spreads.__getitem__)
 
 
 def test_a_grade_is_noise_of_a_tenth_of_a_second_and_what_propellers_leave():

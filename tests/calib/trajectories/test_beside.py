@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.trajectories.given import Usable, scene_from
-from calib.trajectories.heights import heights_of
-from calib.trajectories.known_rows import known_rows
-from calib.trajectories.tapes import tapes_of
-from calib.trajectories.unknowns import State, columns_of
+from calib.trajectories.scene import heights_of, tapes_of
 from tests.calib.trajectories.sines import DELAYS_NS, flight
 from uwblink import Arrangement, KnownDistance
 
@@ -95,29 +91,6 @@ def test_a_distance_says_as_much_whether_it_holds_for_long_or_short():
     without = tapes_of(stated[2:], [], BODIES, {"c", "d"}, 0, 20.0)
     assert len(without) == 0
     assert "the distance of tags 2 and 3 is not used" in without.left_out[0]
-
-
-def test_rows_of_tapes_and_heights_have_the_derivatives_of_finite_differences():
-    flown = flight(seconds=3.0, anchors=CEILING, height_off_m=0.1)
-    tapes = (
-        KnownDistance(11, 12, 7.0, 0.01),
-        KnownDistance(1, 12, 3.0, 0.01, "0..1"),
-        KnownDistance(3, 6, 2.0, 0.01, "1..2"),
-    )
-    scene = scene_from(flown, Usable(poses_until_s=1.0, anchors="sought", distances=tapes))
-    columns = columns_of(scene, 2)
-    rng = np.random.default_rng(2)
-    state = State(rng.normal(size=columns.size), 3 * rng.normal(size=columns.border))
-    state.local[columns.turn[columns.turn >= 0]] *= 1e-4
-    known = known_rows(scene, columns, State(np.zeros(columns.size), np.zeros(columns.border)))
-    found = known.linear(state)
-    step = rng.normal(size=columns.size), rng.normal(size=columns.border)
-    ahead, behind = (state.moved(*(sign * 1e-6 * part for part in step)) for sign in (1, -1))
-    numeric = (known.residuals(ahead) - known.residuals(behind)) / 2e-6
-    # Turns are linear to first order only: at 1e-4 rad to a ten-thousandth of a lever arm, over a centimetre.
-    assert np.allclose(found.local @ step[0] + found.border @ step[1], numeric, rtol=1e-5, atol=0.03)
-    assert len(known.of("height", state)) == len(scene.heights.time_s)
-    assert np.count_nonzero(columns.level >= 0) == 3
 
 
 def test_a_reading_that_sees_a_table_counts_less():

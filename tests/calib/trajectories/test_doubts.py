@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import calib
-from calib.trajectories.coarseness import Coarseness
 from tests.calib.trajectories.sines import DELAYS_NS, flight
 from tests.calib.trajectories.test_beside import by_tape
 from uwblink import KnownDistance
@@ -63,9 +62,3 @@ def test_walls_between_bodies_are_named_and_in_the_intervals(between_m):
     assert np.abs(np.array(errors) / list(found.delays_std_ns.values())).max() < 2.5
     # Walls of 5 cm put delays off by some 100 ps; without them they are known to half of that.
     assert (np.max(np.abs(errors)) > 0.08) == (between_m > 0)
-
-
-def test_coarseness_matters_only_where_it_is_sure_and_large():
-    assert Coarseness(5.0, 0.02).told(0.4)
-    assert not Coarseness(5.0, 0.005).told(0.4)
-    assert not Coarseness(3.0, 0.02).told(0.4)

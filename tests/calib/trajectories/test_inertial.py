@@ -7,10 +7,8 @@ from scipy.spatial.transform import Rotation
 import calib
 import uwbsim
 from calib.trajectories.attitudes import Attitude
-from calib.trajectories.given import Usable, scene_from
-from calib.trajectories.headings import headed, turned_right
-from calib.trajectories.starting import Followed, through
-from calib.trajectories.unknowns import columns_of
+from calib.trajectories.scene import Usable, scene_from
+from calib.trajectories.start import Followed, turned_right
 
 BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
 IMU = {"grade": "consumer", "vibration_mps2": 1.0}
@@ -68,16 +66,15 @@ def test_headings_that_are_wrong_by_a_right_angle_are_found_over_the_flight(flow
         return np.array([[np.arctan2(*(a @ b.T)[[1, 0], 0]) for a, b in zip(*pair, strict=True)] for pair in pairs])
 
     # Integrated from an unknown heading; "b" is put a right angle off, where a first window may have left it.
-    scene = headed(scene, {body: -off(scene)[k, 0] for k, body in enumerate(BOXES)})
-    scene = headed(scene, {"b": np.pi / 2})
-    columns = columns_of(scene, 0)
+    scene = scene.headed({body: -off(scene)[k, 0] for k, body in enumerate(BOXES)})
+    scene = scene.headed({"b": np.pi / 2})
     began = flown.exchanges.time_ns[0]
     where = np.arange(0.0, 8.0, 0.1)
     places = [flown.poses[flown.poses.body == body] for body in BOXES]
     place = np.stack(
         [[np.interp(where, (p.time_ns - began) * 1e-9, axis) for axis in p.position_m.T] for p in places]
     ).transpose(2, 0, 1)
-    found, _, unsure = turned_right(scene, through(scene, columns, Followed(where, place), np.zeros((0, 3))))
+    found, _, unsure = turned_right(scene, Followed(where, place).state(scene, np.zeros((0, 3))))
     assert np.degrees(np.abs(off(scene))).max() > 80
     assert np.degrees(np.abs(off(found))).max() < 16
     assert unsure == ""

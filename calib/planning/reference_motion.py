@@ -2,38 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from calib.data.samples import stamped
+from calib.errors import BadInputError
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges
 
-POSES_HZ: Final = 20.0
-IMU_HZ: Final = 50.0
-MIDDLES: Final = 0.3
-REACH: Final = 0.12
+POSES_HZ = 20.0
+IMU_HZ = 50.0
+MIDDLES = 0.3
+REACH = 0.12
 """Shares of the room: how far from its middle bodies fly about, and the size of each of the two sines an axis."""
 
-PERIODS: Final = (0.65, 1.7)
-TURN_RAD: Final = 1.2
-TURNS_S: Final = (11.0, 19.0)
-HANGING_M: Final = 0.05
-POWER_AT_2_M_DBM: Final = -80.0
-FADING_DB: Final = 3.0
-GRAVITY_M_S2: Final = 9.81
-EDGE: Final = 0.05
-STARTING_S: Final = 3.0
+PERIODS = (0.65, 1.7)
+TURN_RAD = 1.2
+TURNS_S = (11.0, 19.0)
+HANGING_M = 0.05
+POWER_AT_2_M_DBM = -80.0
+FADING_DB = 3.0
+GRAVITY_M_S2 = 9.81
+EDGE = 0.05
+STARTING_S = 3.0
 """How long it takes from standing to flying."""
 
 
+MOST_TAGS = 60
+MOST_RANGES = 200_000
+BOUNDS = {
+    "seconds": (5.0, 3600.0),
+    "rate_hz": (0.5, 2000.0),
+    "speed_m_s": (0.05, 10.0),
+    "apart_m": (0.0, 3.0),
+}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Flown:
+class FlightInputs:
     """How bodies fly: tags by robot, how far apart those are, the room, speed, seconds before they start, anchors."""
 
     robots: tuple[tuple[int, ...], ...]
@@ -49,7 +61,7 @@ class Flown:
 
 
 @dataclass(frozen=True, slots=True)
-class Rehearsal:
+class ReferenceFlight:
     """What a recording of the flight would hold, without errors or delays."""
 
     exchanges: Exchanges
@@ -58,7 +70,7 @@ class Rehearsal:
     imu: Mapping[str, Any] = field(default_factory=dict)
 
 
-def rehearse(flown: Flown) -> Rehearsal:
+def reference_motion(flown: FlightInputs) -> ReferenceFlight:
     """Return a flight; the same for the same seed."""
     rng = np.random.default_rng(flown.seed)
     bodies = [_Body(flown, number, rng) for number in range(len(flown.robots))]
@@ -79,7 +91,7 @@ def rehearse(flown: Flown) -> Rehearsal:
     power = POWER_AT_2_M_DBM - 20 * np.log10(distance / 2) + rng.normal(0, FADING_DB, (2, len(time)))
     exchanges = stamped(np.rint(time * 1e9).astype(np.int64), pair, distance, power)
     imu = _readings(bodies, flown.seconds) if flown.inertial else {}
-    return Rehearsal(exchanges, _poses(bodies, stands, flown.seconds), tags, imu)
+    return ReferenceFlight(exchanges, _poses(bodies, stands, flown.seconds), tags, imu)
 
 
 class _Body:
@@ -88,7 +100,7 @@ class _Body:
     Until it starts it stands; then it is as fast as it will be within `STARTING_S`.
     """
 
-    def __init__(self, flown: Flown, number: int, rng: np.random.Generator) -> None:
+    def __init__(self, flown: FlightInputs, number: int, rng: np.random.Generator) -> None:
         size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
         self.name = f"robot{number + 1}"
         self.still_s = flown.still_s
@@ -136,7 +148,7 @@ def _arms(count: int, apart_m: float) -> Floats:
     return np.column_stack([apart_m / 2 * np.cos(angle), apart_m / 2 * np.sin(angle), np.full(count, -HANGING_M)])
 
 
-def _corners(flown: Flown) -> list[Floats]:
+def _corners(flown: FlightInputs) -> list[Floats]:
     """Return places of anchors around the room, high and low in turn."""
     x, y, z = flown.size_m
     count = len(flown.anchors)
@@ -146,7 +158,7 @@ def _corners(flown: Flown) -> list[Floats]:
     return list(np.column_stack([x * (0.5 + reach * np.cos(angle)), y * (0.5 + reach * np.sin(angle)), z * high]))
 
 
-def _in_turn(flown: Flown, count: int, rng: np.random.Generator) -> Ints:
+def _in_turn(flown: FlightInputs, count: int, rng: np.random.Generator) -> Ints:
     """Return who ranges with whom (n, 2): all pairs of bodies but two anchors, each round in another order."""
     body = {tag: k for k, robot in enumerate(flown.robots) for tag in robot}
     pairs = [(a, b) for a, b in combinations(body, 2) if body[a] != body[b]]
@@ -196,3 +208,63 @@ def _readings(bodies: list[_Body], seconds: float) -> dict[str, Any]:
         for name, column in zip(("wx", "wy", "wz", "ax", "ay", "az"), columns, strict=True):
             found[name].append(column)
     return {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def flight_inputs(  # noqa: PLR0913 - keyword-only, as `plan_flight` takes them
+    robots: int | Sequence[Sequence[int]],
+    anchors: Sequence[int],
+    *,
+    seconds: float,
+    rate_hz: float,
+    size_m: Sequence[float],
+    speed_m_s: float,
+    apart_m: float,
+    still_s: float,
+    inertial: bool,
+    seed: int,
+) -> FlightInputs:
+    """Return how robots will fly; raises `BadInputError` for what cannot be."""
+    given = {"seconds": seconds, "rate_hz": rate_hz, "speed_m_s": speed_m_s, "apart_m": apart_m}
+    for name, (least, most) in BOUNDS.items():
+        if not least <= given[name] <= most:
+            raise BadInputError(f"found {given[name]}, expected {least:g} to {most:g}", parameter=name)
+    if seconds * rate_hz > MOST_RANGES:
+        raise BadInputError(
+            f"{seconds * rate_hz:.0f} ranges are more than a plan takes, {MOST_RANGES}", parameter="seconds"
+        )
+    if still_s > seconds / 2:
+        raise BadInputError(f"found {still_s:g}, expected at most half of the {seconds:g} s", parameter="still_s")
+    if len(size_m) != 3 or not all(math.isfinite(v) and 0 < v <= 1000 for v in size_m):
+        raise BadInputError(f"found {list(size_m)}, expected three lengths of a room in metres", parameter="size_m")
+    x, y, z = map(float, size_m)
+    return FlightInputs(
+        robots=_robots(robots, anchors),
+        apart_m=apart_m,
+        size_m=(x, y, z),
+        speed_m_s=speed_m_s,
+        seconds=seconds,
+        still_s=still_s,
+        rate_hz=rate_hz,
+        anchors=tuple(map(int, anchors)),
+        inertial=inertial,
+        seed=seed,
+    )
+
+
+def _robots(robots: int | Sequence[Sequence[int]], anchors: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    found = (
+        tuple((2 * k + 1, 2 * k + 2) for k in range(robots))
+        if isinstance(robots, int)
+        else tuple(tuple(map(int, tags)) for tags in robots)
+    )
+    tags = [tag for robot in found for tag in robot]
+    if not found or not all(found) or len(set(tags)) < len(tags) or len(tags) + len(anchors) > MOST_TAGS:
+        text = f"found {robots!r:.60}, expected robots with a tag or more each, every tag once, at most {MOST_TAGS}"
+        raise BadInputError(text, parameter="robots")
+    if len(set(anchors)) < len(anchors) or set(anchors) & set(tags):
+        raise BadInputError(f"found {list(anchors)}, expected other tags than those of robots", parameter="anchors")
+    if len(found) == 1 and not anchors:
+        raise BadInputError("a single robot without anchors ranges with nobody", parameter="robots")
+    if any(not 0 < tag < 65536 for tag in (*tags, *anchors)):
+        raise BadInputError("found a tag that is none, expected ids of 1 or more", parameter="robots")
+    return found

@@ -1,0 +1,269 @@
+"""What the ranges of a planned flight would say of delays: Fisher's information, at trajectories that are planned.
+
+It is the information of `calib fit --truth ranges`: the same unknowns, the same rows of ranges and of what is known
+beside them, without data. Only what a fit learns of its errors is assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from calib.calibration.power_curves import ALPHA_DBM
+from calib.data.sources import Data
+from calib.errors import UnanswerableError
+from calib.estimator.inverse import Inverse, inverse_of
+from calib.estimator.range_model import RangeModel
+from calib.estimator.range_rows import RESIDUAL, RangeRows
+from calib.estimator.rows import sum_rows
+from calib.estimator.unknowns import Layout, Priors
+from calib.information import Verdict
+from calib.range_errors.density import error_slopes
+from calib.trajectories.fitting import Asked
+from calib.trajectories.judging import ALONE, verdict_on, with_known_distances
+from calib.trajectories.motion import Distances, Motion, known_rows
+from calib.trajectories.scene import Places, Scene, Usable, scene_from, tapes_of
+from calib.trajectories.start import SAMPLE_S, Followed, path_between
+from uwblink.arrays import Floats
+from uwblink.recording.schema import KnownDistance
+
+CURVE_M, CURVE_BENDS = 0.05, 3.0
+"""A curve over lifted power as boards have it, for how smooth a fit will find it: so many metres, so many radians."""
+
+EVIDENCE_STEPS = 12
+"""Steps in which the smoothness of curves is found, as in a fit."""
+
+ENDS = 4
+"""Control points at either end of a path that a plan's positions do not determine well."""
+
+STEADIEST_M_S3 = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Errors:
+    """What a range will be off by: noise, and a share of reflected ones that are longer by `detour_m` on average.
+
+    It is the error density of ranges (`calib.estimator.range_rows.Errors`) whose residuals are all zero, and each tell
+    what ranges tell on average.
+    """
+
+    noise_m: float
+    reflected: float
+    detour_m: float = 0.3
+    parameters: tuple[str, ...] = ()
+
+    def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats]:
+        """Return log densities and slopes that are zero, and what each residual tells (n,)."""
+        zero = np.zeros_like(values[RESIDUAL])
+        return zero, {RESIDUAL: zero}, zero + self.informed()
+
+    def informed(self) -> float:
+        """Return what a range says of its distance, 1/m^2: its mean squared slope of the log likelihood."""
+        longest = 12 * self.detour_m if self.reflected else 0.0
+        error = np.linspace(-8 * self.noise_m, 8 * self.noise_m + longest, 4001)
+        share = max(self.reflected, 1e-9)
+        logarithms = {
+            "noise": np.log(self.noise_m),
+            "odds": np.log(share / (1 - share)),
+            "detour": np.log(self.detour_m),
+            "least": np.log(1e-3),
+            "outliers": -30.0,
+            "long": -30.0,
+        }
+        parameters = {name: np.array([value]) for name, value in logarithms.items()}
+        found = error_slopes(error, parameters, span_m=1.0)
+        weight = np.exp(found.log_density)
+        return float(weight @ found.by[RESIDUAL] ** 2 / weight.sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Predicted:
+    """What a fit will say: the covariance (tags, tags) of the delays in ns^2, and the verdict on them."""
+
+    tags: tuple[int, ...]
+    covariance_ns2: Floats
+    verdict: Verdict
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flight:
+    """A planned flight: what a fit will be given (`scene`), where everything truly is, and what is looked for.
+
+    `path` is where the moving bodies are, `stands` are all that do not move; `known` are the places of moving bodies
+    all along, of which the scene has the first.
+    """
+
+    scene: Scene
+    model: RangeModel
+    errors: Errors
+    known: Places
+    path: Followed
+    stands: Mapping[str, Floats]
+
+    @property
+    def tapes(self) -> list[tuple[int, int]]:
+        """The pairs of tags whose distance is measured beside."""
+        return [(one.first, one.second) for one in self.scene.tapes.told]
+
+    def known_until(self, seconds: float) -> Flight:
+        """Return the flight with positions known so long."""
+        return replace(self, scene=replace(self.scene, places=self.known[self.known.time_s < seconds]))
+
+    def with_anchors_given(self) -> Flight:
+        """Return the flight with the places of all anchors known."""
+        return replace(self, scene=replace(self.scene, still=dict(self.stands)))
+
+    def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> Flight:
+        """Return the flight with distances of tags measured beside, while bodies stand at first or between anchors."""
+        when = f"0..{still_s:g}" if still_s else ""
+        stated = [KnownDistance(first, second, 1.0, sigma_m, when) for first, second in pairs]
+        bodies = {tag: body for tag, (body, _) in self.scene.arms.items()}
+        tapes = tapes_of(stated, (), bodies, self.scene.still, 0, float(self.scene.time_s[-1]))
+        return replace(self, scene=replace(self.scene, tapes=tapes))
+
+    def pairs_to_tape(self, still_s: float) -> list[tuple[int, int]]:
+        """Return the pairs of tags whose distance says something: of bodies that stand where nobody knows."""
+        stand = set(self.scene.sought) | (set(self.scene.moving) if still_s else set())
+        body = {tag: one for tag, (one, _) in self.scene.arms.items() if one in stand}
+        return [(a, b) for a, b in combinations(sorted(body), 2) if body[a] != body[b]]
+
+    def with_headings(self, std_rad: float) -> Flight:
+        """Return the flight with headings known so well."""
+        better = {
+            body: replace(known, std_rad=np.array([*known.std_rad[:2], std_rad]))
+            for body, known in self.scene.attitudes.items()
+        }
+        return replace(self, scene=replace(self.scene, attitudes=better))
+
+    def predicted(self) -> Predicted:
+        """Return what a fit of the flight will say of the delays."""
+        return Information(self).predicted()
+
+    def best_tape(self, still_s: float, sigma_m: float) -> tuple[int, int] | None:
+        """Return the pair of tags whose taped distance narrows the delays most; None where none would say anything."""
+        pairs = [pair for pair in self.pairs_to_tape(still_s) if pair not in self.tapes]
+        if not pairs:
+            return None
+        near = Information(self)
+        means = [near.mean_variance_with(near.tape(pair, still_s), sigma_m) for pair in pairs]
+        return pairs[int(np.argmin(np.round(means, 9)))]
+
+
+def flight_of(data: Data, usable: Usable, errors: Errors, *, curve: bool, force_std_m_s2: float | None) -> Flight:
+    """Return a planned flight from what a recording of it would hold, with poses all along.
+
+    `force_std_m_s2` is what an accelerometer's mean over a tenth of a second will be off by; None without one.
+    Raises what `scene_from` and `RangeModel.of` raise.
+    """
+    truth = scene_from(data, Usable(attitudes="poses", heading_std_deg=0.0), need_power=curve)
+    asked = Asked(
+        usable=usable,
+        lift="mean-of-lifted",
+        alpha_dbm=ALPHA_DBM,
+        fixed={},
+        groups={},
+        reference_dbm=ALPHA_DBM,
+        curve=curve,
+    )
+    model, scene = asked.model(scene_from(data, usable, need_power=curve), offsets=False)
+    for number, name in enumerate(truth.moving):
+        if np.count_nonzero(truth.places.body == number) < 2:
+            raise UnanswerableError(f"{truth.source}: no positions of body {name}; a plan takes its motion from them")
+    # Attitudes as they truly are, with what will be known of their errors.
+    attitudes = {
+        body: replace(known, time_s=truth.attitudes[body].time_s, quaternion=truth.attitudes[body].quaternion)
+        for body, known in scene.attitudes.items()
+        if body in truth.attitudes
+    }
+    sensed = {} if force_std_m_s2 is None else truth.inertial
+    inertial = {body: replace(some, std_m_s2=float(force_std_m_s2 or 0.0)) for body, some in sensed.items()}
+    times = truth.places.time_s
+    return Flight(
+        scene=replace(scene, attitudes=attitudes, inertial=inertial),
+        model=model,
+        errors=errors,
+        known=truth.places,
+        path=path_between(
+            truth.places, np.arange(times.min(), times.max() + SAMPLE_S / 2, SAMPLE_S), len(truth.moving)
+        ),
+        stands={body: place for body, place in truth.still.items() if place is not None},
+    )
+
+
+class Information:
+    """What is known of a flight's unknowns near its planned trajectories."""
+
+    def __init__(self, flight: Flight) -> None:
+        """Sum the information of all rows at the planned trajectories."""
+        scene, model = flight.scene, flight.model
+        self.flight, self.motion = flight, Motion.of(scene)
+        stand = np.array([flight.stands[body] for body in scene.sought]).reshape(-1, 3)
+        start = flight.path.state(scene, stand)
+        self.jerk_m_s3 = _jerk(start["path"], self.motion.places.step_s)
+        motion = self.motion.unknowns(start, self.jerk_m_s3)
+        fixed = [replace(one, priors=tuple(replace(prior, bounds=None) for prior in one.priors)) for one in motion]
+        self.layout = Layout((*model.unknowns, *fixed))
+        self.x = self.layout.start()
+        knots = np.zeros(0) if model.curve is None else model.curve.knots
+        for kind in model.curve_kinds():
+            centres = np.convolve(knots[1:-1], np.full(3, 1 / 3), mode="valid")
+            self.x[self.layout.where[kind]] = CURVE_M * np.sin(CURVE_BENDS * centres)
+        geometry = Distances.of(self.motion, self.layout, (model.ranges.initiator, model.ranges.target), scene.time_s)
+        raw = np.zeros(len(scene.time_s))
+        ranges = RangeRows.of(raw, model.key(), model.parts, flight.errors, self.layout, geometry)
+        self.of_ranges = sum_rows([ranges, *model.gauge_rows(self.layout)], self.x).information
+        self.whole = self.of_ranges + sum_rows(list(known_rows(self.motion, self.layout).values()), self.x).information
+        self.priors = Priors(self.layout)
+        for _ in range(EVIDENCE_STEPS):
+            self.priors.update(self.x, self._inverse())
+
+    def _inverse(self) -> Inverse:
+        return inverse_of(self.whole + self.priors.precision(), self.layout.free())
+
+    @cached_property
+    def delays(self) -> tuple[Floats, Floats]:
+        """Return columns (p, tags) of the covariance of all unknowns that are delays, and their own (tags, tags)."""
+        own = self.layout.indices(["delay"])
+        columns = self.inverse[:, own]
+        return columns, columns[own]
+
+    @cached_property
+    def inverse(self) -> Inverse:
+        """Return the covariance of all unknowns."""
+        return self._inverse()
+
+    def predicted(self) -> Predicted:
+        """Return what a fit will say."""
+        tags = tuple(self.flight.model.tags)
+        known = self.of_ranges + self.priors.precision()
+        with_truth = with_known_distances(known, self.layout, self.layout.indices(["delay"]))
+        covariance = self.delays[1] * (ALONE**2 if self.flight.scene.by_geometry_alone else 1.0)
+        return Predicted(tags=tags, covariance_ns2=covariance, verdict=verdict_on(covariance, with_truth, tags))
+
+    def tape(self, pair: tuple[int, int], still_s: float) -> Floats:
+        """Return the derivatives (p,) of the distance of two tags, halfway through their standing."""
+        tapes = self.flight.taped([pair], still_s, 1.0).scene.tapes
+        time = np.where(np.isnan(tapes.time_s), self.flight.scene.time_s[0], tapes.time_s)
+        middle = [len(time) // 2]
+        ends = tapes.first[middle], tapes.second[middle]
+        geometry = Distances.of(self.motion, self.layout, ends, time[middle])
+        found = np.zeros(self.layout.size)
+        np.add.at(found, geometry.columns[0], geometry.distances(self.x)[1][0])
+        return found
+
+    def mean_variance_with(self, row: Floats, sigma_m: float) -> float:
+        """Return the mean variance of the delays, ns^2, when what a row (p,) stands for is known to so much."""
+        columns, covariance = self.delays
+        own = float(row @ (self.inverse @ row))
+        return float(np.mean(np.diag(covariance) - (row @ columns) ** 2 / (own + sigma_m**2)))
+
+
+def _jerk(points: Floats, step_s: float) -> float:
+    """Return the jerk that paths by control points (k, bodies, 3) have, root mean square, away from their ends."""
+    inner = points[ENDS:-ENDS] if len(points) > 3 * ENDS else points
+    jerk = np.diff(inner, n=3, axis=0) / step_s**3
+    return max(float(np.sqrt(np.mean(jerk**2))), STEADIEST_M_S3)
