@@ -41,8 +41,10 @@ class Part:
 class Geometry(Protocol):
     """Distances that are unknown: of places that are searched for, of bodies that move."""
 
-    columns: Ints
-    """Indices (n, k) into all unknowns that each distance depends on."""
+    @property
+    def columns(self) -> Ints:
+        """Return the indices (n, k) into all unknowns that each distance depends on."""
+        ...
 
     def distances(self, x: Floats, rows: Ints) -> tuple[Floats, Floats]:
         """Return the distances (m,) of some ranges at unknowns (p,), metres, and their derivatives (m, k)."""

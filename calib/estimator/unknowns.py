@@ -137,8 +137,8 @@ class Priors:
             return sparse.csc_matrix((value, (row.astype(np.int64), column.astype(np.int64))), shape=(size, size))
         found = np.zeros((size, size))
         for weight, (where, prior) in zip(self.weights, self.all, strict=True):
-            own = _structure(prior, where)
-            found[where, where] += weight * (own if isinstance(own, np.ndarray) else own.toarray())
+            dense = _structure(prior, where)
+            found[where, where] += weight * (dense if isinstance(dense, np.ndarray) else dense.toarray())
         return found
 
     def value(self, x: Floats) -> float:

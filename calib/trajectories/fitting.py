@@ -18,18 +18,18 @@ from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
 from calib.checks.limits import limits
-from calib.data.sources import Data
-from calib.errors import BadInputError, UnanswerableError
-from calib.fitting.known_delays import imported
-from calib.estimator.losses import MIXTURE
 from calib.checks.plausibility import implausible, one_way, refuse_refuted
 from calib.checks.power_levels import unlike_powers
-from calib.fitting.result import FitResult
 from calib.checks.warnings import warnings_of
+from calib.data.sources import Data
+from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
+from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import RangeModel
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
+from calib.fitting.known_delays import imported
+from calib.fitting.result import FitResult
 from calib.information import Unknown, judge
 from calib.settings import FitSettings, check_choice
 from calib.trajectories.judging import Judged, curve_uncertainty, judged

@@ -6,7 +6,7 @@ points a second apart. `Distances` makes distances between antennas of them, `kn
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,7 +92,7 @@ class Motion:
             levelled=tuple(k for k, _ in names if k in scene.heights.body),
         )
 
-    def unknowns(self, start: dict[str, Floats], jerk_m_s3: float) -> tuple[Unknown, ...]:
+    def unknowns(self, start: Mapping[str, Floats], jerk_m_s3: float) -> tuple[Unknown, ...]:
         """Return the blocks of unknowns, at `start` or zero; the jerk of paths is estimated, begun at `jerk_m_s3`."""
         scene, count, moving = self.scene, self.places.count, len(self.scene.moving)
         third = sparse.diags([-1.0, 3.0, -3.0, 1.0], [0, 1, 2, 3], shape=(count - 3, count)) / self.places.step_s**3
@@ -108,10 +108,10 @@ class Motion:
         calm[list(self.sensed)] = CALM_SENSED_M_S2
         held = [(2, calm * self.places.step_s**2), (1, np.full(moving, SLOW_M_S * self.places.step_s))]
         path = tuple(_differences(count, order, np.repeat(std, 3)) for order, std in held)
-        several = [scene.attitudes[scene.moving[k]] for k in self.turning]
+        attitudes = [scene.attitudes[scene.moving[k]] for k in self.turning]
         # What is not known at all is infinitely unsure, and says nothing.
-        wander = np.ravel([attitude.wander_rad * np.sqrt(self.turns.step_s) for attitude in several])
-        turn = [(0, np.ravel([attitude.std_rad for attitude in several])), (1, wander)]
+        wander = np.ravel([attitude.wander_rad * np.sqrt(self.turns.step_s) for attitude in attitudes])
+        turn = [(0, np.ravel([attitude.std_rad for attitude in attitudes])), (1, wander)]
         turns = tuple(_differences(self.turns.count, order, std) for order, std in turn)
         blocks = [
             ("path", (count, scene.moving, 3), (smooth, Prior.of_deviation(FAR_M, here), *path), FAR_M),
@@ -145,7 +145,7 @@ class Motion:
         point, share = self.places.cubic(time_s)
         return np.asarray(np.einsum("kp,kpba->kba", share, path.reshape(self.places.count, -1, 3)[point]))
 
-    def refined(self, start: dict[str, Floats]) -> tuple[Motion, dict[str, Floats]]:
+    def refined(self, start: Mapping[str, Floats]) -> tuple[Motion, dict[str, Floats]]:
         """Return twice as many control points that make the same paths (Lane and Riesenfeld 1980).
 
         A new point is the mean of two, or one with an eighth of either side.
@@ -157,7 +157,7 @@ class Motion:
         near = np.clip(place // 2 + 1, 1, len(whole) - 2)
         onto = (whole[near - 1] + 6 * whole[near] + whole[near + 1]) / 8
         between = (whole[near] + whole[near + 1]) / 2
-        return finer, start | {"path": np.where((place % 2 == 1)[:, None, None], between, onto)}
+        return finer, dict(start) | {"path": np.where((place % 2 == 1)[:, None, None], between, onto)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +223,7 @@ class Distances:
                 arm = Rotation.from_rotvec(np.einsum("nk,nka->na", side.turn_share[rows], x[side.turn[rows]])).apply(
                     arm
                 )
-            stand = 0.0
+            stand = np.zeros_like(place)
             if side.stand.shape[1]:
                 stand = np.where(side.ends.stander[rows, None] >= 0, x[side.stand[rows]], 0.0)
             found += [side.ends.base_m[rows] + stand + place + arm, arm]
@@ -361,5 +361,5 @@ def _forces(motion: Motion, layout: Layout) -> NormalRows:
             aim = sensed.force_m_s2[:, axis] - GRAVITY_M_S2 * (axis == 2)
             std = np.full(len(aim), sensed.std_m_s2)
             parts.append((aim, std, np.concatenate(entries, axis=1), np.concatenate(columns, axis=1)))
-    value, std, entries, columns = (np.concatenate([part[k] for part in parts]) for k in range(4))
-    return NormalRows(value=value, std=std, entries=entries, columns=columns)
+    whole = [np.concatenate([part[k] for part in parts]) for k in range(4)]
+    return NormalRows(value=whole[0], std=whole[1], entries=whole[2], columns=whole[3])

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib.estimator.inverse import SparseInverse
+from calib.estimator.inverse import Matrix, SparseInverse
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import RESIDUAL, Errors, Part, RangeRows
@@ -21,7 +21,7 @@ from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.spread import robust_spread
 from calib.trajectories.motion import Distances, Motion, TapeRows, known_rows
 from calib.trajectories.scene import Scene
-from uwblink.arrays import Floats
+from uwblink.arrays import Floats, Ints
 
 State = Mapping[str, Floats]
 """Unknowns of motion by their kind."""
@@ -236,14 +236,14 @@ class _Search:
     def likeliest(self) -> Found:
         """Go to the top of the likelihood of ranges that are direct, reflected or outliers."""
         errors, unknowns, parts = self.model.error_model(self.residuals())
-        self.used, found = 0.0, None
+        self.used = 0.0
         self.build(errors, (unknowns, parts))
-        for turn in range(ROUNDS):
-            last = turn == ROUNDS - 1
+        for _ in range(ROUNDS - 1):
             self.errors = replace(errors, expected=True, used=self.used)
-            found = self.climb(evidence_steps=0 if last else 12, tolerance=0.01 if last else 0.1)
-            if not last:
-                self.trust()
+            self.climb()
+            self.trust()
+        self.errors = replace(errors, expected=True, used=self.used)
+        found = self.climb(evidence_steps=0, tolerance=0.01)
         path = next(k for k, key in enumerate(self._keys()) if key == ("path", 0))
         return Found(
             scene=self.motion.scene,
@@ -261,7 +261,7 @@ class _Search:
         )
 
 
-def _trace(found: Optimum, information: object, own: Floats) -> float:
+def _trace(found: Optimum, information: Matrix, own: Ints) -> float:
     """Return how many of some unknowns (k,) the information of rows determines."""
     inverse = found.covariance
     if not isinstance(inverse, SparseInverse):

@@ -156,7 +156,7 @@ def _follow(scene: Scene, seed: Followed, stand: Floats, done: Callable[[float],
                 break
             low, high = sorted((edge - sign * step, edge + sign * step))
             near = found.among(low, high)
-            fresh = np.arange(1, round(step / SAMPLE_S) + 1) * SAMPLE_S * sign + edge
+            fresh = np.asarray(np.arange(1, round(step / SAMPLE_S) + 1) * SAMPLE_S * sign + edge, dtype=np.float64)
             fresh = fresh[(fresh >= begin_s - SAMPLE_S) & (fresh <= end_s + SAMPLE_S)]
             placed, window = _carried_on(near, fresh, sign), scene.between(low, high)
             if len(window.time_s) >= 2:
