@@ -72,7 +72,7 @@ def test_commands_go_through_doors(package):
         ("calib", "def f():\n    from calib.fitting.fitting import fit", ["calib.fitting.fitting.fit"]),
         ("calib", "from calib.report import layout", ["calib.report.layout"]),
         ("calib", "import calib.fitting.fitting", ["calib.fitting.fitting"]),
-        ("calib", "import calib\ncalib.estimation.x", ["calib.estimation"]),
+        ("calib", "import calib\ncalib.estimator.x", ["calib.estimator"]),
         ("uwbsim", "from uwblink.errors import UwblinkError", ["uwblink.errors.UwblinkError"]),
         ("calib", "import calib\nfrom uwblink.cli import shared\nfrom calib.errors import CalibError\ncalib.fit", []),
     ],

@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.data.ranges import STATIC, Ranges
 from calib.errors import UnanswerableError
-from calib.estimation.row_order import stable_order
 from calib.estimator.pairs import pairs_of
 from calib.long_columns import computed, let_go, picked
 from calib.spread import robust_spread
@@ -154,7 +153,7 @@ def _parts(error: Floats, key: Ints) -> dict[int, Floats]:
     """Return errors (n,) apart by their keys (n,)."""
     sizes = np.bincount(key)
     let_go(error)
-    order = stable_order(key)
+    order = np.argsort(key, kind="stable")
     let_go(key)
     several = picked(error, order)
     return dict(enumerate(np.split(several, np.cumsum(sizes)[:-1])))

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.doctor.base import RecordingView, pair_ids
 from calib.doctor.checks import Seen, more_often
-from calib.estimation.identifiability import identifiable_directions, square_of
+from calib.estimator.identifiability import identifiable_directions, square_of
 from uwblink.recording.summary import failures_by_pair
 from uwblink.twr import delay_weights
 

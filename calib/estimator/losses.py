@@ -50,7 +50,7 @@ def _l2(u: Floats) -> tuple[Floats, Floats]:
 
 
 MIXTURE: Final = "mixture"
-"""The loss that is no loss of residuals: the likelihood of `calib.estimation.mixture_fit`, begun from a Cauchy fit."""
+"""The loss that is no loss of residuals: the likelihood of `calib.range_errors`, begun from a Cauchy fit."""
 
 TRIED_AT: Final = np.array([-7.3, -2.1, -0.83, -0.37, 0.37, 0.83, 2.1, 7.3])
 """Residuals over scale at which a new loss must agree with its own slope; no common loss has a kink at one."""

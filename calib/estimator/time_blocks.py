@@ -153,7 +153,7 @@ def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int 
     """Return what persistence does to sums of slopes (blocks, k), of whose columns so many are independent.
 
     How long errors last is looked at within sessions, and `within` so many spans of time: what differs between them is
-    a matter of its own (`calib.estimation.alternatives`).
+    a matter of its own (`calib.checks.fitted`).
     """
     slopes, columns = time.pieces(slopes, within), slopes.shape[1]
     independent *= max(slopes.shape[1] // max(columns, 1) // within, 1)

@@ -12,9 +12,14 @@ from calib.calibration.power_curves import equal_bins
 from calib.data.sources import Data, load_ranges
 from calib.error_mixture import fit_error_mixture
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.robust import robust_fit, sandwich
+from calib.estimator.known_distances import LEAST_SCALE_M, SCALE_OF_SPREAD
 from calib.estimator.losses import LOSSES
+from calib.estimator.optimize import Optimum, maximize
+from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
+from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.settings import check_choice, check_tag
+from calib.spread import robust_spread
+from uwblink.arrays import Floats
 from uwblink.recording.antenna_delays import delays_differ, known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -63,19 +68,32 @@ def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, los
     trial = replace(calibration, delays_ns=calibration.delays_ns | {tag: 0.0})
     applied = trial.apply(some)
     error = applied.corrected_m - some.truth_m
-    start = np.array([float(np.median(-error / mine))])
-    found = robust_fit(mine[:, None], error, loss, start=start)
-    core = error + mine * found.parameters[0]
+    found = _robust(mine, error, loss)
     bins = equal_bins(applied.lifted)
-    delay = float(
-        found.parameters[0] - fit_error_mixture(core, bins.number, len(bins.count)).location_m / np.mean(mine)
-    )
-    covariance = sandwich(mine[:, None], found.residuals, LOSSES[loss], found.scale)
+    centre = fit_error_mixture(error + mine * found.of("delay")[0], bins.number, len(bins.count)).location_m
+    delay = float(found.of("delay")[0] - centre / np.mean(mine))
     added = {"tag": tag, "recording": ranges.source, "exchanges": int(np.count_nonzero(useful))}
     return replace(
         calibration,
         delays_ns=calibration.delays_ns | {tag: delay},
-        delays_std_ns=calibration.delays_std_ns | {tag: float(np.sqrt(covariance[0, 0]))},
+        delays_std_ns=calibration.delays_std_ns | {tag: float(np.sqrt(found.covariance[0, 0]))},
         antenna_delays={**calibration.antenna_delays, **known_delays(ranges.antenna_delays, [tag])},
         provenance=calibration.provenance | {"added": [*calibration.provenance.get("added", []), added]},
     )
+
+
+def _robust(mine: Floats, error: Floats, loss: str) -> Optimum:
+    """Return the delay that explains errors (n,) best, whose derivatives (n,) are `mine`, by a robust loss."""
+    layout = Layout((Unknown(kind="delay", names=("",), start=np.array([float(np.median(-error / mine))])),))
+    part = Part(parameter=RESIDUAL, kind="delay", columns=np.zeros((len(error), 1), np.int64), values=mine[:, None])
+    rows = RangeRows.of(
+        error, np.zeros(len(error), np.int64), [part], Robust(weights=LOSSES[loss].weights, scale_m=1.0), layout
+    )
+    x, scale = layout.start(), 1.0
+    for _ in range(5):
+        residual = rows.residuals(x)
+        scale = max(SCALE_OF_SPREAD * robust_spread(residual), LEAST_SCALE_M)
+        errors = Robust(weights=LOSSES[loss].weights, scale_m=scale).tempered(residual)
+        found = maximize([replace(rows, errors=errors)], Priors(layout), x, evidence_steps=0, tolerance=1e-6)
+        x = found.x
+    return found

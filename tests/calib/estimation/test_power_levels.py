@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import calib
+from calib.checks import power_levels
 from calib.checks.power_levels import power_levels_db, unlike_powers
-from calib.estimation import power_levels
 from tests.calib.synthetic import DELAYS_NS, ranges
 
 SENT_DB, READ_DB = {2: -3.0}, {3: 2.0}

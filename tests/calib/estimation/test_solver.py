@@ -5,63 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from calib.calibration.comparison import compare
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import basis, curvature, lifted_power
 from calib.data.ranges import without_static
 from calib.errors import BadInputError, UnanswerableError
-from calib.estimation.building import build_problem
-from calib.estimation.robust import quadratic_model, robust_fit
-from calib.estimation.smoothing import reml_penalty
-from calib.estimation.solver import solve
 from calib.estimator import known_distances
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, design, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
 
 METRES_A_NS = SPEED_OF_LIGHT * 1e-9
-
-
-def problem_of(r, groups=None, minimum_norm=False):
-    return build_problem(
-        r, lift="mean-of-lifted", alpha_dbm=-82.0, fixed={}, groups=groups or {}, minimum_norm=minimum_norm
-    )  # fmt: skip
-
-
-def test_the_joint_optimum_is_scipys():
-    problem = problem_of(ranges(9000))
-    found = solve(problem, "cauchy", 0.1 * METRES_A_NS, sequential=False)
-    width, written = 0.1 * METRES_A_NS, problem.design.written_out()
-    residual = problem.error + problem.design @ found.parameters
-    # The penalty that the fit chose is recovered from its own optimum: the gradient of the loss is balanced by it.
-    near = quadratic_model(problem.design, residual, "cauchy", width)
-    ridge, _ = reml_penalty(near, found.parameters, problem.penalties())
-    root = np.linalg.cholesky(ridge[problem.rank :, problem.rank :]).T
-    root = np.hstack([np.zeros((len(root), problem.rank)), root])
-
-    def cost(x):
-        u = (problem.error + written @ x) / width
-        # Half of scipy's sum of squares is the loss: sign(u) sqrt(log(1 + u^2)) squared is Cauchy's.
-        return np.concatenate([np.sign(u) * np.sqrt(np.log1p(u**2)) * width, root @ x])
-
-    def slope(x):
-        u = (problem.error + written @ x) / width
-        size = np.sqrt(np.log1p(u**2))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            factor = np.where(np.abs(u) < 1e-6, 1.0, np.abs(u) / ((1 + u**2) * size))
-        return np.vstack([factor[:, None] * written, root])
-
-    joint = robust_fit(problem.design, problem.error, "cauchy", width, ridge, found.parameters, near=True)
-    x = joint.parameters + 0.003
-    for _ in range(3):
-        x = least_squares(cost, x, jac=slope, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    np.testing.assert_allclose(joint.parameters[: problem.rank], x[: problem.rank], atol=1e-6)
-    # A constant of the curve is stated apart, so the coefficients are compared less their average over the range.
-    stated = joint.parameters.copy()
-    stated[problem.rank :] -= problem.centres[0] @ stated[problem.rank :]
-    np.testing.assert_allclose(stated, found.parameters, atol=2e-4)
 
 
 def test_least_squares_is_least_squares():

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 
-from calib.errors import UnanswerableError
 from uwblink.arrays import Floats, Ints
 
 UNDETERMINED: Final = 1e-8
@@ -45,19 +44,6 @@ def identifiable_directions(square: Floats, tags: list[int], pairs: Ints) -> tup
         return np.eye(len(tags)), []
     free = {tag for tag, row in zip(tags, vectors[:, loose], strict=True) if np.abs(row).max() > 1e-3}
     return np.asarray(vectors[:, ~loose]), _connected(free, {(low, high) for low, high in pairs.tolist()})
-
-
-def require_determined(groups: list[list[int]]) -> None:
-    """Raise `UnanswerableError` that names groups of tags whose delays are free, and what would settle them."""
-    if not groups:
-        return
-    named = "; ".join(", ".join(map(str, group)) for group in groups)
-    raise UnanswerableError(
-        f"the pairs do not determine the antenna delays of tags {named}: some can grow as "
-        "others shrink without changing any range; record three tags that all range with each other, or pin a known "
-        "delay with `fixed_ns` (`minimum_norm` fits regardless, and says so; `constants` pair gives each pair its own)",
-        undetermined=groups,
-    )
 
 
 def _connected(tags: set[int], pairs: set[tuple[int, int]]) -> list[list[int]]:

@@ -1,1 +1,0 @@
-"""Parts of the former fit that fits without known distances still use."""
