@@ -19,8 +19,8 @@ from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
-from calib.error_mixture import fit_error_mixtures
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
+from calib.range_errors.error_mixture import fit_error_mixtures
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE, look

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from calib.calibration.power_curves import Curve
-from calib.densities import ROOT_2PI, LongDetours, densities
 from calib.errors import BadInputError
+from calib.range_errors.densities import ROOT_2PI, LongDetours, densities
 from uwblink.arrays import Floats, Ints
 
 

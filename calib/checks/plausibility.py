@@ -12,7 +12,6 @@ import numpy as np
 from calib.data.ranges import STATIC, Ranges
 from calib.errors import UnanswerableError
 from calib.estimator.pairs import pairs_of
-from calib.long_columns import computed, let_go, picked
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import TICK_S
@@ -127,9 +126,7 @@ def one_way(ranges: Ranges) -> Iterator[str]:
     first, second, raw, truth = ranges.initiator, ranges.target, ranges.raw_m, ranges.truth_m
     tags = ranges.tags()
     pairs = pairs_of(first, second, tags)
-    key = computed(len(ranges), lambda rows: pairs.number[rows] * 2 + (first[rows] < second[rows]), np.int64)
-    parts = _parts(computed(len(ranges), lambda rows: raw[rows] - truth[rows]), key)
-    let_go(first, second, raw, truth)
+    parts = _parts(raw - truth, pairs.number * 2 + (first < second))
     worst, said = 0.0, ""
     for number, part in parts.items():
         back = parts.get(number - 1, part[:0])
@@ -152,10 +149,7 @@ def one_way(ranges: Ranges) -> Iterator[str]:
 def _parts(error: Floats, key: Ints) -> dict[int, Floats]:
     """Return errors (n,) apart by their keys (n,)."""
     sizes = np.bincount(key)
-    let_go(error)
-    order = np.argsort(key, kind="stable")
-    let_go(key)
-    several = picked(error, order)
+    several = error[np.argsort(key, kind="stable")]
     return dict(enumerate(np.split(several, np.cumsum(sizes)[:-1])))
 
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib.calibration.error_model import ErrorModel, PairErrors
-from calib.densities import LONG_FACTOR, LongDetours
 from calib.estimator.range_model import RangeModel, Spline
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
+from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.range_errors.density import error_slopes
 from uwblink.arrays import Floats
 

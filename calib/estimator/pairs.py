@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.long_columns import computed, let_go
 from uwblink.arrays import Ints
 
 
@@ -22,16 +21,12 @@ def pairs_of(initiator: Ints, target: Ints, tags: list[int]) -> Pairs:
     """Number the pairs of ranges (n,) between `tags`, in order of their lower tags, then of their higher ones."""
     known = np.array(tags)
 
-    def keys(rows: slice) -> Ints:
-        first, second = places_of(tags, initiator[rows], target[rows])
-        return np.asarray(np.minimum(first, second) * len(tags) + np.maximum(first, second))
-
-    key = computed(len(initiator), keys, np.int64)
-    let_go(initiator, target)
+    first, second = places_of(tags, initiator, target)
+    key = np.minimum(first, second) * len(tags) + np.maximum(first, second)
     there = np.bincount(key) > 0
     low, high = np.divmod(np.flatnonzero(there), len(tags))
     place = np.cumsum(there) - 1
-    number = computed(len(key), lambda rows: place[key[rows]], np.int32)
+    number = place[key].astype(np.int32)
     return Pairs(number, np.column_stack([known[low], known[high]]))
 
 

@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 
 from calib.calibration.model import Calibration
 from calib.data.ranges import Ranges
-from calib.densities import ONE_KIND, ROOT_2PI, LongDetours, densities
 from calib.errors import UnanswerableError
+from calib.range_errors.densities import ONE_KIND, ROOT_2PI, LongDetours, densities
 from uwblink.arrays import Bools, Floats
 
 
@@ -97,8 +97,8 @@ def gated(innovation_m: Floats, variance_m2: Floats, gate: float) -> Heard:
 def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> Heard:
     """Weigh noise, reflection and outlier by how likely each made an innovation of such noise.
 
-    The noise in a reflected range is normal, cut off above (`calib.densities`, docs/theory.md). An outlier says
-    nothing.
+    The noise in a reflected range is normal, cut off above (`calib.range_errors.densities`, docs/theory.md). An
+    outlier says nothing.
     """
     found = densities(innovation_m, np.sqrt(variance_m2), errors.least_m, errors.detour_m, errors.long)
     inside = 1 - errors.outlier

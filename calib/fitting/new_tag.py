@@ -10,13 +10,13 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import equal_bins
 from calib.data.sources import Data, load_ranges
-from calib.error_mixture import fit_error_mixture
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import LEAST_SCALE_M, SCALE_OF_SPREAD
 from calib.estimator.losses import LOSSES
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_rows import RESIDUAL, Part, RangeRows, Robust
 from calib.estimator.unknowns import Layout, Priors, Unknown
+from calib.range_errors.error_mixture import fit_error_mixture
 from calib.settings import check_choice, check_tag
 from calib.spread import robust_spread
 from uwblink.arrays import Floats

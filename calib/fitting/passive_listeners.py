@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lift
 from calib.data.sources import Data, opened
-from calib.error_mixture import fit_error_mixture
+from calib.range_errors.error_mixture import fit_error_mixture
 from uwblink.arrays import Floats
 from uwblink.protocols.table import third_from_target
 from uwblink.recording.distances import distances_m

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.densities import LONG_FACTOR, LongDetours, densities
+from calib.range_errors.densities import LONG_FACTOR, LongDetours, densities
 from uwblink.arrays import Floats
 
 OUTLIERS_OVER_M = 10.0

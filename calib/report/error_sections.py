@@ -9,10 +9,10 @@ import numpy as np
 
 from calib import figures
 from calib.calibration.model import curve_rows
-from calib.error_mixture import fit_error_mixtures
 from calib.evaluation.localization import PAPER_RMSE_M, Localization, summarize
 from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows
 from calib.evaluation.tracking import Settings
+from calib.range_errors.error_mixture import fit_error_mixtures
 from calib.report.figures import FILTER_NAMES, rmse_bars, track
 from calib.report.results import Results
 from uwblink.pages.blocks import Block, Heading, Picture, Table, Text

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import expon, exponnorm, norm
 
-from calib.densities import LongDetours, densities
+from calib.range_errors.densities import LongDetours, densities
 
 SIGMA, LEAST, DETOUR = 0.08, 0.1, 0.3
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import exponnorm
 
-from calib.error_mixture import ErrorMixture, e_step, fit_error_mixture, fit_error_mixtures
+from calib.range_errors.error_mixture import ErrorMixture, e_step, fit_error_mixture, fit_error_mixtures
 
 
 def mixed(n=40_000, share=0.12, mean_m=0.35, outlier=0.0, seed=3):

@@ -4,8 +4,8 @@ An error is noise with probability 1 - t - s; noise plus an exponential detour w
 within reach with probability s. Expectation-maximisation (Dempster, Laird, Rubin 1977) on counts over a grid of
 errors and bins of power, so its cost does not grow with the number of ranges.
 
-It has one kind of detour, where the likelihood by pair has two (`calib.densities.LongDetours`): without a least detour
-the shorter of two kinds takes ranges from the core, whose standard deviation is then 3 % too small.
+It has one kind of detour, where the likelihood by pair has two (`calib.range_errors.densities.LongDetours`): without a
+least detour the shorter of two kinds takes ranges from the core, whose standard deviation is then 3 % too small.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.densities import densities
+from calib.range_errors.densities import densities
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 
