@@ -12,7 +12,7 @@ import numpy as np
 from scipy import linalg, sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from uwblink.arrays import Floats, Ints
+from uwblink.arrays import Bools, Floats, Ints
 
 MOST_DENSE = 400
 """Unknowns up to which matrices are dense: a dense factorisation takes as long as a sparse one of a flight there."""
@@ -31,15 +31,18 @@ class SparseInverse:
     border is solved by its Schur complement.
     """
 
-    def __init__(self, matrix: sparse.csc_matrix, free: Ints) -> None:
-        """Factor the matrix; unknowns are scaled to the same size first."""
+    def __init__(self, matrix: sparse.csc_matrix, free: Ints, local: Bools | None = None) -> None:
+        """Factor the matrix; unknowns are scaled to the same size first.
+
+        `local` (p,) marks those that meet only near ones; without any that are marked, those that meet few are taken.
+        """
         own = sparse.csc_matrix(matrix[free][:, free])
         self.shape, self._free = matrix.shape, free
         self._scale = 1 / np.sqrt(np.maximum(own.diagonal(), 1e-300))
         unit = sparse.diags(self._scale) @ own @ sparse.diags(self._scale) + 1e-13 * sparse.eye(len(free))
         unit = sparse.csr_matrix(unit)
         meets = np.diff(unit.indptr)
-        wide = meets > 2 * np.median(meets)
+        wide = meets > 2 * np.median(meets) if local is None or not local.any() else ~local[free]
         inner = np.flatnonzero(~wide)
         inner = inner[reverse_cuthill_mckee(sparse.csr_matrix(unit[inner][:, inner]), symmetric_mode=True)]
         self._inner, self._border = inner, np.flatnonzero(wide)
@@ -78,13 +81,13 @@ class SparseInverse:
 Inverse = Floats | SparseInverse
 
 
-def inverse_of(matrix: Matrix, free: Ints) -> Inverse:
+def inverse_of(matrix: Matrix, free: Ints, local: Bools | None = None) -> Inverse:
     """Return the inverse (p, p) of a positive definite matrix among the free unknowns, zero elsewhere.
 
     Unknowns are scaled to the same size first; what neither rows nor priors determine is held by a share of 1e-13.
     """
     if sparse.issparse(matrix):
-        return SparseInverse(matrix, free)
+        return SparseInverse(matrix, free, local)
     found = np.zeros_like(matrix)
     if not len(free):
         return found

@@ -83,7 +83,7 @@ def maximize(
             kept = (value - best) / promised
             length = float(np.clip(length * np.clip(0.5 / max(1 - kept, 1e-3), 0.5, 2.0) ** 0.7, 0.25, 8.0))
         sums, shorter = found, 0
-        covariance = inverse_of(sums.information + priors.precision(), free)
+        covariance = inverse_of(sums.information + priors.precision(), free, layout.local())
         slope = sums.gradient + priors.pull(x)
         step = covariance @ slope
         gain = float(slope @ step)

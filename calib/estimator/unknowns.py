@@ -56,7 +56,8 @@ class Prior:
 class Unknown:
     """A block of unknowns: `names` (k,) say of what each is, `start` (k,) where a search begins.
 
-    `known` (k,) marks those that keep their start. `scale` is what a guess without any data is good to.
+    `known` (k,) marks those that keep their start; `local` are unknowns each of which meets few others, as control
+    points of a path do. `scale` is what a guess without any data is good to.
     """
 
     kind: str
@@ -65,6 +66,7 @@ class Unknown:
     priors: tuple[Prior, ...] = ()
     scale: float = 1.0
     known: Bools | None = None
+    local: bool = False
 
     def __post_init__(self) -> None:
         """Raise `BadInputError` where start and names differ in length."""
@@ -103,6 +105,10 @@ class Layout:
         """Return the indices of the unknowns that are not known already."""
         known = [np.zeros(len(b.start), bool) if b.known is None else b.known for b in self.blocks]
         return np.flatnonzero(~np.concatenate(known))
+
+    def local(self) -> Bools:
+        """Return which unknowns (p,) meet few others, and have a banded matrix among themselves."""
+        return np.repeat([block.local for block in self.blocks], [len(block.start) for block in self.blocks])
 
     def indices(self, kinds: Sequence[str]) -> Ints:
         """Return the indices of some kinds, in the order given; kinds that are not there have none."""

@@ -222,7 +222,7 @@ class Information:
             self.priors.update(self.x, self._inverse())
 
     def _inverse(self) -> Inverse:
-        return inverse_of(self.whole + self.priors.precision(), self.layout.free())
+        return inverse_of(self.whole + self.priors.precision(), self.layout.free(), self.layout.local())
 
     @cached_property
     def delays(self) -> tuple[Floats, Floats]:
