@@ -26,6 +26,7 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
 from calib.estimator.losses import MIXTURE
 from calib.estimator.range_model import RangeModel
+from calib.estimator.range_rows import Mixture
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.fitting.known_delays import imported
@@ -34,7 +35,7 @@ from calib.information import Unknown, judge
 from calib.settings import FitSettings, check_choice
 from calib.trajectories.judging import Judged, curve_uncertainty, judged
 from calib.trajectories.scene import Scene, Usable, scene_from
-from calib.trajectories.search import Found, search
+from calib.trajectories.search import Cauchy, Found, search
 from calib.trajectories.start import begin
 from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
@@ -202,13 +203,18 @@ def _described(model: RangeModel, top: Found, known: Calibration | None) -> Know
     """Return what was found as a fit to the distances that were found, which knows how far they are uncertain."""
     distances = top.geometry.distances(top.optimum.x)[0]
     model = replace(model, ranges=replace(model.ranges, truth_m=distances))
+    errors = top.rows.errors
+    if isinstance(errors, Cauchy):
+        scale = errors.scale_m
+    else:
+        scale = float(np.median(np.exp(top.rows.values(top.optimum.x)["noise"])))
     fitted = Fitted(
         rows=top.rows,
         gauge=top.gauge,
         optimum=top.optimum,
         residuals=top.rows.residuals(top.optimum.x),
-        loss=MIXTURE,
-        scale_m=float(np.median(np.exp(top.rows.values(top.optimum.x)["noise"]))),
+        loss=MIXTURE if isinstance(errors, Mixture) else "cauchy",
+        scale_m=scale,
         steps=top.steps,
         beside=tuple(top.known.values()),
     )

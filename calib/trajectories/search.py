@@ -15,7 +15,7 @@ import numpy as np
 from calib.estimator.inverse import Matrix, SparseInverse
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import RangeModel
-from calib.estimator.range_rows import RESIDUAL, Errors, Part, RangeRows
+from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows
 from calib.estimator.rows import NormalRows, Rows, sum_rows
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.spread import robust_spread
@@ -39,6 +39,9 @@ ROUNDS = 3
 """Rounds in which the scale of a loss, or the share of ranges that paths use up, is found again."""
 
 MOST_USED = 0.8
+FEWEST_A_PAIR = 15
+"""Of fewer ranges a pair on average nobody can tell what their errors are made of: they keep Cauchy's likelihood."""
+
 FINEST_S = 0.11
 """Control points are not put twice as densely again below this."""
 
@@ -51,17 +54,24 @@ FORCES_M_S2 = (0.02, 5.0)
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """Cauchy's likelihood of residuals, with a curvature that descends from anywhere (`Errors`)."""
+    """Cauchy's likelihood of residuals, with a curvature that descends from anywhere (`Errors`).
+
+    With `expected` each tells what all do on average, as near the top.
+    """
 
     scale_m: float
+    expected: bool = False
     parameters: tuple[str, ...] = ()
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
         """Return log densities (n,), slopes by the residual (n,) and what each tells (n,)."""
         u = values[RESIDUAL] / self.scale_m
         weight = 2 / self.scale_m**2 / (1 + u**2)
+        curvature = weight * (1 - u**2) / (1 + u**2)
         # Where the loss bends upwards there is none: a fifth of the weight, as of reweighted least squares.
-        tells = weight * np.maximum((1 - u**2) / (1 + u**2), 0.2)
+        tells = np.maximum(curvature, 0.2 * weight)
+        if self.expected:
+            tells = np.full(len(u), max(float(np.mean(curvature)), 0.2 * float(np.mean(weight))))
         return -np.log1p(u**2), {RESIDUAL: -weight * values[RESIDUAL]}, tells
 
 
@@ -178,7 +188,7 @@ class _Search:
         rows: list[Rows] = [replace(self.rows, errors=self.errors), *self.known.values(), *self.gauge]
         asked = self.layout.indices(["delay", *self.model.curve_kinds()])
         found = maximize(
-            rows, self.priors, self.x, steps=40, evidence_steps=evidence_steps, tolerance=tolerance, asked=asked
+            rows, self.priors, self.x, steps=60, evidence_steps=evidence_steps, tolerance=tolerance, asked=asked
         )
         self.x, self.steps = found.x, self.steps + found.steps
         self.rows = replace(self.rows, errors=self.errors)
@@ -235,15 +245,36 @@ class _Search:
 
     def likeliest(self) -> Found:
         """Go to the top of the likelihood of ranges that are direct, reflected or outliers."""
+        if len(self.rows) < FEWEST_A_PAIR * len(self.model.pairs.ends):
+            self.errors = Cauchy(max(robust_spread(self.residuals()), LEAST_SCALE_M), expected=True)
+            return self.found(self.climb(evidence_steps=0, tolerance=0.01))
         errors, unknowns, parts = self.model.error_model(self.residuals())
-        self.used = 0.0
+        self.of_errors(errors, unknowns, parts)
         self.build(errors, (unknowns, parts))
-        for _ in range(ROUNDS - 1):
-            self.errors = replace(errors, expected=True, used=self.used)
-            self.climb()
-            self.trust()
-        self.errors = replace(errors, expected=True, used=self.used)
-        found = self.climb(evidence_steps=0, tolerance=0.01)
+        self.errors = replace(errors, used=self.used)
+        self.climb()
+        self.trust()
+        self.errors = replace(errors, used=self.used)
+        found = self.climb(evidence_steps=0, tolerance=0.03)
+        # At the top, what ranges tell on average: squares of the slopes of few are too unsteady for its covariance.
+        self.errors = replace(self.errors, expected=True)
+        return self.found(replace(self.climb(evidence_steps=0, tolerance=np.inf), success=found.success))
+
+    def of_errors(self, errors: Mixture, unknowns: tuple[Unknown, ...], parts: tuple[Part, ...]) -> None:
+        """Find what errors are made of at the present distances, which are a start for all together."""
+        distances = self.geometry.distances(self.x)[0]
+        layout, rows = self.model.build(self.error_m - distances, errors, unknowns, parts)
+        x, priors = layout.start(), Priors(layout)
+        for kind, where in layout.where.items():
+            x[where] = self.values.get(kind, x[where])
+        found = maximize([rows, *self.model.gauge_rows(layout)], priors, x, tolerance=1.0)
+        own = {block.kind for block in unknowns}
+        self.values |= {kind: found.x[where] for kind, where in layout.where.items() if kind in own}
+        keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
+        self.weights |= {key: w for key, w in zip(keys, priors.weights, strict=True) if key[0] in own}
+
+    def found(self, found: Optimum) -> Found:
+        """Return what was found."""
         path = next(k for k, key in enumerate(self._keys()) if key == ("path", 0))
         return Found(
             scene=self.motion.scene,
