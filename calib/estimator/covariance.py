@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.special import stdtrit
 
 from calib.estimator.inverse import trace_of_product
 from calib.estimator.optimize import Optimum
@@ -34,13 +35,19 @@ class Kept:
     indices: Ints
     combinations: Floats
     independent: int
+    freedom: float = np.inf
 
     @classmethod
-    def delays(cls, indices: Ints) -> Kept:
-        """Return delays; what all of them share is the curve's constant, and would hide how long their errors last."""
+    def delays(cls, indices: Ints, each: float) -> Kept:
+        """Return delays that pairs of so many ranges `each` determine.
+
+        What all of them share is the curve's constant, and would hide how long their errors last. What the errors of a
+        pair are made of is known from its own ranges, so that intervals are those of Student's t with as many degrees
+        of freedom as a pair has ranges beyond one.
+        """
         count = len(indices)
         apart = np.eye(count) - (1 / count if count > 1 else 0.0)
-        return cls(indices=indices, combinations=apart, independent=max(count - 1, 1))
+        return cls(indices=indices, combinations=apart, independent=max(count - 1, 1), freedom=max(each - 1, 2.0))
 
     @classmethod
     def curve(cls, indices: Ints) -> Kept:
@@ -76,7 +83,8 @@ def sandwich(
         at = own.stop
         found = persistence(series[:, own] @ sort.combinations.T, blocks, sort.independent)
         lasting.append(found)
-        width[own] = np.sqrt(found.factor) * found.quantile95 / TWO_SIDED_95
+        quantile = max(found.quantile95, float(stdtrit(sort.freedom, 0.975)))
+        width[own] = np.sqrt(found.factor) * quantile / TWO_SIDED_95
     # Slopes at the optimum are smaller than at the truth: with information I and penalty P, the squares of so many
     # ranges are smaller by the share tr((I + P)^-1 I) / n on average, the unknowns that ranges determine by their
     # number.

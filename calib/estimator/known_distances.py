@@ -324,7 +324,8 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, verdict: Ve
         "noise": layout.indices(noise),
     }
     parts = {name: own for name, own in parts.items() if len(own)}
-    kept = [Kept.delays(own) if name == "delay" else Kept.curve(own) for name, own in parts.items()]
+    each = len(fitted.residuals) / len(model.pairs.ends)
+    kept = [Kept.delays(own, each) if name == "delay" else Kept.curve(own) for name, own in parts.items()]
     lasting = sandwich(fitted.optimum, fitted.rows, kept, blocks, fitted.beside)
     whose = np.repeat(np.arange(len(parts)), [len(own) for own in parts.values()])
     covariances = {name: lasting.matrix[np.ix_(whose == k, whose == k)] for k, name in enumerate(parts)}

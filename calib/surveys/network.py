@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, DEGREE, Curve, basis
-from calib.estimator.range_model import DELAY_NS, METRES_A_NS
+from calib.estimator.range_model import METRES_A_NS
 from calib.estimator.rows import Terms, normal_terms
 from calib.estimator.unknowns import Layout, Prior, Priors, Unknown
 from calib.surveys.recordings import PairMeans
@@ -47,6 +47,10 @@ CURVE_SEGMENTS = 12
 
 NARROWEST_DB = 3.0
 """Span of powers below which there is no curve to speak of."""
+
+UNLIKE_NS = 2.0
+"""How far a delay may be from what was configured: published boards differ by 0.6 ns. Surveys need it: without known
+distances a scale of the places can pass for a delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +268,7 @@ class Network:
         """Return what is known of the unknowns beforehand: a precision (p, p), and the unknowns (p,) it is about."""
         freed = np.array([boards.dimensions - 1 if boards.freed else -1 for boards in self.arrangements])[self.owner]
         beside = (np.arange(3) == freed[:, None]).ravel()
-        delays = np.full(len(self.tags), DELAY_NS**-2)
+        delays = np.full(len(self.tags), UNLIKE_NS**-2)
         curve = np.zeros((0, 0)) if self.curve is None else self.curve.precision / curve_m**2
         found = np.zeros((self.layout.size,) * 2)
         diagonal = np.concatenate([np.where(beside, BESIDE_M**-2, FAR_M**-2), delays, np.zeros(len(curve))])
