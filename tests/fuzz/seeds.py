@@ -88,6 +88,7 @@ ALONE: Final = (
     "calib plan survey 4 --on plane --taped 2 --tape-sigma 0.01 --size 3,4",
     "calib plan survey 1,2,3,4 --on space --anchor-tags 1,2,3 --anchor-sigma 0.01 --pair-error 0.02 --rate 50 --json",
     "calib plan survey 3 --on line --arrangements 3 --size 5",
+    "calib plan flight 4 --duration 20",
     "calib sample -o {out} -n 50 --seed 2",
     "calib sample -o {out} -n 50 --with-anchors",
     "uwbsim scenarios icra2023 -o {out}",

@@ -64,5 +64,5 @@ def test_the_scenario_of_a_new_tag(tmp_path, known):
     planted = load_ranges(new).planted["delays_ns"]
     shift = calibration.delays_ns[1] - planted["1"]
     # The common shift is the curve's constant. Tag 1 is known to 11 ps and moves the new one the other way; the curve
-    # is known to 3 mm, 20 ps.
-    assert added.delays_ns[7] - shift == pytest.approx(planted["7"], abs=0.06)
+    # is known to 3 mm, 20 ps: together 30 ps, and three of these.
+    assert added.delays_ns[7] - shift == pytest.approx(planted["7"], abs=0.09)
