@@ -114,31 +114,42 @@ class Slopes:
     def __init__(self, rows: RangeRows, optimum: Optimum, blocks: TimeBlocks, delays: Floats) -> None:
         """Take rows at their optimum; `delays` (tags, p) turns unknowns into delays in ns."""
         self.optimum, self.blocks, self.delays = optimum, blocks, delays
-        score, tells, gradients, linking = [], [], [], []
-        size = optimum.layout.size
-        for terms, by in rows.terms_and_scores(optimum.x):
-            score.append(by)
-            gradients.append(terms.as_matrix(terms.slopes, size))
-            # What links an offset to the unknowns: the residual's slope times theirs, or the loss's curvature.
-            if terms.weight is None or terms.entries is None:
-                tells.append(by**2)
-                linking.append(sparse.diags(by) @ gradients[-1])
-            else:
-                tells.append(terms.weight)
-                linking.append(terms.as_matrix(terms.entries * terms.weight, size))
+        count, size, at = len(rows), optimum.layout.size, 0
         self.order = rows.order
-        self.score, self.tells = np.concatenate(score), np.concatenate(tells)
-        self.gradients = sparse.csr_matrix(sparse.vstack(gradients))
-        self._linking = sparse.csr_matrix(sparse.vstack(linking))
+        self.score, self.tells = np.empty(count), np.empty(count)
+        own = np.zeros((blocks.count, size))
+        several, values, columns = 0, np.empty(0), np.empty(0, dtype=np.int32)
+        for terms, by in rows.terms_and_scores(optimum.x):
+            # What links an offset to the unknowns: the residual's slope times theirs, or the loss's curvature.
+            likely = terms.weight is None or terms.entries is None
+            entries = terms.slopes if terms.entries is None else terms.entries
+            piece = terms.as_matrix(entries, size)
+            which = slice(at, at + len(by))
+            self.score[which], self.tells[which] = by, by**2 if likely else terms.weight
+            if not several:
+                several = piece.indices.size // len(by)
+                # In one piece: of millions of ranges there is no room for parts and their whole.
+                values, columns = np.empty(count * several), np.empty(count * several, dtype=np.int32)
+            values[at * several : which.stop * several] = piece.data
+            columns[at * several : which.stop * several] = piece.indices
+            number = blocks.number[rows.order[which]]
+            weight = np.ones(len(by)) if likely else by
+            in_block = sparse.csr_matrix((weight, (number, np.arange(len(by)))), shape=(blocks.count, len(by)))
+            own += (in_block @ piece).toarray()
+            at = which.stop
+        self.own, self._likely = own, likely
+        self._entries = sparse.csr_matrix((values, columns, several * np.arange(count + 1)), shape=(count, size))
         self._in_block = sparse.csr_matrix(
-            (np.ones(len(self.order)), (blocks.number[self.order], np.arange(len(self.order)))),
-            shape=(blocks.count, len(self.order)),
+            (np.ones(count), (blocks.number[self.order], np.arange(count))), shape=(blocks.count, count)
         )
-        self.own = np.asarray((self._in_block @ self.gradients).todense())
 
     def link(self, derivative: sparse.csr_matrix) -> Floats:
         """Return what links offsets, as derivatives (n, k) of given ranges, to all unknowns (k, p)."""
-        return np.asarray((derivative[self.order].T @ self._linking).todense())
+        return self._link(derivative[self.order])
+
+    def _link(self, kept: sparse.csr_matrix) -> Floats:
+        weight = self.score if self._likely else self.tells
+        return np.asarray(((sparse.diags(weight) @ kept).T @ self._entries).todense())
 
     def test(self, family: Family) -> Tested:
         """Return a family's efficient slopes."""
@@ -146,7 +157,7 @@ class Slopes:
         plain = np.asarray((self._in_block @ sparse.diags(self.score) @ derivative).todense())
         known = np.asarray((self._in_block @ sparse.diags(self.tells) @ derivative.power(2)).todense())
         square = np.asarray((derivative.T @ sparse.diags(self.tells) @ derivative).todense())
-        link = np.asarray((derivative.T @ self._linking).todense())
+        link = self._link(derivative)
         taken = self._taken(link, family.fitted)
         efficient, information = plain - self.own @ taken.T, square - taken @ link.T
         whole = max(float(np.diag(square).max()), 1e-300)
