@@ -302,11 +302,12 @@ class RangeRows:
         slopes = np.concatenate([by[name] * own for name, own in zip(names, entries, strict=True)])
         stacked = np.concatenate(columns, axis=1)
         of_residual = [k for k, name in enumerate(names) if name == RESIDUAL]
-        found = Terms(value=value, slopes=slopes, columns=stacked, starts=starts)
+        found = Terms(value=value, slopes=slopes, columns=stacked, starts=starts, residual=by[RESIDUAL])
         if tells is None:
             return found
+        unit = np.ones(count)
         if len(of_residual) == len(names):
-            return replace(found, weight=tells, entries=np.concatenate(entries))
+            return replace(found, weight=tells, entries=np.concatenate(entries), residual=unit)
         shared = [by[SHARED if name == RESIDUAL else name] * one for name, one in zip(names, entries, strict=True)]
         residual = np.concatenate([entries[k] for k in of_residual])
         beside = Terms(
@@ -316,8 +317,9 @@ class RangeRows:
             starts=starts,
             weight=tells,
             entries=residual,
+            residual=unit,
         )
-        return replace(found, entries=np.concatenate(shared), beside=beside)
+        return replace(found, entries=np.concatenate(shared), residual=by[SHARED], beside=beside)
 
 
 def _sorted(part: Part, order: Ints, starts: Ints) -> Part:

@@ -32,7 +32,8 @@ class Terms:
     `slopes` (K, n) are derivatives of a row's log likelihood by the unknowns `columns` (blocks, K); `starts`
     (blocks + 1,) bound the blocks. What rows know of the unknowns is the sum of `weight` (n,) times outer squares of
     `entries` (K, n); None stands for 1 and the slopes themselves (Berndt, Hall, Hall, Hausman 1974). What rows know
-    `beside` that is added.
+    `beside` that is added. `residual` (n,) are the entries that a unit offset of each row would have, where rows have
+    residuals.
     """
 
     value: float
@@ -41,6 +42,7 @@ class Terms:
     starts: Ints
     weight: Floats | None = None
     entries: Floats | None = None
+    residual: Floats | None = None
     beside: Terms | None = None
 
     def as_matrix(self, values: Floats, size: int) -> sparse.csr_matrix:

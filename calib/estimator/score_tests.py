@@ -108,6 +108,35 @@ class Tested:
     blocks: int
 
 
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What links a unit offset of each range (n,) to the unknowns: `weight` (n,) times its `several` entries.
+
+    Entries lie in one piece: of millions of ranges there is no room for parts and their whole.
+    """
+
+    weight: Floats
+    entries: Floats
+    columns: Ints
+    several: int
+
+    @classmethod
+    def of(cls, count: int, several: int) -> _Known:
+        """Return room for so many ranges."""
+        return cls(np.empty(count), np.empty(count * several), np.empty(count * several, dtype=np.int32), several)
+
+    def put(self, rows: slice, weight: Floats, entries: sparse.csr_matrix) -> None:
+        """Fill in some ranges."""
+        where = slice(rows.start * self.several, rows.stop * self.several)
+        self.weight[rows], self.entries[where], self.columns[where] = weight, entries.data, entries.indices
+
+    def link(self, kept: sparse.csr_matrix, size: int) -> Floats:
+        """Return what links offsets, as derivatives (n, k) of kept ranges, to all unknowns (k, size)."""
+        count = len(self.weight)
+        matrix = sparse.csr_matrix((self.entries, self.columns, self.several * np.arange(count + 1)), (count, size))
+        return np.asarray(((sparse.diags(self.weight) @ kept).T @ matrix).todense())
+
+
 class Slopes:
     """The slopes of a fit's ranges by the residual and by all unknowns, as sums and products that tests are made of."""
 
@@ -116,29 +145,26 @@ class Slopes:
         self.optimum, self.blocks, self.delays = optimum, blocks, delays
         count, size, at = len(rows), optimum.layout.size, 0
         self.order = rows.order
-        self.score, self.tells = np.empty(count), np.empty(count)
-        own = np.zeros((blocks.count, size))
-        several, values, columns = 0, np.empty(0), np.empty(0, dtype=np.int32)
+        self.score, self.tells = np.empty(count), np.zeros(count)
+        self.own = np.zeros((blocks.count, size))
+        self._known: list[_Known] = []
         for terms, by in rows.terms_and_scores(optimum.x):
-            # What links an offset to the unknowns: the residual's slope times theirs, or the loss's curvature.
-            likely = terms.weight is None or terms.entries is None
-            entries = terms.slopes if terms.entries is None else terms.entries
-            piece = terms.as_matrix(entries, size)
             which = slice(at, at + len(by))
-            self.score[which], self.tells[which] = by, by**2 if likely else terms.weight
-            if not several:
-                several = piece.indices.size // len(by)
-                # In one piece: of millions of ranges there is no room for parts and their whole.
-                values, columns = np.empty(count * several), np.empty(count * several, dtype=np.int32)
-            values[at * several : which.stop * several] = piece.data
-            columns[at * several : which.stop * several] = piece.indices
-            number = blocks.number[rows.order[which]]
-            weight = np.ones(len(by)) if likely else by
-            in_block = sparse.csr_matrix((weight, (number, np.arange(len(by)))), shape=(blocks.count, len(by)))
-            own += (in_block @ piece).toarray()
+            in_block = sparse.csr_matrix(
+                (np.ones(len(by)), (blocks.number[rows.order[which]], np.arange(len(by)))),
+                shape=(blocks.count, len(by)),
+            )
+            self.own += (in_block @ terms.as_matrix(terms.slopes, size)).toarray()
+            self.score[which] = by
+            for k, part in enumerate(part for part in (terms, terms.beside) if part is not None):
+                entries = part.slopes if part.entries is None else part.entries
+                if k == len(self._known):
+                    self._known.append(_Known.of(count, len(entries)))
+                residual = np.ones(len(by)) if part.residual is None else part.residual
+                weighed = residual if part.weight is None else residual * part.weight
+                self._known[k].put(which, weighed, part.as_matrix(entries, size))
+                self.tells[which] += residual * weighed
             at = which.stop
-        self.own, self._likely = own, likely
-        self._entries = sparse.csr_matrix((values, columns, several * np.arange(count + 1)), shape=(count, size))
         self._in_block = sparse.csr_matrix(
             (np.ones(count), (blocks.number[self.order], np.arange(count))), shape=(blocks.count, count)
         )
@@ -148,8 +174,8 @@ class Slopes:
         return self._link(derivative[self.order])
 
     def _link(self, kept: sparse.csr_matrix) -> Floats:
-        weight = self.score if self._likely else self.tells
-        return np.asarray(((sparse.diags(weight) @ kept).T @ self._entries).todense())
+        size = self.optimum.layout.size
+        return sum((known.link(kept, size) for known in self._known), np.zeros((kept.shape[1], size)))
 
     def test(self, family: Family) -> Tested:
         """Return a family's efficient slopes."""
