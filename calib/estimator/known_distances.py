@@ -15,6 +15,7 @@ from scipy import sparse
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.covariance import Covariance, Kept, sandwich
+from calib.estimator.identifiability import identifiable_directions, square_of
 from calib.estimator.losses import LOSSES, MIXTURE
 from calib.estimator.optimize import Optimum, maximize
 from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
@@ -22,8 +23,6 @@ from calib.estimator.range_rows import RESIDUAL, Mixture, Part, RangeRows, Robus
 from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.time_blocks import TimeBlocks, in_order, time_blocks
 from calib.estimator.unknowns import Layout, Priors, Unknown
-from calib.information import Unknown as NamedUnknown
-from calib.information import Verdict, judge
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 
@@ -58,8 +57,9 @@ class KnownDistances:
     """A fit to known distances: its `model`, the search that ended it, and the covariances of what was fitted.
 
     `values` are unknowns by kind, `covariances` those of "delay", of all curves side by side ("curve") and of the noise
-    ("noise"). `residuals` (n,) are fitted less true ranges in the order of the model's ranges. `searches` are the one
-    search, or that of the delays and that of the curves.
+    ("noise"). `residuals` (n,) are fitted less true ranges in the order of the model's ranges, metres. `searches` are
+    the one search, or that of the delays and that of the curves. `free` are groups of tags whose delays the data leave
+    free.
     """
 
     model: RangeModel
@@ -69,7 +69,7 @@ class KnownDistances:
     lasting: Covariance
     blocks: TimeBlocks
     residuals: Floats
-    verdict: Verdict
+    free: list[list[int]]
 
     @property
     def delays(self) -> Floats:
@@ -85,11 +85,6 @@ class KnownDistances:
     def steps(self) -> int:
         """Return how many steps all searches took."""
         return sum(search.steps for search in self.searches)
-
-    @property
-    def free(self) -> list[list[int]]:
-        """Return groups of tags whose delays the data leave free."""
-        return free_groups(self.verdict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,10 +112,10 @@ def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
     """
     model = model_of(ranges, recipe)
     error = model.ranges.raw_m - model.ranges.truth_m
-    verdict = _determined(model, recipe)
+    groups = _free_tags(model, recipe)
     blocks = time_blocks(model.ranges.time_ns, model.ranges.session)
     if recipe.sequential and model.curve is not None and not set(model.tags) <= set(recipe.fixed_ns):
-        return _in_sequence(model, error, recipe, blocks, verdict)
+        return _in_sequence(model, error, recipe, blocks, groups)
     robust = recipe.loss if recipe.loss != MIXTURE else "cauchy"
     pilot = robust_fit(model, error, robust, recipe.scale_m, ("delay", *model.curve_kinds()), sample=PILOT)
     if recipe.loss == MIXTURE and LEAST_SCALE_M < robust_spread(pilot.residuals) < LARGEST_SPREAD_M:
@@ -131,7 +126,7 @@ def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
         fitted = pilot
     if not isinstance(fitted.rows.errors, Mixture):
         fitted = robust_fit(model, error, robust, recipe.scale_m, [u.kind for u in model.unknowns], start=pilot)
-    return described(model, fitted, blocks, verdict)
+    return described(model, fitted, blocks, groups)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,24 +170,16 @@ def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeMo
     return model
 
 
-def _determined(model: RangeModel, recipe: Recipe) -> Verdict:
-    """Return what pairs determine of the delays; raises `UnanswerableError` where that is not all of them."""
-    names = model.unknowns[0].names
-    ends = np.searchsorted(model.tags, model.pairs.ends)
-    count = np.bincount(model.pairs.number)
-    information = np.zeros((len(names),) * 2)
-    if recipe.constants == "pair":
-        information[np.diag_indices_from(information)] = count
-    else:
-        for (low, high), several in zip(ends.tolist(), count.tolist(), strict=True):
-            information[np.ix_([low, high], [low, high])] += several
-    free = np.flatnonzero(~np.isin(model.tags, list(recipe.fixed_ns))) if recipe.constants == "tag" else slice(None)
-    own = information[free][:, free] if isinstance(free, slice) else information[np.ix_(free, free)]
-    every = [NamedUnknown("delay", name) for name in names]
-    some = every[free] if isinstance(free, slice) else [every[k] for k in free.tolist()]
-    verdict = judge(own * 1e3, some) if some else judge(np.eye(1) * 1e3, [NamedUnknown("delay", "")])
-    if not verdict.whole and not recipe.minimum_norm:
-        groups = free_groups(verdict)
+def _free_tags(model: RangeModel, recipe: Recipe) -> list[list[int]]:
+    """Return the tags whose delays pairs leave free, in groups; raises `UnanswerableError` unless that is asked for."""
+    ranges, free = model.ranges, [k for k, tag in enumerate(model.tags) if tag not in recipe.fixed_ns]
+    if recipe.constants == "pair" or not free:
+        return []
+    square, pairs = square_of(
+        model.tags, ranges.initiator, ranges.target, ranges.weight_initiator, ranges.weight_target
+    )
+    groups = identifiable_directions(square[np.ix_(free, free)], [model.tags[k] for k in free], pairs)[1]
+    if groups and not recipe.minimum_norm:
         named = "; ".join(", ".join(map(str, group)) for group in groups)
         raise UnanswerableError(
             f"the pairs do not determine the antenna delays of tags {named}: some can grow as others shrink without "
@@ -200,17 +187,7 @@ def _determined(model: RangeModel, recipe: Recipe) -> Verdict:
             "`fixed_ns` (`minimum_norm` fits regardless, and says so; `constants` pair gives each pair its own)",
             undetermined=groups,
         )
-    return verdict
-
-
-def free_groups(verdict: Verdict) -> list[list[int]]:
-    """Return the tags whose delays shift together without a trace in any range, in groups."""
-    groups: list[set[int]] = []
-    for direction in verdict.free:
-        tags = {int(u.of) for u, part in zip(verdict.unknowns, direction.parts, strict=True) if abs(part) > 1e-3}
-        overlapping = [group for group in groups if group & tags]
-        groups = [group for group in groups if group not in overlapping] + [tags.union(*overlapping)]
-    return sorted(sorted(group) for group in groups)
+    return groups
 
 
 def robust_fit(
@@ -314,7 +291,7 @@ def _from(layout: Layout, start: Fitted | None) -> Floats:
     return x
 
 
-def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, verdict: Verdict) -> KnownDistances:
+def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, free: list[list[int]]) -> KnownDistances:
     """Return a fit with the covariances of what was fitted."""
     layout = fitted.optimum.layout
     noise = [kind for kind in layout.where if kind.startswith(("noise level", "noise curve"))]
@@ -340,7 +317,7 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, verdict: Ve
         lasting=lasting,
         blocks=blocks,
         residuals=fitted.residuals,
-        verdict=verdict,
+        free=free,
     )
 
 
@@ -363,19 +340,19 @@ def _of_another_shape(optimum: Optimum, delays: Ints) -> Floats:
 
 
 def _in_sequence(
-    model: RangeModel, error: Floats, recipe: Recipe, blocks: TimeBlocks, verdict: Verdict
+    model: RangeModel, error: Floats, recipe: Recipe, blocks: TimeBlocks, groups: list[list[int]]
 ) -> KnownDistances:
     """Fit delays first, then the curves on what they leave, as in ICRA 2023, sections III and IV, with splines.
 
     The curves keep their constants and the delays are those of the first step, unless a reference is asked for.
     """
     free = replace(model, gauged=(False,) * len(model.gauged))
-    first = described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks, verdict)
+    first = described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks, groups)
     kinds = free.curve_kinds()
     # The curve bends with powers that are few at either end: it is fitted to those between them.
     inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
     second = robust_fit(free, first.residuals, recipe.loss, first.searches[0].scale_m, kinds, weight=inside)
-    curves = described(free, second, blocks, verdict)
+    curves = described(free, second, blocks, groups)
     values = first.values | {kind: curves.values[kind] for kind in kinds}
     if recipe.reference is not None:
         values = _stated(model, values, recipe)
@@ -387,7 +364,7 @@ def _in_sequence(
         lasting=first.lasting,
         blocks=blocks,
         residuals=second.residuals,
-        verdict=verdict,
+        free=groups,
     )
 
 

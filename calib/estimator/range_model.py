@@ -92,7 +92,7 @@ class Spline:
 class RangeModel:
     """Unknowns and parts of `ranges` (n,), whose curves lie over `lifted` powers between those of `span`.
 
-    `unknowns` hold delays, curves and offsets; `error_unknowns` what errors are made of, begun by `start_errors`.
+    `unknowns` hold delays, curves and offsets; `error_model` begins what errors are made of.
     `gauged` are the groups whose curve is zero at `reference`; the others keep a constant that pinned delays fix.
     """
 
@@ -107,7 +107,6 @@ class RangeModel:
     noise: Spline | None
     unknowns: tuple[Unknown, ...]
     parts: tuple[Part, ...]
-    rows: tuple[NormalRows, ...]
     gauged: tuple[bool, ...]
     reference: float | None
     constants: str
@@ -150,7 +149,6 @@ class RangeModel:
         pairs = pairs_of(ranges.initiator, ranges.target, tags)
         unknowns, parts = _constants(ranges, pairs, tags, fixed_ns, constants)
         bias = noise = None
-        rows: list[NormalRows] = []
         gauged: list[bool] = []
         if curve:
             bias = Spline.at(lifted, _knots(ordered, low, high))
@@ -178,7 +176,6 @@ class RangeModel:
             noise=noise,
             unknowns=tuple(unknowns),
             parts=tuple(parts),
-            rows=tuple(rows),
             gauged=tuple(gauged),
             reference=reference,
             constants=constants,

@@ -192,10 +192,6 @@ class RangeRows:
             geometry=geometry,
         )
 
-    def with_errors(self, errors: Errors, layout: Layout) -> RangeRows:
-        """Return the same rows under another density of errors."""
-        return replace(self, errors=errors, layout=layout)
-
     def __len__(self) -> int:
         """Return the number of ranges."""
         return len(self.residual)

@@ -15,7 +15,6 @@ import numpy as np
 from scipy import sparse
 
 from calib.estimator.inverse import MOST_DENSE, Matrix
-from calib.estimator.unknowns import Layout
 from uwblink.arrays import Floats, Ints
 
 ROWS_AT_ONCE = 16_384
@@ -157,9 +156,3 @@ def normal_terms(left: Floats, std: Floats, derivative: Floats, columns: Ints) -
         starts=np.arange(len(left) + 1),
         entries=derivative / std,
     )
-
-
-def matrix_of(rows: Sequence[Rows], x: Floats, layout: Layout) -> sparse.csr_matrix:
-    """Return the slopes of all rows (n, p) as one sparse matrix, for tests and small problems."""
-    parts = [terms.as_matrix(terms.slopes, layout.size) for kind in rows for terms in kind.terms(x)]
-    return sparse.csr_matrix(sparse.vstack(parts))

@@ -31,7 +31,6 @@ from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
 from calib.fitting.known_delays import imported
 from calib.fitting.result import FitResult
-from calib.information import Unknown, judge
 from calib.settings import FitSettings, check_choice
 from calib.trajectories.judging import Judged, curve_uncertainty, judged
 from calib.trajectories.scene import Scene, Usable, scene_from
@@ -219,8 +218,7 @@ def _described(model: RangeModel, top: Found, known: Calibration | None) -> Know
         beside=tuple(top.known.values()),
     )
     # What the ranges determine is judged later, with what trajectories take of it.
-    everything = judge(1e3 * np.eye(1), [Unknown("delay", "")])
-    found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session), everything)
+    found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session), [])
     if known is not None:
         more = curve_uncertainty(found, known)
         found = replace(found, covariances=found.covariances | {"delay": found.covariances["delay"] + more})

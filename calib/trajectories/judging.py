@@ -27,7 +27,7 @@ PRIOR_NS = 2.0
 GUESS_NS, LOOSEST = 0.2, 0.5
 """A direction of delays counts as determined if it is known to half of so much (3 cm of range), by standard error.
 
-Calibrated by simulation (docs/fit-from-ranges.md): intervals beyond were seen not to hold.
+Calibrated by simulation (docs/accuracy.md): intervals beyond were seen not to hold.
 """
 
 GROWTH = 3.0
@@ -35,7 +35,7 @@ GROWTH = 3.0
 
 ALONE = 3.0
 """By geometry alone a fit is linear no further: errors of up to 4.2 of its standard errors were seen, which are so many
-times as large there as linear propagation has them (docs/fit-from-ranges.md)."""
+times as large there as linear propagation has them (docs/accuracy.md)."""
 
 LOOKED_AT = 400
 """Distances whose standard errors are averaged."""

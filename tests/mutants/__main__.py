@@ -70,23 +70,15 @@ ROOMS: Final = {
     ),
     "fit": Room(
         (
-            "calib/estimation/solver.py",
-            "calib/estimation/pairs.py",
-            "calib/estimation/identifiability.py",
-            "calib/estimation/sigma_curve.py",
+            "calib/estimator/optimize.py",
+            "calib/estimator/covariance.py",
+            "calib/estimator/score_tests.py",
+            "calib/estimator/identifiability.py",
         ),
-        tuple(
-            f"tests/calib/estimation/test_{name}.py"
-            for name in (
-                "solver",
-                "solver_parts",
-                "sigma_curve",
-                "pairs",
-                "identifiability",
-                "robust",
-                "smoothing",
-                "result",
-            )
+        (
+            "tests/calib/estimator",
+            "tests/calib/estimation/test_sessions.py",
+            "tests/calib/estimation/test_identifiability.py",
         ),
     ),
 }

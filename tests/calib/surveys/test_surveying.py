@@ -497,3 +497,8 @@ def test_a_curve_that_cannot_be_taken_over_is_refused():
         calib.survey(ranges, known="line", curve_from=flight, delays_only=True)
     with pytest.raises(BadInputError, match="lifts powers by"):
         calib.survey(ranges, known="line", curve_from=replace(flight, alpha_dbm=-80.0))
+
+
+def test_two_arrangements_of_one_name_are_refused(recording):
+    with pytest.raises(BadInputError, match="two arrangements are called 'A'"):
+        calib.survey([recording[0], recording[0]])
