@@ -71,10 +71,10 @@ def examine_fit(found: KnownDistances) -> Doubts:
     where = layout.where["delay"]
     delays[:, where] = np.eye(len(found.delays))
     slopes = Slopes(search_of.rows, search_of.optimum, found.blocks, delays)
-    louder, alone = of_a_decibel(found), len(found.searches) > 1
+    louder, alone = change_per_decibel(found), len(found.searches) > 1
     tested = [slopes.test(family) for family in families(found, louder, beside_curve=not alone)]
-    findings = _told_once(search(tested, ERROR_RATE))
-    findings += list(_of_gain(findings, tested))
+    findings = _without_repeats(search(tested, ERROR_RATE))
+    findings += list(_wrong_decibels(findings, tested))
     plain = found.covariances["delay"]
     for one in tested:
         if one.family.kind in ("pair", "session") and not len(one.family.fitted):
@@ -223,13 +223,13 @@ def _root_mean_square(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def of_a_decibel(found: KnownDistances) -> Floats:
+def change_per_decibel(found: KnownDistances) -> Floats:
     """Return by how much ranges (n,) would read otherwise, had their powers been a decibel higher."""
     curves, lifted = list(bias_curves(found).values()), found.model.lifted
     return np.asarray(np.mean([curve(DECIBEL * lifted) - curve(lifted) for curve in curves], axis=0))
 
 
-def _told_once(findings: list[Finding]) -> list[Finding]:
+def _without_repeats(findings: list[Finding]) -> list[Finding]:
     """Leave out what a tag does for a while where a difference between sessions says the same more surely."""
     between = {name: abs(one.deviation) for one in findings if one.kind == "session" for name in one.names}
     return [
@@ -239,7 +239,7 @@ def _told_once(findings: list[Finding]) -> list[Finding]:
     ]
 
 
-def _of_gain(findings: list[Finding], tested: list[Tested]) -> Iterator[Finding]:
+def _wrong_decibels(findings: list[Finding], tested: list[Tested]) -> Iterator[Finding]:
     """Yield wrong decibels of tags whose errors go with power in another way, where they suggest such.
 
     How errors go with power says that a tag is not as the others, decibels what that does to its delay.
@@ -266,11 +266,11 @@ def _of_gain(findings: list[Finding], tested: list[Tested]) -> Iterator[Finding]
 
 def _weighed(plain: Floats, findings: list[Finding], places: OfPlaces) -> tuple[Floats, list[str]]:
     """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences."""
-    said = places.told(plain)
+    said = places.sentences(plain)
     if said:
         # Offsets of pairs are then draws like the others; one of them is no fault of its own.
         findings = [one for one in findings if one.kind != "pair"]
-    narrower = [one for one in findings if _of_arithmetic(one, plain, certain=bool(said))]
+    narrower = [one for one in findings if _is_cause(one, plain, certain=bool(said))]
     if any("late" in one.names for one in narrower):
         # Ranges of two bodies are wrong together then, too: the narrower cause is named.
         said = []
@@ -290,7 +290,7 @@ def _weighed(plain: Floats, findings: list[Finding], places: OfPlaces) -> tuple[
     return covariance, [*said, *(sentence_of(one) for one in matter if once[one.kind, one.names] is one)]
 
 
-def _of_arithmetic(finding: Finding, before_ns2: Floats, *, certain: bool) -> bool:
+def _is_cause(finding: Finding, before_ns2: Floats, *, certain: bool) -> bool:
     """Return whether a finding that all ranges share is a cause by itself, with places `certain` or not.
 
     True distances of another time than ranges move ranges, and hardly delays.

@@ -47,7 +47,7 @@ class OfPlaces:
     widening_ns2: Floats
     certain: bool = False
 
-    def told(self, before_ns2: Floats) -> list[str]:
+    def sentences(self, before_ns2: Floats) -> list[str]:
         """Return it as a sentence, where it is certain and matters beside a covariance (tags, tags) without it."""
         # What all delays have in common hangs on the curve as well, and is less known by far.
         apart = np.eye(len(before_ns2)) - 1 / max(len(before_ns2), 1)

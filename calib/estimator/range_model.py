@@ -162,7 +162,12 @@ class RangeModel:
             noise = Spline.at(lifted, knots_for(ordered, SIGMA_SEGMENTS, (low, high)))
         if offsets:
             _add_offsets(
-                ranges, pairs, tags, unknowns, parts, told=_told_apart(pairs, tags, fixed_ns, constants, gauged)
+                ranges,
+                pairs,
+                tags,
+                unknowns,
+                parts,
+                identifiable=_offsets_identifiable(pairs, tags, fixed_ns, constants, gauged),
             )
         return cls(
             ranges=ranges,
@@ -309,12 +314,12 @@ OFFSETS = (0.01, 1e-4, 1.0)
 
 
 def _add_offsets(
-    ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[Unknown], parts: list[Part], *, told: bool
+    ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[Unknown], parts: list[Part], *, identifiable: bool
 ) -> None:
     """Add what is constant in the ranges of a pair, and of pairs and tags in one of several sessions."""
     names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
     number = pairs.number[:, None]
-    if told:
+    if identifiable:
         unknowns.append(_of_pairs("offset of pair", names, OFFSETS))
         parts.append(Part(parameter=RESIDUAL, kind="offset of pair", columns=number))
     count = len(ranges.sessions)
@@ -331,10 +336,10 @@ def _add_offsets(
         parts.append(Part(parameter=RESIDUAL, kind=kind, columns=columns.astype(np.int32)))
 
 
-def _told_apart(
+def _offsets_identifiable(
     pairs: Pairs, tags: list[int], fixed: Mapping[int, float], constants: str, gauged: Sequence[bool]
 ) -> bool:
-    """Return whether anything tells offsets of pairs from delays, or from constants of curves."""
+    """Return whether ranges determine offsets of pairs beside delays and constants of curves."""
     if constants == "pair":
         return False
     free = [tag for tag in tags if tag not in fixed]
