@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from calib.calibration.formats import export
     from calib.calibration.model import Calibration, load_calibration
     from calib.calibration.parts import CorrectedRanges
+    from calib.checks.examine import examine
     from calib.data.ranges import Ranges
     from calib.data.samples import sample_flight
     from calib.data.sources import load_ranges
-    from calib.doctor.examine import examine
     from calib.errors import BadInputError, CalibError, UnanswerableError
     from calib.estimator.losses import register_loss
     from calib.evaluation.localization import localize
@@ -98,7 +98,7 @@ _HOMES: Final = {
     "apply": "calib.calibration.correction",
     "compare": "calib.calibration.comparison",
     "evaluate": "calib.evaluation.statistics",
-    "examine": "calib.doctor.examine",
+    "examine": "calib.checks.examine",
     "export": "calib.calibration.formats",
     "fit": "calib.fitting.fitting",
     "fit_from_ranges": "calib.trajectories.fitting",

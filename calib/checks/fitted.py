@@ -16,13 +16,11 @@ from calib.calibration.power_curves import basis
 from calib.checks.places import OfPlaces, of_places
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.range_rows import Mixture
-from calib.estimator.score_tests import Family, Finding, Slopes, Tested, search, widening
+from calib.estimator.score_tests import Family, FoundOffset, Slopes, Tested, search, widening
 from calib.estimator.to_calibration import bias_curves
+from calib.findings import OF_A_FIT
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
-
-ERROR_RATE = 0.005
-"""Share of sound fits that may be doubted, all alternatives together: half the budget of a recording's checks."""
 
 SEGMENTS, SPAN_S = 6, 20.0
 """Spans of time in which a tag may have an offset of its own, and how long they are at least: errors that last must be
@@ -73,7 +71,7 @@ def examine_fit(found: KnownDistances) -> Doubts:
     slopes = Slopes(search_of.rows, search_of.optimum, found.blocks, delays)
     louder, alone = change_per_decibel(found), len(found.searches) > 1
     tested = [slopes.test(family) for family in families(found, louder, beside_curve=not alone)]
-    findings = _without_repeats(search(tested, ERROR_RATE))
+    findings = _without_repeats(search(tested, OF_A_FIT))
     findings += list(_wrong_decibels(findings, tested))
     plain = found.covariances["delay"]
     for one in tested:
@@ -229,7 +227,7 @@ def change_per_decibel(found: KnownDistances) -> Floats:
     return np.asarray(np.mean([curve(DECIBEL * lifted) - curve(lifted) for curve in curves], axis=0))
 
 
-def _without_repeats(findings: list[Finding]) -> list[Finding]:
+def _without_repeats(findings: list[FoundOffset]) -> list[FoundOffset]:
     """Leave out what a tag does for a while where a difference between sessions says the same more surely."""
     between = {name: abs(one.deviation) for one in findings if one.kind == "session" for name in one.names}
     return [
@@ -239,7 +237,7 @@ def _without_repeats(findings: list[Finding]) -> list[Finding]:
     ]
 
 
-def _wrong_decibels(findings: list[Finding], tested: list[Tested]) -> Iterator[Finding]:
+def _wrong_decibels(findings: list[FoundOffset], tested: list[Tested]) -> Iterator[FoundOffset]:
     """Yield wrong decibels of tags whose errors go with power in another way, where they suggest such.
 
     How errors go with power says that a tag is not as the others, decibels what that does to its delay.
@@ -254,7 +252,7 @@ def _wrong_decibels(findings: list[Finding], tested: list[Tested]) -> Iterator[F
         known = max(float(result.information[k, k]), 1e-300)
         offset = float(result.total[k]) / known
         if known > 1e-3 * result.whole and abs(offset) > SUGGESTED * np.sqrt(result.covariance[k, k]) / known:
-            yield Finding(
+            yield FoundOffset(
                 kind="decibels",
                 names=(name,),
                 offset_m=-offset,
@@ -264,7 +262,7 @@ def _wrong_decibels(findings: list[Finding], tested: list[Tested]) -> Iterator[F
             )
 
 
-def _weighed(plain: Floats, findings: list[Finding], places: OfPlaces) -> tuple[Floats, list[str]]:
+def _weighed(plain: Floats, findings: list[FoundOffset], places: OfPlaces) -> tuple[Floats, list[str]]:
     """Return the delays' covariance (tags, tags) with what findings add, and those that matter as sentences."""
     said = places.sentences(plain)
     if said:
@@ -290,7 +288,7 @@ def _weighed(plain: Floats, findings: list[Finding], places: OfPlaces) -> tuple[
     return covariance, [*said, *(sentence_of(one) for one in matter if once[one.kind, one.names] is one)]
 
 
-def _is_cause(finding: Finding, before_ns2: Floats, *, certain: bool) -> bool:
+def _is_cause(finding: FoundOffset, before_ns2: Floats, *, certain: bool) -> bool:
     """Return whether a finding that all ranges share is a cause by itself, with places `certain` or not.
 
     True distances of another time than ranges move ranges, and hardly delays.
@@ -301,7 +299,7 @@ def _is_cause(finding: Finding, before_ns2: Floats, *, certain: bool) -> bool:
     return certain or (large and ("late" in finding.names or _moved(finding, before_ns2) > MATTERS))
 
 
-def _moved(finding: Finding, covariance: Floats) -> float:
+def _moved(finding: FoundOffset, covariance: Floats) -> float:
     """Return by how many of its standard errors a finding moves some delay."""
     std = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     if not np.any(np.diag(covariance) > 0):
@@ -314,7 +312,7 @@ def _moved(finding: Finding, covariance: Floats) -> float:
     return float(np.max(np.abs(finding.effects_ns) / std, initial=0.0))
 
 
-def sentence_of(finding: Finding) -> str:
+def sentence_of(finding: FoundOffset) -> str:
     """Return a finding as a sentence."""
     whose = " or ".join(finding.names)
     size = f"{100 * abs(finding.offset_m):.1f} cm"

@@ -185,7 +185,7 @@ def doctor(
     from dataclasses import asdict, replace
 
     import calib
-    from calib.doctor import examined_part
+    from calib.checks import examined_part
     from uwblink import Recording
     from uwblink.recording import clock_skews
 

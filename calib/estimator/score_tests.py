@@ -50,7 +50,7 @@ class Family:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class FoundOffset:
     """An alternative that the residuals ask for: its kind, whose it may be, the offset, and what it does to delays.
 
     `effect_ns` (tags,) is by how much the delays would change, `deviation` how many standard errors the offset is from
@@ -220,14 +220,14 @@ class Slopes:
         return taken.T
 
 
-def search(tested: Sequence[Tested], rate: float) -> list[Finding]:
+def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:
     """Return what stands out of all families, the gravest first; of sound fits the share `rate` has any finding."""
     several = sum(len(one.family.names) for one in tested)
     found = [finding for one in tested for finding in findings(one, several, rate)]
     return sorted(found, key=lambda finding: finding.p_value)
 
 
-def findings(tested: Tested, several: int, rate: float) -> Iterator[Finding]:
+def findings(tested: Tested, several: int, rate: float) -> Iterator[FoundOffset]:
     """Yield the alternatives of a family that stand out, one after the other, each beside those already found."""
     family, freedom = tested.family, max(tested.lasting.freedom, 3.0)
     total, covariance, information = tested.total.copy(), tested.covariance.copy(), tested.information.copy()
@@ -250,7 +250,7 @@ def findings(tested: Tested, several: int, rate: float) -> Iterator[Finding]:
             others = [k for k in range(first, first + count) if k != top]
             rest = family.sessions[1 - top % count] if count == 2 else "the other recordings"
             otherwise, sessions = -tested.effects[:, others].sum(axis=1) * offset, (family.sessions[top % count], rest)
-        yield Finding(
+        yield FoundOffset(
             kind=family.kind,
             names=tuple(dict.fromkeys(family.names[k] for k in np.flatnonzero(close).tolist())),
             offset_m=-offset,
@@ -287,4 +287,4 @@ def widening(tested: Tested) -> Floats:
     return np.asarray(variance * tested.effects @ tested.effects.T)
 
 
-__all__ = ["RESIDUAL", "Family", "Finding", "Slopes", "Tested", "findings", "search", "widening"]
+__all__ = ["RESIDUAL", "Family", "FoundOffset", "Slopes", "Tested", "findings", "search", "widening"]

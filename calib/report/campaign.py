@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from calib.calibration.model import Calibration
+from calib.checks.examine import examine
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data, each, held_open, load_each, opened
-from calib.doctor.base import Finding
-from calib.doctor.examine import examine
 from calib.errors import UnanswerableError
 from calib.estimator.losses import MIXTURE
 from calib.evaluation.localization import Localization, localize, summarize
+from calib.findings import Finding
 from calib.fitting.fitting import fit
 from calib.fitting.passive_listeners import heard_delays
 from calib.fitting.result import FitResult

@@ -18,8 +18,8 @@ from calib.data.sources import Data
 from calib.evaluation.statistics import Evaluation, evaluate
 
 if TYPE_CHECKING:
-    from calib.doctor.base import Finding
     from calib.evaluation.localization import Localization
+    from calib.findings import Finding
     from calib.fitting.passive_listeners import OverheardDelay
     from calib.fitting.result import FitResult
 

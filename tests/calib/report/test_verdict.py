@@ -8,7 +8,7 @@ import pytest
 import calib
 from benchmarks.standing import standing_boards
 from calib.calibration.model import Calibration
-from calib.doctor.base import Finding
+from calib.findings import Finding
 from calib.fitting.fitting import fit
 from calib.report import Heading, Picture, Table, Text, write_survey_report
 from calib.report.results import Results

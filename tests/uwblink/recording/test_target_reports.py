@@ -8,7 +8,7 @@ import pytest
 
 import calib
 import uwblink
-from calib.doctor.examine import examine
+from calib.checks.examine import examine
 from tests.boards import bench_scenario
 from uwblink.boards.listeners import ReportCheck
 from uwblink.recording.file import Recording

@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
+from calib.checks.levels import DOF, OF_MEDIAN, medians
 from calib.checks.limits import told
 from calib.checks.plausibility import robust_slope
+from calib.checks.recording_view import RecordingView, pair_ids
 from calib.data.clocks import corrected, left_skew
-from calib.doctor.base import RecordingView, pair_ids
-from calib.doctor.checks import BUDGET, Seen, exceeds
-from calib.doctor.levels import DOF, OF_MEDIAN, medians
+from calib.findings import BUDGET, Candidate, exceeds
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.protocols.table import single_sided
@@ -43,7 +43,7 @@ NORMAL: Final = 1e6
 """Degrees of freedom of what many ranges tell."""
 
 
-def skew(view: RecordingView) -> Iterator[Seen]:
+def skew(view: RecordingView) -> Iterator[Candidate]:
     """Errors that follow the carriers' readings: skew that was not taken out, or was with the wrong sign."""
     e = view.exchanges
     rows = np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e)
@@ -74,7 +74,7 @@ def skew(view: RecordingView) -> Iterator[Seen]:
     evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
     for at, fault, remedy in SLOPES[bool(taken.all())]:
         if abs(slope - at) < NEAR:
-            yield Seen(fault, evidence, p_value, {"more": remedy})
+            yield Candidate(fault, evidence, p_value, {"more": remedy})
 
 
 def _line(x: Floats, y: Floats, variance: Floats) -> tuple[float, float]:
@@ -119,7 +119,7 @@ def _between_thirds(x: Floats) -> float:
     return float(high - low)
 
 
-def _by_direction(some: Exchanges, error: Floats) -> Iterator[Seen]:
+def _by_direction(some: Exchanges, error: Floats) -> Iterator[Candidate]:
     """Where carriers were not read: skew makes ranges of a pair longer one way, and as much shorter the other way."""
     ways, variance = _both_ways(some, [error])
     if len(ways):
@@ -129,7 +129,7 @@ def _by_direction(some: Exchanges, error: Floats) -> Iterator[Seen]:
         told = f"ranges of a pair differ by up to {100 * size:.0f} cm by who initiates"
         p_value = exceeds(float(ways[worst, 0]), float(std[worst]), DOF, tolerance=ONE_WAY_M, tried=len(ways))
         remedy = "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"
-        yield Seen(LEFT, told, p_value, {"more": remedy})
+        yield Candidate(LEFT, told, p_value, {"more": remedy})
 
 
 def _both_ways(some: Exchanges, columns: list[Floats]) -> tuple[Floats, Floats]:
@@ -159,7 +159,7 @@ def _within(some: Exchanges, values: Floats) -> Floats:
     return np.asarray(values - medians(values, place, int(place.max()) + 1)[place])
 
 
-def swapped_roles(view: RecordingView) -> Iterator[Seen]:
+def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
     """The target's clock against the initiator's: from the third leg, and as the carriers say."""
     e = view.exchanges
     double = (e.protocol == "ds") & (e.tx3 != 0) & np.isfinite(e.skew1_ppm)
@@ -183,7 +183,7 @@ def swapped_roles(view: RecordingView) -> Iterator[Seen]:
     # The readings' own offset of a tenth of a ppm, which is no noise, hides no slope of 1.
     slope, std = _line(stamps, readings, variance)
     if slope < -NEAR:
-        yield Seen(
+        yield Candidate(
             "swapped roles",
             "the carriers say that the targets' clocks are slower where the stamps say faster, and the other way round",
             exceeds(slope, std, NORMAL, tolerance=NEAR),
@@ -202,15 +202,15 @@ SLOPES: Final = {
 }
 
 
-def unread(view: RecordingView) -> Iterator[Seen]:
+def unread(view: RecordingView) -> Iterator[Candidate]:
     """Single-sided ranges whose carriers were not read: nothing says what skew left in them."""
     left = left_skew(view.exchanges)
     if left is None or np.isfinite(left.told_m):
         return
-    yield Seen(BLIND, told(left))
+    yield Candidate(BLIND, told(left))
 
 
-def carriers(view: RecordingView) -> Iterator[Seen]:
+def carriers(view: RecordingView) -> Iterator[Candidate]:
     """Carriers' readings that do not follow the clocks' ratios by the stamps."""
     if without_stamps(view.exchanges).all():
         return
@@ -226,4 +226,4 @@ def carriers(view: RecordingView) -> Iterator[Seen]:
     told = (
         f"they scatter by {scatter:.1f} ppm about their median (pair {pair}), and as much or more in half of the pairs"
     )
-    yield Seen("carrier readings that say little", told, p_value)
+    yield Candidate("carrier readings that say little", told, p_value)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.standing import standing_boards
-from calib.doctor.examine import examine
+from calib.checks.examine import examine
 from tests.calib.surveys.test_surveying import FOUR
 from uwblink import Arrangement, Contents, Exchanges
 from uwblink.recording.schema import KnownDistance

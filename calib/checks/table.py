@@ -4,22 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from calib.doctor import (
-    anchors,
-    clocks,
-    closures,
-    geometry,
-    pairs,
-    protocols,
-    radio,
-    reflected,
-    several,
-    steps,
-    surveys,
-    timestamps,
-    units,
-)
-from calib.doctor.checks import BUDGET, CERTAIN, Check, Seen
+from calib.checks import clocks, closures, geometry, pairs, reflected, several, stamps, steps, surveys, units
+from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Check
 
 ALONE: Final = "Student's t over 16 stretches of time"
 BLOCKS: Final = "Student's t, variances by stretches of time"
@@ -29,13 +15,13 @@ GROSS: Final = (
         "Do double-sided exchanges have a third message?",
         "share without one, above a half", CERTAIN,
         {"single-sided data taken for double-sided": 'import again with protocol = "ss"'},
-        timestamps.single_as_double,
+        stamps.single_as_double,
     ),
     Check(
         "Does a frame last as long as frames do?",
         "longest leg, shorter than a frame as ticks and not as ns", CERTAIN,
         {"unit slip": 'the stamps are nanoseconds, not ticks: import again with [units] stamps = "ns"'},
-        timestamps.ticks,
+        stamps.ticks,
     ),
     Check(
         "Are true distances and ranges in one unit?",
@@ -55,7 +41,7 @@ GROSS: Final = (
             "another protocol": "import again with {settings}",
             "timestamp width": "import again with bits = {bits}",
         },
-        protocols.another,
+        stamps.another,
     ),
 )  # fmt: skip
 
@@ -67,27 +53,27 @@ ROWS: Final = (
             "corrupted exchanges": "a robust fit leaves them out; check cables and USB load, and decode the recording "
             "again if it has bytes"
         },
-        timestamps.corrupted,
+        stamps.corrupted,
     ),
     Check(
         "Is each exchange there once?",
         "rows with all stamps of another", CERTAIN,
         {"doubled exchanges": "import one log of each exchange; what is said here counts each once"},
-        timestamps.doubled,
+        stamps.doubled,
     ),
     Check(
         "Do both reports of an exchange agree?",
         "reports that differ", CERTAIN,
         {"contradicting reports": "look at the cables and ports of the two boards; what a damaged line says is not "
          "known"},
-        timestamps.contradicting,
+        stamps.contradicting,
     ),
     Check(
         "Does a tag range with itself?",
         "exchanges with one tag at both ends", CERTAIN,
         {"a tag with itself": "import again with other columns for from_id and to_id; a fit leaves these exchanges "
          "out"},
-        timestamps.with_itself,
+        stamps.with_itself,
     ),
     Check(
         "Does a tag fail in more than half of its exchanges, and more than others?",
@@ -124,8 +110,8 @@ GEOMETRY: Final = (
     Check(
         "Does an anchor stand more than 5 cm elsewhere?",
         "displacement that ranges ask for", "F(3, 9), variances by stretches of time, for all anchors",
-        {anchors.ELSEWHERE: "measure the place of {body} again, and see whose number it has"},
-        anchors.anchors,
+        {geometry.ELSEWHERE: "measure the place of {body} again, and see whose number it has"},
+        geometry.anchors,
     ),
 )  # fmt: skip
 
@@ -189,7 +175,7 @@ STRUCTURE: Final = (
             "speed of light in vacuum": "nothing for a fit, which uses the stamps; multiply reported ranges by 0.9997 "
             "before using them",
         },
-        timestamps.speed_of_light,
+        stamps.speed_of_light,
     ),
     Check(
         "Are reported ranges in metres?",
@@ -231,10 +217,10 @@ STRUCTURE: Final = (
         "Does distance explain more than 80 % of the power?",
         "share of variance between distances, noise of readings aside (variance inflation of 5)", CERTAIN,
         {
-            radio.CONFOUNDED: "turn the antennas while recording; until then the curve may hold what belongs to "
+            pairs.CONFOUNDED: "turn the antennas while recording; until then the curve may hold what belongs to "
             "distance, and `delays_only` fits none"
         },
-        radio.confounded,
+        pairs.confounded,
     ),
     Check(
         "Were powers measured?",
@@ -242,7 +228,7 @@ STRUCTURE: Final = (
         {
             "no powers": "import powers as fpp1 and fpp2; without them only delays can be fitted, by `delays_only`",
         },
-        radio.unpowered,
+        pairs.unpowered,
     ),
     Check(
         "Are true distances known?",
@@ -272,10 +258,5 @@ SURVEYS: Final = Check(
 )  # fmt: skip
 
 CHECKS: Final = (*GROSS, *ROWS, *GEOMETRY, *RADIO, *STRUCTURE, BETWEEN, SURVEYS)
-LEVEL: Final = BUDGET / sum(not check.certain for check in CHECKS)
-"""p-value below which a check's fault is told: each has an equal share of the budget."""
-
-
-def certain(seen: Seen) -> bool:
-    """Return whether what was seen is a finding."""
-    return seen.p_value < LEVEL
+LEVEL: Final = (BUDGET - OF_A_FIT) / sum(not check.certain for check in CHECKS)
+"""p-value below which a candidate is a finding: checks have equal shares of the budget, beside that of a fit."""

@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.doctor.base import RecordingView
-from calib.doctor.checks import BUDGET, Seen, exceeds, positive, stretches
-from calib.doctor.levels import DOF, OF_MEDIAN, Levels, levels
-from calib.doctor.pairs import standing_still
+from calib.checks.levels import DOF, OF_MEDIAN, Levels, levels
+from calib.checks.pairs import standing_still
+from calib.checks.recording_view import RecordingView
+from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
 from uwblink.arrays import Floats
 
 OPEN: Final = "pairs that do not close"
@@ -44,14 +44,14 @@ class OpenPair:
     p_value: float
 
 
-def closures(view: RecordingView) -> Iterator[Seen]:
+def closures(view: RecordingView) -> Iterator[Candidate]:
     """Pairs whose level the delays of their tags do not explain, with the worst closure around four tags."""
     known = levels(view)
     if known is None:
         return
     for one in open_pairs(known, TOLERANCE_M + (CURVE_M if standing_still(view) is not None else 0.0)):
         names, way = " or ".join(known.named(pair) for pair in one.pairs), "long" if one.offset_m > 0 else "short"
-        yield Seen(
+        yield Candidate(
             OPEN,
             f"ranges of pair {names} are {100 * abs(one.offset_m):.1f} cm too {way} for "
             f"the delays of their tags{_around(known, one.pairs[0])}",
@@ -59,7 +59,7 @@ def closures(view: RecordingView) -> Iterator[Seen]:
         )
 
 
-def astray(view: RecordingView) -> Iterator[Seen]:
+def astray(view: RecordingView) -> Iterator[Candidate]:
     """Pairs whose ranges and true distances have little to do with each other."""
     known = levels(view)
     if known is None:
@@ -74,7 +74,7 @@ def astray(view: RecordingView) -> Iterator[Seen]:
             least = min(least, p_value)
     if told:
         more = f" and {len(told) - NAMED} pairs more" if len(told) > NAMED else ""
-        yield Seen(
+        yield Candidate(
             ASTRAY,
             f"ranges of pairs {', '.join(told[:NAMED])}{more} differ on average, each pair's median aside",
             least,

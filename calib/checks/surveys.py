@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 
 from calib.data.sources import Data
-from calib.doctor.checks import Seen
 from calib.errors import UnanswerableError
+from calib.findings import Candidate
 from calib.surveys.knowledge import Knowledge
 from calib.surveys.network import NARROWEST_DB, in_dbm
 from calib.surveys.recordings import read_surveys
@@ -42,51 +42,51 @@ MANY: Final = 0.1
 """Share of pairs that are believed to be reflected, from which places are worth a change."""
 
 
-def surveyed(recordings: list[Data]) -> Iterator[Seen]:
+def surveyed(recordings: list[Data]) -> Iterator[Candidate]:
     """Yield what a survey of recordings finds wrong: with what is known, with places, with powers."""
     yield from _powers(recordings)
     try:
         found = survey(recordings, regardless=True)
     except UnanswerableError as error:
         yield from _contradicted(read_surveys(recordings, Knowledge()).findings)
-        yield Seen("survey determines nothing", str(error))
+        yield Candidate("survey determines nothing", str(error))
         return
     yield from _contradicted(found.contradictions)
     yield from _weak(found)
 
 
-def _contradicted(found: tuple[Contradiction, ...]) -> Iterator[Seen]:
+def _contradicted(found: tuple[Contradiction, ...]) -> Iterator[Candidate]:
     for one in found:
-        yield Seen(FAULTS[one.kind], one.text.partition("; ")[0])
+        yield Candidate(FAULTS[one.kind], one.text.partition("; ")[0])
 
 
-def _weak(found: SurveyResult) -> Iterator[Seen]:
+def _weak(found: SurveyResult) -> Iterator[Candidate]:
     made = found.calibration.provenance
     if made["undetermined"]:
         who = ", ".join(map(str, made["undetermined"][0]))
-        yield Seen("delays that a survey leaves open", f"the arrangements do not determine the delays of {who}")
+        yield Candidate("delays that a survey leaves open", f"the arrangements do not determine the delays of {who}")
     likely = [one for one in found.reflected if one.chance > 0.5]
     if len(likely) > MANY * made["pairs"]:
         who = ", ".join(f"{one.first}-{one.second} in {one.arrangement}" for one in likely)
-        yield Seen(
+        yield Candidate(
             "many reflected pairs",
             f"{len(likely)} of {made['pairs']} pairs are believed to be reflected: {who}",
         )
     if found.second_best is not None and found.second_best.ambiguous:
         who = ", ".join(map(str, found.second_best.tags))
-        yield Seen(
+        yield Candidate(
             "two solutions of a survey",
             f"{found.second_best.arrangement}: boards {who} could as well be elsewhere",
         )
 
 
-def _powers(recordings: list[Data]) -> Iterator[Seen]:
+def _powers(recordings: list[Data]) -> Iterator[Candidate]:
     try:
         lifted = read_surveys(recordings, Knowledge()).means.lifted
     except UnanswerableError:
         return
     if np.isfinite(lifted).all() and (lifted > 0).all() and np.ptp(in_dbm(lifted)) < NARROWEST_DB:
-        yield Seen(
+        yield Candidate(
             "powers that hardly vary",
             f"mean powers of pairs lie within {np.ptp(in_dbm(lifted)):.1f} dB, and a curve over power needs "
             f"{NARROWEST_DB:g}",

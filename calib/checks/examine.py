@@ -1,24 +1,23 @@
 """Names the fault in a recording, with the evidence and the remedy.
 
-Each examination is a row of the table of checks (`calib.doctor.table`). Those that suspect the truth (poses, lever
+Each examination is a row of the table of checks (`calib.checks.table`). Those that suspect the truth (poses, lever
 arms, ids, clocks) work by trial: they undo the suspected fault, and if the ranges then agree better with the distances,
 it was there; of several, the one that explains most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from calib.checks import clocks, closures, geometry, pairs, reflected, several, stamps, steps, surveys, units
+from calib.checks.recording_view import Looked, RecordingView, chosen, looked_at
+from calib.checks.table import BETWEEN, CHECKS, GEOMETRY, GROSS, LEVEL, RADIO, ROWS, STRUCTURE, SURVEYS
 from calib.data.sources import Data, each, opened
-from calib.doctor import anchors, clocks, closures, pairs, radio, reflected, several, steps, surveys, timestamps, units
-from calib.doctor.base import Finding, RecordingView, chosen
-from calib.doctor.checks import Check, Seen
-from calib.doctor.long_recordings import Looked, looked_at
-from calib.doctor.table import BETWEEN, CHECKS, GEOMETRY, GROSS, LEVEL, RADIO, ROWS, STRUCTURE, SURVEYS, certain
+from calib.findings import Check, Finding
 from uwblink.recording.distances import distances_m
 from uwblink.recording.target_reports import differences, repeated_rows, single_reports
 from uwblink.twr import raw_range
@@ -47,27 +46,17 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
         if view is not None and not {finding.fault for finding in found} & GROSS_FAULTS:
             views.append(view)
     if len(views) > 1:
-        between = _told(BETWEEN, several.compared(views, LEVEL))
+        between = BETWEEN.findings(several.compared(views, LEVEL), LEVEL)
         # What moved between two recordings is no fault of either one.
         moved = any(finding.fault == several.MOVED_ANCHOR for finding in between)
-        findings = [one for one in findings if not (moved and one.fault == anchors.ELSEWHERE)] + between
+        findings = [one for one in findings if not (moved and one.fault == geometry.ELSEWHERE)] + between
     if views and len(views) == len(recordings) and all(view.standing for view in views):
-        findings += _told(SURVEYS, surveys.surveyed(recordings))
+        findings += SURVEYS.findings(surveys.surveyed(recordings), LEVEL)
     return sorted(findings, key=lambda finding: ORDER.index(finding.fault))
 
 
-def _told(check: Check, seen: Iterable[Seen]) -> list[Finding]:
-    """Return what a check has seen and sound data hardly show, with what to do."""
-    return [
-        Finding(one.fault, one.evidence, check.remedies[one.fault].format(**one.words), one.p_value)
-        for one in seen
-        if certain(one)
-    ]
-
-
-def _run(checks: Sequence[Check], view: RecordingView) -> Iterator[Finding]:
-    for check in checks:
-        yield from _told(check, check.look(view))
+def _run(checks: Sequence[Check], view: RecordingView) -> list[Finding]:
+    return [finding for check in checks for finding in check.findings(check.look(view), LEVEL)]
 
 
 def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
@@ -79,10 +68,10 @@ def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
         return [Finding(EMPTY, "the recording holds no exchanges", "record or import some", 0.0)], None
     view = replace(_admitted(name, looked), arrangements=marked)
     for check in GROSS:
-        if gross := _told(check, check.look(view)):
+        if gross := check.findings(check.look(view), LEVEL):
             return gross, None
-    findings = list(_run(ROWS, view))
-    bad = timestamps.impossible(view)
+    findings = _run(ROWS, view)
+    bad = stamps.impossible(view)
     if bad.all():
         return findings, None
     view = chosen(view, ~bad)
@@ -90,7 +79,7 @@ def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
         unknown = np.full(len(view.exchanges), np.nan)
         view = replace(view, exchanges=replace(view.exchanges, fpp1_dbm=unknown, fpp2_dbm=unknown))
     # Only stamps that make sense can say something about poses, and only right poses something about radios.
-    findings += _best(view) or list(_run(RADIO, view))
+    findings += _best(view) or _run(RADIO, view)
     findings += _run(STRUCTURE, view)
     found = {finding.fault for finding in findings}
     implied = set[str]().union(*(follows for fault, follows in IMPLIED if fault in found))
@@ -99,9 +88,9 @@ def _examined(data: Data) -> tuple[list[Finding], RecordingView | None]:
 
 def _best(view: RecordingView) -> list[Finding]:
     """Return the fault of poses and lever arms that explains most of the errors."""
-    seen = [(check, [one for one in check.look(view) if certain(one)]) for check in GEOMETRY]
+    seen = [(check, [one for one in check.look(view) if one.p_value < LEVEL]) for check in GEOMETRY]
     check, best = max(seen, key=lambda one: sum(fault.gain for fault in one[1]))
-    return _told(check, best)
+    return check.findings(best, LEVEL)
 
 
 def _admitted(name: str, looked: Looked) -> RecordingView:
@@ -144,8 +133,8 @@ ORDER: Final = (EMPTY, *(fault for check in CHECKS for fault in check.remedies))
 CHANGED: Final = {closures.OPEN, reflected.MANY, reflected.LASTING}
 IMPLIED: Final = (
     # Where nothing moves, every pair has one distance and one power, and the one explains the other.
-    (pairs.STATIC, {radio.CONFOUNDED}),
-    (anchors.ELSEWHERE, {closures.OPEN}),
+    (pairs.STATIC, {pairs.CONFOUNDED}),
+    (geometry.ELSEWHERE, {closures.OPEN}),
     (steps.MOVED, CHANGED),
     (steps.DRIFTED, CHANGED),
     (closures.ASTRAY, {*CHANGED, steps.MOVED, steps.DRIFTED}),

@@ -7,9 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from calib.checks.geometry import MATERIAL
+from calib.checks.recording_view import PLAUSIBLE_M, RecordingView
 from calib.data.ranges import measured_powers
-from calib.doctor.base import PLAUSIBLE_M, RecordingView
-from calib.doctor.checks import MATERIAL, Seen
+from calib.findings import Candidate
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.twr import without_stamps
@@ -37,7 +38,7 @@ REPORTED: Final = "unit of the reported ranges"
 POWER: Final = "unit of the powers"
 
 
-def lengths(view: RecordingView) -> Iterator[Seen]:
+def lengths(view: RecordingView) -> Iterator[Candidate]:
     """Ranges and true distances of which one is many times the other.
 
     The unit is the one that leaves the least between them; where the ranges have no stamps, and none that a radio can
@@ -49,7 +50,7 @@ def lengths(view: RecordingView) -> Iterator[Seen]:
     if np.count_nonzero(good) < FEWEST:
         if bare and far:
             told = f"half of the ranges are longer than {PLAUSIBLE_M:.0f} m, which no UWB radio measures"
-            yield Seen(RANGES, told, words={"unit": "mm"})
+            yield Candidate(RANGES, told, words={"unit": "mm"})
         return
     raw, truth = view.raw_m[good], view.truth_m[good]
     unit = _unit(raw, truth)
@@ -58,14 +59,14 @@ def lengths(view: RecordingView) -> Iterator[Seen]:
         return
     if short is not None:
         told = f"ranges are in {short} if true distances are in m: half of them are longer than {np.median(raw):.0f}"
-        yield Seen(RANGES, told, words={"unit": short})
+        yield Candidate(RANGES, told, words={"unit": short})
         return
     name = POSES if view.posed else TRUTH
     told = (
         f"true distances have a median of {np.median(truth):.6g}, ranges one of {np.median(raw):.6g} m: they agree if "
         f"{'poses' if view.posed else 'true distances'} are in {unit}"
     )
-    yield Seen(name, told, words={"unit": unit, "many": f"{LENGTHS[str(unit)]:g}"})
+    yield Candidate(name, told, words={"unit": unit, "many": f"{LENGTHS[str(unit)]:g}"})
 
 
 def _unit(metres: Floats, others: Floats) -> str | None:
@@ -89,7 +90,7 @@ STILL_M: Final = 0.5
 """Ranges that spread by less are of one distance."""
 
 
-def reported(view: RecordingView) -> Iterator[Seen]:
+def reported(view: RecordingView) -> Iterator[Candidate]:
     """Reported ranges that are another unit than those from the stamps."""
     e = view.exchanges
     with np.errstate(all="ignore"):
@@ -101,14 +102,14 @@ def reported(view: RecordingView) -> Iterator[Seen]:
     for unit, many in LENGTHS.items():
         if abs(found / many - 1) < CLOSE:
             told = f"reported ranges are {found:.5g} times those from the stamps"
-            yield Seen(REPORTED, told, words={"unit": unit})
+            yield Candidate(REPORTED, told, words={"unit": unit})
 
 
 CLOSE: Final = 0.05
 """By which delays of boards may change a range of some metres."""
 
 
-def powers(view: RecordingView) -> Iterator[Seen]:
+def powers(view: RecordingView) -> Iterator[Candidate]:
     """Powers that cannot be dBm at an antenna."""
     e = view.exchanges
     every = np.concatenate([e.fpp1_dbm, e.fpp2_dbm])
@@ -124,4 +125,4 @@ def powers(view: RecordingView) -> Iterator[Seen]:
     )
     told = f"the median power is {middle:+.5g} dBm, where these radios receive -115 to -55; {guess}"
     factor = f"multiply fpp1 and fpp2 by {POWERS[near[0]]:g}" if near else "give fpp1 and fpp2 in dBm"
-    yield Seen(POWER, told, words={"factor": factor})
+    yield Candidate(POWER, told, words={"factor": factor})

@@ -7,8 +7,8 @@ import pytest
 
 import calib
 from benchmarks.flights import Plan, fly
+from calib.checks import examined_part, recording_view
 from calib.data.sources import RecordedSource
-from calib.doctor import examined_part, long_recordings
 from uwblink import Contents, Recording
 from uwblink.recording.distances import distances_m
 
@@ -23,8 +23,8 @@ def flight():
 
 @pytest.fixture
 def written(tmp_path, monkeypatch):
-    monkeypatch.setattr(long_recordings, "MOST", MOST)
-    monkeypatch.setattr(long_recordings, "STRETCHES", STRETCHES)
+    monkeypatch.setattr(recording_view, "MOST", MOST)
+    monkeypatch.setattr(recording_view, "STRETCHES", STRETCHES)
 
     def write(flight):
         Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(tmp_path / "long.uwb")
@@ -35,7 +35,7 @@ def written(tmp_path, monkeypatch):
 
 def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all_poses(flight, written):
     with Recording.open(written(flight)) as recording:
-        looked = long_recordings.looked_at(RecordedSource(recording))
+        looked = recording_view.looked_at(RecordedSource(recording))
     x, every = looked.exchanges, flight.exchanges
     assert looked.count == len(every) == 24_000
     assert len(x) == pytest.approx(MOST, rel=0.02)
@@ -65,8 +65,8 @@ def test_poses_that_are_late_are_found_by_how_much(flight, written):
 
 
 def test_a_short_recording_is_looked_at_as_a_whole(flight, written, monkeypatch):
-    monkeypatch.setattr(long_recordings, "MOST", 24_000)
+    monkeypatch.setattr(recording_view, "MOST", 24_000)
     path = written(flight)
     with Recording.open(path) as recording:
-        assert len(long_recordings.looked_at(RecordedSource(recording)).exchanges) == 24_000
+        assert len(recording_view.looked_at(RecordedSource(recording)).exchanges) == 24_000
     assert examined_part(path) == ""

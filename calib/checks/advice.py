@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
+from calib.checks.recording_view import RecordingView
 from calib.data.ranges import Ranges
-from calib.doctor.base import RecordingView
 from calib.errors import CalibError
-from calib.fitting.fitting import fit
+from calib.estimator.known_distances import Recipe, fit_known_distances
 
 CLEARLY: Final = 0.6
 """One loss is recommended over another when its halves disagree by no more than this share of the other's."""
@@ -52,8 +52,9 @@ def _halves_disagree_ps(view: RecordingView, loss: str) -> float | None:
     found = []
     try:
         for odd in (False, True):
-            known = fit(ranges[order[(stretch % 2 == 1) == odd]].usable(), loss=loss).calibration
-            found.append(known.delays_ns)
+            half = ranges[order[(stretch % 2 == 1) == odd]].usable()
+            known = fit_known_distances(half, Recipe(loss=loss, fixed_ns={}, groups={}))
+            found.append(dict(zip(known.model.tags, known.delays.tolist(), strict=True)))
     except CalibError:
         return None
     apart = np.array([found[0][tag] - found[1][tag] for tag in found[0] if tag in found[1]])

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, lifted_power
-from calib.doctor.base import RecordingView, pair_ids
+from calib.checks.recording_view import RecordingView, pair_ids
 from calib.spread import robust_spread
 from uwblink.arrays import Floats, Ints
 

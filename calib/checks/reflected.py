@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.doctor.advice import advice_on_loss
-from calib.doctor.base import RecordingView
-from calib.doctor.checks import BUDGET, Seen, exceeds, more_often, stretches
-from calib.doctor.levels import Levels, levels
+from calib.checks.advice import advice_on_loss
+from calib.checks.levels import Levels, levels
+from calib.checks.recording_view import RecordingView
+from calib.findings import BUDGET, Candidate, exceeds, more_often, stretches
 from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 
@@ -60,7 +60,7 @@ class Reflected:
     p_value: float
 
 
-def reflections(view: RecordingView) -> Iterator[Seen]:
+def reflections(view: RecordingView) -> Iterator[Candidate]:
     """Pairs whose reflections last, and recordings of which a large share is reflected."""
     known = levels(view)
     if known is None:
@@ -75,7 +75,7 @@ def reflections(view: RecordingView) -> Iterator[Seen]:
         yield from _many(view, known, found)
 
 
-def _many(view: RecordingView, known: Levels, found: list[Reflected]) -> Iterator[Seen]:
+def _many(view: RecordingView, known: Levels, found: list[Reflected]) -> Iterator[Candidate]:
     counts = np.bincount(known.pair, minlength=len(known.level))
     share = float(np.sum([one.share * counts[one.pair] for one in found]) / counts.sum())
     long = np.zeros(len(known.rest))
@@ -92,10 +92,12 @@ def _many(view: RecordingView, known: Levels, found: list[Reflected]) -> Iterato
             f"about {100 * share:.0f} % of the ranges are longer than noise explains, by {100 * detour:.0f} cm on "
             "average"
         )
-        yield Seen(MANY, told, p_value, {"more": f"move antennas away from bodies and walls{advice_on_loss(view)}"})
+        yield Candidate(
+            MANY, told, p_value, {"more": f"move antennas away from bodies and walls{advice_on_loss(view)}"}
+        )
 
 
-def _of_tags(view: RecordingView) -> Iterator[Seen]:
+def _of_tags(view: RecordingView) -> Iterator[Candidate]:
     """Where pairs have a few ranges each: the tags of whose ranges many more are reflected than of the others'."""
     e, good = view.exchanges, np.isfinite(view.error_m)
     if np.count_nonzero(good) < FEWEST_IN_ALL:
@@ -119,7 +121,7 @@ def _of_tags(view: RecordingView) -> Iterator[Seen]:
             told.append(f"tag {tag}: {100 * np.mean(long[mine]):.0f} % of its ranges, by {100 * detour:.0f} cm")
     if long.any():
         detour = float(np.mean(rest[long])) - centre
-        yield Seen(
+        yield Candidate(
             MANY,
             f"about {100 * share:.0f} % of the ranges are longer than noise explains, by {100 * detour:.0f} cm on "
             "average" + "".join(f"; {one}" for one in told),
@@ -143,7 +145,7 @@ def _less_tags(error: Floats, place: Ints, count: int) -> Floats:
     return np.asarray(rest)
 
 
-def _of_lasting(view: RecordingView, known: Levels, lasting: list[Reflected]) -> Seen:
+def _of_lasting(view: RecordingView, known: Levels, lasting: list[Reflected]) -> Candidate:
     worst = sorted(lasting, key=lambda one: -one.share * one.detour_m)
     told = "; ".join(
         f"pair {known.named(one.pair)}: {100 * one.share:.0f} % of its ranges, by {100 * one.detour_m:.0f} cm, for "
@@ -151,7 +153,7 @@ def _of_lasting(view: RecordingView, known: Levels, lasting: list[Reflected]) ->
         for one in worst[:NAMED]
     )
     more = f"; and {len(worst) - NAMED} pairs more" if len(worst) > NAMED else ""
-    return Seen(LASTING, told + more, min(one.p_value for one in lasting), {"advice": advice_on_loss(view)})
+    return Candidate(LASTING, told + more, min(one.p_value for one in lasting), {"advice": advice_on_loss(view)})
 
 
 def reflected(known: Levels, pair: int) -> Reflected | None:

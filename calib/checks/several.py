@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from calib.doctor.anchors import Displaced, displaced, place_m, standing
-from calib.doctor.base import RecordingView
-from calib.doctor.checks import Seen, exceeds
-from calib.doctor.levels import DOF, OF_MEDIAN, levels, variance_of_sum
-from calib.doctor.steps import AGREE, FEWEST_OTHERS, FEWEST_PAIRS, LARGEST_M, TOLERANCE_M
+from calib.checks.geometry import Displaced, displaced, place_m, standing
+from calib.checks.levels import DOF, OF_MEDIAN, levels, variance_of_sum
+from calib.checks.recording_view import RecordingView
+from calib.checks.steps import AGREE, FEWEST_OTHERS, FEWEST_PAIRS, LARGEST_M, TOLERANCE_M
+from calib.findings import Candidate, exceeds
 from uwblink.arrays import Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -23,13 +23,13 @@ APART_M: Final = 0.08
 FEWEST_COMMON: Final = 3
 
 
-def compared(views: Sequence[RecordingView], level: float) -> Iterator[Seen]:
+def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
     """Yield what differs between recordings, each compared with the one before it; `level` is that of a check."""
     moved = {view.name: {one.body: one for one in displaced(view) if one.p_value < level} for view in views}
     for first, second in pairwise(views):
         bodies = _moved(first, second, moved)
         for body, (away, p_value) in bodies.items():
-            yield Seen(
+            yield Candidate(
                 MOVED_ANCHOR,
                 f"{body} stands {np.linalg.norm(away):.2f} m elsewhere ({away[0]:+.2f} {away[1]:+.2f} {away[2]:+.2f} m"
                 f") in {second.name} than in {first.name}, by its ranges and the places that the recordings give it",
@@ -57,7 +57,7 @@ def _moved(
     return found
 
 
-def _other_delays(first: RecordingView, second: RecordingView, but: set[int]) -> Iterator[Seen]:
+def _other_delays(first: RecordingView, second: RecordingView, but: set[int]) -> Iterator[Candidate]:
     """Yield tags all of whose pairs read otherwise, beside what all tags of both recordings share."""
     change = _changes(first, second)
     tags = sorted({tag for ends in change for tag in ends} - but)
@@ -72,7 +72,7 @@ def _other_delays(first: RecordingView, second: RecordingView, but: set[int]) ->
         tag = min(sure, key=lambda t: (sure[t][1], -abs(sure[t][0])))
         size, p_value = sure[tag]
         alike = "all its pairs alike" if sum(tag in ends for ends in known) > 1 else "its only pair"
-        yield Seen(
+        yield Candidate(
             OTHER_DELAY,
             f"ranges of tag {tag} are {100 * size:+.1f} cm longer in {second.name} than in {first.name} "
             f"({2e9 * abs(size) / SPEED_OF_LIGHT:.2f} ns in its delay), {alike}, others are not",

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from calib.doctor.base import RecordingView
-from calib.doctor.checks import Seen, exceeds
-from calib.doctor.levels import DOF, Levels, levels
+from calib.checks.levels import DOF, Levels, levels
+from calib.checks.recording_view import RecordingView
+from calib.findings import Candidate, exceeds
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
@@ -54,7 +54,7 @@ class Shift:
     drifts: bool
 
 
-def moved_delay(view: RecordingView) -> Iterator[Seen]:
+def moved_delay(view: RecordingView) -> Iterator[Candidate]:
     """Tags whose ranges all shift at one time."""
     known = levels(view)
     if known is None or known.time_s[-1] < SHORTEST_S:
@@ -62,7 +62,7 @@ def moved_delay(view: RecordingView) -> Iterator[Seen]:
     for shift in shifts(known):
         ps = f"{abs(shift.size_m) / SPEED_OF_LIGHT * 2e9:.2f} ns"
         if shift.drifts:
-            yield Seen(
+            yield Candidate(
                 DRIFTED,
                 f"ranges of tag {shift.tag} drift by {100 * shift.size_m:+.1f} cm over the recording ({ps}), all its "
                 "pairs alike, others do not",
@@ -72,7 +72,7 @@ def moved_delay(view: RecordingView) -> Iterator[Seen]:
             continue
         after_s = known.host_s[np.searchsorted(known.time_s, shift.time_s)]
         alike = "all its pairs alike" if len(known.pairs_of(shift.tag)) > 1 else "its only pair"
-        yield Seen(
+        yield Candidate(
             MOVED,
             f"ranges of tag {shift.tag} shift by {100 * shift.size_m:+.1f} cm {after_s:.0f} s after the start "
             f"({ps} in its delay), {alike}, others do not",

@@ -1,0 +1,160 @@
+"""Checks of who ranges with whom, of motion, and of powers that say nothing beside distances."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from calib.calibration.power_curves import ALPHA_DBM, lifted_power
+from calib.checks.recording_view import RecordingView, pair_ids
+from calib.data.ranges import measured_powers
+from calib.estimator.identifiability import identifiable_directions, square_of
+from calib.findings import Candidate, more_often
+from uwblink.arrays import Floats, Ints
+from uwblink.recording.summary import failures_by_pair
+from uwblink.twr import delay_weights
+
+STATIC: Final = "static data"
+STILL_M: Final = 0.1
+"""Distances that change by less are one distance: two wavelengths, over which power hardly varies."""
+
+MOSTLY: Final = 0.5
+"""A tag that answers half of the time is at the edge of its range, and no worse."""
+
+
+def pairs(view: RecordingView) -> Iterator[Candidate]:
+    """Pairs that leave antenna delays undetermined."""
+    e = view.exchanges
+    with np.errstate(all="ignore"):
+        first, second = delay_weights(e)
+    good = np.isfinite(first) & np.isfinite(second)
+    if not good.any():
+        return
+    tags = sorted({*e.initiator[good].tolist(), *e.target[good].tolist()})
+    square, ends = square_of(tags, e.initiator[good], e.target[good], first[good], second[good])
+    _, free = identifiable_directions(square, tags, ends)
+    if free:
+        groups = "; ".join(", ".join(map(str, group)) for group in free)
+        yield Candidate("too few pairs", f"the pairs do not determine the delays of tags {groups}")
+
+
+def silent(view: RecordingView) -> Iterator[Candidate]:
+    """A tag whose exchanges nearly all fail, where those of others do not."""
+    e = view.exchanges
+    failed = failures_by_pair(view.faults)
+    tags = sorted({t.tag for t in view.tags})
+    for tag in sorted(tags, key=lambda tag: -sum(n for pair, n in failed.items() if tag in pair)):
+        bad = sum(n for pair, n in failed.items() if tag in pair)
+        done = int(np.count_nonzero((e.initiator == tag) | (e.target == tag)))
+        # What fails with a dead tag is no fault of the other one.
+        failed = {pair: n for pair, n in failed.items() if tag not in pair or bad <= done}
+        others, others_bad = len(e) - done, sum(n for pair, n in failed.items() if tag not in pair)
+        if others + others_bad:
+            usual = max(MOSTLY, others_bad / (others + others_bad))
+            p_value = more_often(bad, bad + done, usual, tried=len(tags))
+            told = f"tag {tag} took part in {done} exchanges, {bad} failed"
+            yield Candidate("dead or deaf tag", told, p_value, {"tag": tag})
+
+
+def standing_still(view: RecordingView) -> float | None:
+    """Return the largest change of a pair's distance, metres, where none changes by more than `STILL_M`, else None."""
+    pair = pair_ids(view.exchanges)
+    good = np.isfinite(view.truth_m)
+    spans = [float(np.ptp(view.truth_m[good & (pair == p)])) for p in np.unique(pair[good])]
+    return max(spans) if spans and max(spans) < STILL_M else None
+
+
+def still(view: RecordingView) -> Iterator[Candidate]:
+    """Tags that keep their distances."""
+    span = standing_still(view)
+    if span is not None:
+        yield Candidate(STATIC, f"no distance changes by more than {100 * span:.0f} cm")
+
+
+def no_truth(view: RecordingView) -> Iterator[Candidate]:
+    """Exchanges without a true distance."""
+    known = float(np.mean(np.isfinite(view.truth_m)))
+    if known < 0.5 and not view.standing:
+        yield Candidate(
+            "no true distances",
+            f"{100 * known:.0f} % of the exchanges have one: poses are missing or do not cover the recording",
+        )
+
+
+CONFOUNDED: Final = "power confounded with distance"
+EXPLAINED: Final = 0.8
+"""Share of the power's variance that distance may explain: beyond, what is fitted over power has more than five times
+the variance that it would have alone (variance inflation, Marquardt 1970)."""
+
+FROM_DISTANCE: Final = 0.5
+"""Share of the readings' variance, noise and all, below which it is not distance that powers are made of."""
+
+SHORTEST_M: Final = 0.5
+"""Distances that vary less than this cannot explain a power."""
+
+FEWEST: Final = 300
+ENOUGH: Final = 5000
+"""Of more ranges, only every so many are looked at."""
+
+GROUPS: Final = 40
+
+
+def unpowered(view: RecordingView) -> Iterator[Candidate]:
+    """Exchanges without a first-path power at either end, of which no curve can be fitted."""
+    e = view.exchanges
+    known = float(np.mean(np.isfinite(measured_powers(e.fpp1_dbm)) | np.isfinite(measured_powers(e.fpp2_dbm))))
+    if known < 0.5:
+        yield Candidate("no powers", f"{100 * known:.0f} % of the exchanges have a first-path power")
+
+
+def confounded(view: RecordingView) -> Iterator[Candidate]:
+    """Power that is a function of distance and nothing else lets the curve learn distance.
+
+    What readings scatter is no power that varies, and is taken off; so is what groups of distances explain by chance,
+    as powers of a pair within `TURNED_S` are nearly one (adjusted share).
+    """
+    e = view.exchanges
+    lifted = lifted_power(e.fpp1_dbm, e.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
+    rows = np.flatnonzero(np.isfinite(lifted) & np.isfinite(view.truth_m) & (view.truth_m > 0))
+    rows = rows[np.argsort(e.time_ns[rows], kind="stable")]
+    if len(rows) < FEWEST or np.ptp(view.truth_m[rows]) < SHORTEST_M:
+        return
+    every, shares = rows[:: max(len(rows) // ENOUGH, 1)], []
+    seconds = e.time_ns[rows] // round(TURNED_S * 1e9)
+    alone = len(np.unique(np.column_stack([pair_ids(e)[rows], seconds]), axis=0))
+    # Lifted powers near the antennas outweigh all others, their decibels do not; either way is too much.
+    for power in (lifted, np.log(lifted)):
+        noise = _noise(view, power, rows)
+        share = _explained(power[every], view.truth_m[every], noise)
+        if _explained(power[every], view.truth_m[every], 0.0) > FROM_DISTANCE:
+            shares.append(1 - (1 - share) * (alone - 1) / max(alone - GROUPS, 1))
+    if max(shares, default=0.0) > EXPLAINED:
+        yield Candidate(CONFOUNDED, f"distance explains {100 * max(shares):.0f} % of the power's variance")
+
+
+def _explained(power: Floats, truth_m: Floats, noise: float) -> float:
+    """Return the share of the variance of powers (n,), without that of their noise, between groups of one distance."""
+    groups = np.array_split(power[np.argsort(truth_m, kind="stable")], GROUPS)
+    within = float(np.mean([np.var(group) for group in groups]))
+    between = float(np.var([np.mean(group) for group in groups]))
+    return between / max(between + max(within - noise, 0.0), 1e-300)
+
+
+def _noise(view: RecordingView, power: Floats, rows: Ints) -> float:
+    """Return the variance of readings' noise in powers (n,), from readings of a pair that follow each other at once."""
+    e = view.exchanges[rows]
+    pair, time_s = pair_ids(e), e.time_ns * 1e-9
+    order = np.lexsort((time_s, pair))
+    together = (np.diff(pair[order]) == 0) & (np.diff(time_s[order]) < AT_ONCE_S)
+    if np.count_nonzero(together) < FEWEST // 3:
+        return 0.0
+    return float(np.mean(np.diff(power[rows][order])[together] ** 2)) / 2
+
+
+TURNED_S: Final = 2.0
+"""In which a robot turns, and its antenna has another gain."""
+
+AT_ONCE_S: Final = 0.2
+"""In which a robot turns its antenna by a few degrees."""
