@@ -20,7 +20,7 @@ CONFINED = {
     "typer": lambda path: "/cli/" in path,
     "rich": lambda path: "/cli/" in path,
     "duckdb": lambda path: path.startswith("uwblink/") or path in {"uwbsim/sweep/results.py", "uwbsim/tables.py"},
-    "pydantic": lambda path: path.startswith("uwbsim/"),
+    "pydantic": lambda path: path.startswith(("uwbsim/", "calib/calibration/")),
     "threadpoolctl": lambda path: (
         path
         in {

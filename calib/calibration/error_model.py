@@ -13,11 +13,13 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr
 
+from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from calib.range_errors.densities import ROOT_2PI, LongDetours, densities
@@ -28,9 +30,9 @@ from uwblink.arrays import Floats, Ints
 class PairErrors:
     """Factors of a pair of tags on what is common: noise, odds of a reflection, mean of the exponential detour."""
 
-    noise: float
-    odds: float
-    detour: float
+    noise: Positive
+    odds: Positive
+    detour: Positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,19 +55,19 @@ class ErrorModel:
     others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0.
     """
 
-    lifted: tuple[float, ...]
-    noise_m: tuple[float, ...]
-    tail_share: tuple[float, ...]
-    least_m: float
-    detour_m: float
-    outlier_share: float
-    outlier_m: float
-    location_m: float = 0.0
-    scale: float = 1.0
-    levels: tuple[tuple[float, float], ...] = ()
-    long_share: float = 0.0
-    long_factor: float = 1.0
-    pairs: dict[str, PairErrors] = field(default_factory=dict)
+    lifted: tuple[Number, ...]
+    noise_m: tuple[Positive, ...]
+    tail_share: tuple[OpenShare, ...]
+    least_m: StdM
+    detour_m: StdM
+    outlier_share: Share
+    outlier_m: StdM
+    location_m: Metres = 0.0
+    scale: Positive = 1.0
+    levels: tuple[tuple[Share, Share], ...] = ()
+    long_share: Share = 0.0
+    long_factor: Positive = 1.0
+    pairs: dict[PairName, PairErrors] = field(default_factory=dict)
 
     @property
     def long(self) -> LongDetours:
@@ -199,6 +201,15 @@ class ErrorModel:
         found = np.full(len(asked), len(codes), dtype=np.int64)
         found[known] = order[place[known]]
         return found
+
+
+def _mistake(model: ErrorModel) -> str:
+    sizes = len(model.lifted) == len(model.noise_m) == len(model.tail_share) > 1
+    good = sizes and all(one < two for one, two in pairwise(model.lifted))
+    return "" if good else "lifted: expected ascending powers, with as many noises and shares"
+
+
+CheckedErrors = Annotated[ErrorModel, joint(_mistake)]
 
 
 class ErrorsAtOnce:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,10 +14,10 @@ import numpy as np
 import yaml
 
 from calib.calibration.c_header import c_header
-from calib.calibration.document import curve_table, finite, is_tag
+from calib.calibration.document import finite
 from calib.calibration.error_model import ErrorModel
 from calib.calibration.model import Calibration, require_calibration
-from calib.calibration.power_curves import ALPHA_DBM, Curve
+from calib.calibration.power_curves import ALPHA_DBM
 from calib.data.sources import antenna_delays_in
 from calib.errors import BadInputError
 from uwblink.output import write_text
@@ -141,7 +142,7 @@ def _miluv(calibration: Calibration) -> str:
     original = calibration.provenance.get("miluv")
     document = dict(original) if isinstance(original, dict) else {}
     document["delays_ns"] = {str(t): d for t, d in sorted(calibration.delays_ns.items())}
-    for key, curve in (("bias_spline_m", calibration.bias_curve), ("std_spline_m", calibration.sigma_curve)):
+    for key, curve in zip(CURVES_OF_MILUV, (calibration.bias_curve, calibration.sigma_curve), strict=True):
         document[key] = {"knots": list(curve.knots), "coeffs": list(curve.coefficients), "degree": curve.degree}
     document.setdefault("tx_rx_split", {"tx": TX_SHARE, "rx": round(1 - TX_SHARE, 2)})
     document.setdefault("c_mps", SPEED_OF_LIGHT)
@@ -161,8 +162,8 @@ def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
         "lift": calibration.lift,
         "power_at": calibration.power_at,
         "tags": tags,
-        "bias_curve": curve_table(calibration.bias_curve),
-        "sigma_curve": curve_table(calibration.sigma_curve),
+        "bias_curve": asdict(calibration.bias_curve),
+        "sigma_curve": asdict(calibration.sigma_curve),
     }
     if calibration.errors:
         document["errors"] = _error_tables(calibration.errors)
@@ -241,6 +242,9 @@ def export(
     return text
 
 
+CURVES_OF_MILUV: Final = ("bias_spline_m", "std_spline_m")
+
+
 def read_miluv(path: Path) -> Calibration:
     """Read the JSON form of MILUV's published calibration; raises `BadInputError`.
 
@@ -251,39 +255,35 @@ def read_miluv(path: Path) -> Calibration:
     text = read_text(path, BadInputError, "calibration of MILUV (.json)")
     try:
         table = json.loads(text, parse_float=finite, parse_constant=finite)
-        delays = {_tag(tag): float(delay) for tag, delay in table["delays_ns"].items()}
-        bias, sigma = (_curve(table[key]) for key in ("bias_spline_m", "std_spline_m"))
-        speed = float(table.get("c_mps", SPEED_OF_LIGHT))
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        bias, sigma = (_curve_table(table[key]) for key in CURVES_OF_MILUV)
+        document = {
+            "schema_version": 3,
+            "delays_ns": table["delays_ns"],
+            "delays_std_ns": {},
+            "loss": "cauchy",
+            "scale_ns": 0.1,
+            "lift": "mean-of-lifted",
+            "alpha_dbm": ALPHA_DBM,
+            "speed_of_light": table.get("c_mps", SPEED_OF_LIGHT),
+            "bias_curve": bias,
+            "sigma_curve": sigma,
+            "power_at": "reception",
+            "antenna_delays": {tag: AntennaDelay()._asdict() for tag in table["delays_ns"]},
+            "provenance": {
+                "imported_from": path.name,
+                "miluv": table | dict.fromkeys(("delays_ns", *CURVES_OF_MILUV)),
+            },
+        }
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
         raise BadInputError(f"{path}: not a MILUV calibration ({type(error).__name__}: {error!s:.200})") from error
-    rest = {key: value for key, value in table.items() if key not in ("delays_ns", "bias_spline_m", "std_spline_m")}
-    order = list(table)
-    found = Calibration(
-        delays_ns=delays,
-        delays_std_ns={},
-        loss="cauchy",
-        scale_ns=0.1,
-        lift="mean-of-lifted",
-        alpha_dbm=ALPHA_DBM,
-        speed_of_light=speed,
-        bias_curve=bias,
-        sigma_curve=sigma,
-        power_at="reception",
-        antenna_delays=dict.fromkeys(delays, AntennaDelay()),
-        provenance={"imported_from": path.name, "miluv": {key: rest.get(key) for key in order}},
-    )
-    return Calibration.from_json(found.to_json(), str(path))
+    return Calibration.from_json(json.dumps(document), str(path))
 
 
-def _tag(text: str) -> int:
-    if not is_tag(text):
-        raise ValueError(f"{text[:40]!r} is no id of a tag")
-    return int(text)
-
-
-def _curve(table: dict[str, Any]) -> Curve:
-    knots = tuple(float(k) for k in table["knots"])
-    coefficients, degree = tuple(float(c) for c in table["coeffs"]), int(table["degree"])
-    if len(knots) != len(coefficients) + degree + 1 or list(knots) != sorted(knots) or knots[0] == knots[-1]:
-        raise ValueError("knots, coeffs and degree do not fit")
-    return Curve(knots, coefficients, degree, (knots[0], knots[-1]))
+def _curve_table(spline: dict[str, Any]) -> dict[str, Any]:
+    knots = spline["knots"]
+    return {
+        "knots": knots,
+        "coefficients": spline["coeffs"],
+        "degree": spline["degree"],
+        "range": [knots[0], knots[-1]],
+    }

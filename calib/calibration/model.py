@@ -8,14 +8,29 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import Any, Final, Literal, Self, overload
+from typing import Annotated, Any, Final, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, PlainSerializer, TypeAdapter
 
 from calib.calibration.applying import RangeCorrector, corrected_ranges
-from calib.calibration.document import fields_of, text_of
-from calib.calibration.error_model import ErrorModel
+from calib.calibration.document import (
+    IN_ORDER,
+    DelayNs,
+    FreeStdNs,
+    Light,
+    PairKey,
+    PowerDbm,
+    StdNs,
+    TagKey,
+    expect,
+    one_of,
+    pair_name,
+    read,
+    write,
+)
+from calib.calibration.error_model import CheckedErrors
 from calib.calibration.parts import (
     CorrectedColumns,
     CorrectedRange,
@@ -23,16 +38,31 @@ from calib.calibration.parts import (
     PairOffset,
     TagGroup,
     Uncertainty,
-    pair_name,
 )
-from calib.calibration.power_curves import Curve, basis, lifted_power
+from calib.calibration.power_curves import LIFTS, BiasCurve, SigmaCurve, basis, lifted_power
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError, UnanswerableError
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats
 from uwblink.output import write_text
-from uwblink.recording.antenna_delays import AntennaDelays
+from uwblink.recording.antenna_delays import REGISTER_MAX, AntennaDelay
 from uwblink.text_files import read_text
+
+
+def _are_registers(table: Any) -> bool:
+    fields = isinstance(table, dict) and set(table) == set(AntennaDelay._fields)
+    return fields and all(type(value) is int and 0 <= value <= REGISTER_MAX for value in table.values())
+
+
+Registers = Annotated[
+    AntennaDelay,
+    expect(
+        f"tx, rx and reply in ticks of a register of 16 bits, 0 to {REGISTER_MAX}",
+        _are_registers,
+        lambda table: AntennaDelay(**table),
+    ),
+    PlainSerializer(AntennaDelay._asdict),
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -49,23 +79,23 @@ class Calibration:
     when they were recorded, which delays are on top of; empty where that is not known.
     """
 
-    delays_ns: dict[int, float]
-    delays_std_ns: dict[int, float]
+    delays_ns: Annotated[dict[TagKey, DelayNs], IN_ORDER]
+    delays_std_ns: Annotated[dict[TagKey, FreeStdNs], IN_ORDER]
     loss: str
-    scale_ns: float
-    lift: str
-    alpha_dbm: float
-    speed_of_light: float
-    bias_curve: Curve
-    sigma_curve: Curve
+    scale_ns: StdNs
+    lift: Annotated[str, one_of(LIFTS)]
+    alpha_dbm: PowerDbm
+    speed_of_light: Light
+    bias_curve: BiasCurve
+    sigma_curve: SigmaCurve
     provenance: dict[str, Any] = field(default_factory=dict)
-    uncertainty: Uncertainty | None = None
+    power_at: Annotated[str, one_of(("exchange", "reception"))] = "exchange"
     groups: dict[str, TagGroup] = field(default_factory=dict)
-    power_at: str = "exchange"
-    errors: ErrorModel | None = None
-    pair_offsets: dict[tuple[int, int], PairOffset] = field(default_factory=dict)
-    antenna_delays: AntennaDelays = field(default_factory=dict)
-    _corrector: RangeCorrector | None = field(default=None, init=False, compare=False)
+    errors: CheckedErrors | None = None
+    pair_offsets: Annotated[dict[PairKey, PairOffset], IN_ORDER] = field(default_factory=dict)
+    antenna_delays: Annotated[Mapping[TagKey | None, Registers], IN_ORDER] = field(default_factory=dict)
+    uncertainty: Uncertainty | None = None
+    _corrector: Annotated[Any, Field(exclude=True)] = field(default=None, init=False, compare=False)
 
     @property
     def stopped(self) -> bool:
@@ -212,12 +242,36 @@ class Calibration:
 
     def to_json(self) -> str:
         """Return the calibration as JSON text."""
-        return text_of(self)
+        return write(self, _ADAPTER)
 
-    @classmethod
-    def from_json(cls, text: str, where: str = "calibration") -> Self:
+    @staticmethod
+    def from_json(text: str, where: str = "calibration") -> Calibration:
         """Read a calibration; raises `BadInputError` that names `where` and the key."""
-        return cls(**fields_of(text, where))
+        found = read(_ADAPTER, text, where)
+        if wrong := _misfit(found):
+            raise BadInputError(f"{where}: uncertainty: {wrong}")
+        return found
+
+
+_ADAPTER: Final = TypeAdapter(Calibration)
+
+
+def _misfit(calibration: Calibration) -> str:
+    """Return what covariance matrices do not fit, "" where all are as large as what they are of."""
+    known = calibration.uncertainty
+    if known is None:
+        return ""
+    sizes = {
+        "delays_ns2": len(known.tags),
+        "bias_m2": len(calibration.bias_curve.coefficients),
+        "sigma_m2": len(calibration.sigma_curve.coefficients),
+    }
+    for name, size in sizes.items():
+        rows = getattr(known, name)
+        # A variance of 0 may come out of a decomposition a little below 0.
+        if len(rows) != size or any(len(row) != size or row[k] < -1e-9 for k, row in enumerate(rows)):
+            return f"{name}: expected {size} rows of {size} numbers, and no variance below 0"
+    return ""
 
 
 def require_calibration(value: object, parameter: str = "calibration") -> None:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from calib.calibration.power_curves import Curve
+from calib.calibration.document import Metres, Number, StdM, number, pair_name
+from calib.calibration.power_curves import BiasCurve, SigmaCurve
 from calib.data.ranges import Ranges
 from calib.errors import BadInputError
 from uwblink.arrays import Bools, Floats
 from uwblink.display import as_text, excerpt
+from uwblink.twr import LARGEST_ID
 
-Matrix = tuple[tuple[float, ...], ...]
+Tags = tuple[Annotated[int, number(0, LARGEST_ID, "the id of a tag", int)], ...]
+
+Matrix = tuple[tuple[Number, ...], ...]
 """A matrix as a tuple of rows."""
 
 
@@ -22,9 +26,9 @@ Matrix = tuple[tuple[float, ...], ...]
 class TagGroup:
     """Tags of one design, and their curves; a range between groups gets the mean of both groups' curves."""
 
-    tags: tuple[int, ...]
-    bias_curve: Curve
-    sigma_curve: Curve
+    tags: Tags
+    bias_curve: BiasCurve
+    sigma_curve: SigmaCurve
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,17 +38,18 @@ class Uncertainty:
     `delays_ns2` (tags, tags) goes with `tags`; `bias_m2` and `sigma_m2` (m, m) go with the coefficients of the curves.
     """
 
-    tags: tuple[int, ...]
+    tags: Tags
     delays_ns2: Matrix
     bias_m2: Matrix
     sigma_m2: Matrix
 
 
-class PairOffset(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class PairOffset:
     """By how much the ranges of a pair are too long, and its standard error, in metres."""
 
-    offset_m: float
-    std_m: float
+    offset_m: Metres
+    std_m: StdM
 
 
 def offset_of(offsets: Mapping[tuple[int, int], PairOffset], first: int, second: int) -> PairOffset:
@@ -67,11 +72,6 @@ def offsets_m(offsets: Mapping[tuple[int, int], PairOffset], ranges: Ranges) -> 
     pairs, place = np.unique(ends, axis=0, return_inverse=True)
     values = [offset_of(offsets, *pair).offset_m for pair in pairs.tolist()]
     return np.asarray(np.array(values)[place.ravel()])
-
-
-def pair_name(pair: tuple[int, int]) -> str:
-    """Return a pair as files and tables name it: 1-2."""
-    return "-".join(map(str, pair))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from scipy.interpolate import BSpline
 
+from calib.calibration.document import Metres, Number, joint, number
 from uwblink.arrays import Bools, Floats, Ints
 
 ALPHA_DBM: Final = -82.0
@@ -56,10 +57,10 @@ class Curve:
     A flat one has the same value at any power, also where none was measured.
     """
 
-    knots: tuple[float, ...]
-    coefficients: tuple[float, ...]
-    degree: int
-    range: tuple[float, float]
+    knots: tuple[Number, ...]
+    coefficients: tuple[Metres, ...]
+    degree: Annotated[int, number(0, 5, "a degree, 0 to 5", int)]
+    range: tuple[Number, Number]
 
     def __call__(self, lifted: Floats) -> Floats:
         """Return the curve at lifted powers (n,), in metres."""
@@ -90,6 +91,21 @@ class Curve:
         below, above = (ends[1] - ends[0]) / step, (ends[3] - ends[2]) / step
         away = np.abs(below) * np.maximum(low - lifted, 0.0) + np.abs(above) * np.maximum(lifted - high, 0.0)
         return np.asarray(away)
+
+
+def _curve_mistake(curve: Curve) -> str:
+    fits = len(curve.knots) == len(curve.coefficients) + curve.degree + 1 and list(curve.knots) == sorted(curve.knots)
+    good = fits and len(curve.coefficients) > curve.degree and curve.range[0] < curve.range[1]
+    return "" if good else "knots, coefficients, degree, range do not fit"
+
+
+def _negative(curve: Curve) -> str:
+    good = min(curve.coefficients) >= 0 or bool(np.all(curve(np.linspace(*curve.range, 200)) >= 0))
+    return "" if good else "coefficients: expected a standard deviation that is nowhere below 0 m"
+
+
+BiasCurve = Annotated[Curve, joint(_curve_mistake)]
+SigmaCurve = Annotated[BiasCurve, joint(_negative)]
 
 
 def flat_curve(value_m: float, span: tuple[float, float]) -> Curve:

@@ -120,8 +120,9 @@ def test_a_file_gives_it_back_and_files_without_it_open(fitted):
     ("key", "value", "said"),
     [
         ("lifted", [0.1], "errors: lifted"),
-        ("noise_m", [0.0] * 8, "errors: lifted"),
-        ("tail_share", [1.5] * 8, "errors: lifted"),
+        ("noise_m", [0.0] * 8, "errors: noise_m: 0: .*above 0"),
+        ("noise_m", [1.0] * 7, "errors: lifted"),
+        ("tail_share", [1.5] * 8, "errors: tail_share: 0"),
         ("pairs", {"one-two": {}}, "names of pairs"),
         ("pairs", {"1-2": {"noise": 1.0, "odds": 0.0, "detour": 1.0}}, "1-2: odds"),
         ("levels", [[0.1]], "levels"),

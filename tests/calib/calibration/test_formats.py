@@ -214,7 +214,7 @@ def test_numbers_that_are_none_do_not_come_in_with_a_miluv_calibration(tmp_path,
     (tmp_path / "m.json").write_text(good)
     assert read_miluv(tmp_path / "m.json").delays_ns == {1: 0.1}
     (tmp_path / "m.json").write_text(good.replace(old, new))
-    with pytest.raises(BadInputError, match=r"m\.json: not a MILUV calibration"):
+    with pytest.raises(BadInputError, match=r"m\.json: (not a MILUV calibration|delays_ns)"):
         read_miluv(tmp_path / "m.json")
 
 
