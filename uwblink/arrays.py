@@ -7,17 +7,73 @@ expected.
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NoReturn, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uwblink.display import as_html, as_text, excerpt
 from uwblink.errors import ArgumentError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Complexes = NDArray[np.complex128]
+
+
+class ColumnTable:
+    """Base of dataclasses whose fields are columns of length n, one of them `time_ns`; other fields hold for all rows.
+
+    A derived class defines `to_dict`, which names its columns for data frames, and `_title`.
+    """
+
+    __slots__ = ()
+    time_ns: Ints
+
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        fields: dict[str, Any] = self.__dataclass_fields__  # type: ignore[attr-defined]
+        found = {name: getattr(self, name) for name in fields}
+        return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.time_ns)
+
+    def __getitem__(self, rows: int | slice | Bools | Ints) -> Self:
+        """Return the chosen rows, in their order; one row for a number."""
+        chosen = [rows] if isinstance(rows, int | np.integer) else rows
+        columns: dict[str, Any] = {name: column[chosen] for name, column in self._columns().items()}
+        return replace(self, **columns)  # type: ignore[type-var]
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Return the rows of one or more tables as one table; what holds for all rows is that of the first."""
+        columns: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in parts[0]._columns()}
+        return replace(parts[0], **columns)  # type: ignore[type-var]
+
+    def in_time_order(self) -> Self:
+        """Return the rows in ascending order of `time_ns`; rows of equal times stay in their order."""
+        return self if np.all(np.diff(self.time_ns) >= 0) else self[np.argsort(self.time_ns, kind="stable")]
+
+    def to_dict(self) -> dict[str, NDArray[Any]]:
+        """Return the columns by name, (n,) each."""
+        return self._columns()
+
+    def _title(self) -> str:
+        raise NotImplementedError
+
+    def _shown(self) -> dict[str, NDArray[Any]]:
+        return self.to_dict()
+
+    def __repr__(self) -> str:
+        """Return a headline and the first rows, in lines of 79 characters."""
+        return as_text(self._title(), excerpt(self._shown()))
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook, with every column."""
+        return as_html(self._title(), excerpt(self._shown()))
 
 
 def length(name: str, values: ArrayLike) -> int:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__: Final = ["as_html", "as_text", "cut", "excerpt", "first_few", "printable"]
 
@@ -66,4 +66,4 @@ def first_few(items: Iterable[str], most: int = SHOWN_ROWS) -> str:
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float | np.floating) else cut(printable(value), 20)
+    return f"{value:.4g}" if isinstance(value, float) else cut(printable(value), 20)

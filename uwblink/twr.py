@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uwblink import arrays
-from uwblink.arrays import Bools, Floats, Ints
-from uwblink.display import as_html, as_text, excerpt, first_few
+from uwblink.arrays import Bools, ColumnTable, Floats, Ints
+from uwblink.display import first_few
 from uwblink.errors import ArgumentError
 from uwblink.protocols.rows import Intervals, RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
@@ -24,8 +24,8 @@ from uwblink.ticks import COUNTER_BITS, METRES_PER_TICK, REPORT_BITS, SPEED_OF_L
 STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Exchanges:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Exchanges(ColumnTable):
     """Ranging exchanges as columns of length n.
 
     `protocol` holds keys of `PROTOCOLS`. Stamps are ticks modulo 2**`bits`, zero where the protocol
@@ -52,15 +52,6 @@ class Exchanges:
     skew2_ppm: Floats
     truth_m: Floats
     bits: int = REPORT_BITS
-
-    def __len__(self) -> int:
-        """Return the number of exchanges."""
-        return len(self.time_ns)
-
-    def __getitem__(self, rows: int | slice | Bools | Ints) -> Exchanges:
-        """Return the chosen rows, in their order; one row for a number."""
-        chosen = [rows] if isinstance(rows, int | np.integer) else rows
-        return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
 
     @classmethod
     def from_arrays(  # noqa: PLR0913 - one parameter a column, most of which nobody needs to give
@@ -137,15 +128,7 @@ class Exchanges:
         >>> [*x.to_dict()][:5], x.to_dict()["rx2"].tolist()
         (['time_ns', 'initiator', 'target', 'protocol', 'reporter'], [3000])
         """
-        return {name: getattr(self, name) for name in COLUMNS}
-
-    def __repr__(self) -> str:
-        """Return a headline and the first rows, in lines of 79 characters."""
-        return as_text(self._title(), excerpt(self._shown()))
-
-    def _repr_html_(self) -> str:
-        """Return the same for a notebook, with every column."""
-        return as_html(self._title(), excerpt(self._shown()))
+        return self._columns()
 
     def _title(self) -> str:
         ends = np.unique(np.column_stack([self.initiator, self.target]), axis=0)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from uwblink.protocols.rows import Intervals
 from uwblink.protocols.table import PROTOCOLS, is_single_sided
 from uwblink.recording import IMPOSSIBLE_PPM, target_faster_ppm
 from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
-from uwblink.twr import COLUMNS, Exchanges, intervals, names_in, without_stamps
+from uwblink.twr import Exchanges, intervals, names_in, without_stamps
 
 PPM_TO_METRES: Final = 0.5 * SPEED_OF_LIGHT * 1e-6
 """What a ppm of clock skew changes in a single-sided range per second of reply time: half of c times a ppm."""
@@ -78,8 +78,7 @@ class ClockSample:
         parts = [part[draws < self._share()] for part, draws in zip(self._parts, self._draws, strict=True)]
         if not sum(map(len, parts)):
             return None
-        joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
-        return _farthest_pair(replace(parts[0], **joined))
+        return _farthest_pair(Exchanges.concatenate(parts))
 
 
 def _comparable(exchanges: Exchanges) -> Bools:

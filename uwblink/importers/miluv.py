@@ -286,13 +286,8 @@ def _with_anchors(
     anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in numbers]
     begins = int(poses.time_ns.min()) if len(poses) else 0
     position = np.array([places[number] for number in numbers], dtype=np.float64).reshape(-1, 3)
-    joined = Poses(
-        np.concatenate([poses.time_ns, np.full(len(numbers), begins)]),
-        np.concatenate([poses.body, np.array([tag.body for tag in anchors], dtype=np.str_)]),
-        np.concatenate([poses.position_m, position]),
-        np.concatenate([poses.quaternion, np.tile([0.0, 0.0, 0.0, 1.0], (len(numbers), 1))]),
-    )
-    return joined[np.argsort(joined.time_ns, kind="stable")], [*tags, *anchors]
+    standing = Poses.from_arrays([begins] * len(numbers), [tag.body for tag in anchors], position)
+    return Poses.concatenate([poses, standing]).in_time_order(), [*tags, *anchors]
 
 
 def _start_ns(folder: Path) -> int:

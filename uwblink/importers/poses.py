@@ -185,8 +185,7 @@ def _poses(path: Path, time_ns: Ints, body: np.ndarray, values: Floats, place: P
     bad = np.flatnonzero((norm < 0.9) | (norm > 1.1))
     if len(bad):
         raise ImportTableError(f"{path}: pose {bad[0] + 1}: its quaternion has length {norm[bad[0]]:.3g}, expected 1")
-    poses = Poses(time_ns, body, values[:, :3], values[:, 3:] / norm[:, None])
-    return poses if (np.diff(time_ns) >= 0).all() else poses[np.argsort(time_ns, kind="stable")]
+    return Poses(time_ns, body, values[:, :3], values[:, 3:] / norm[:, None]).in_time_order()
 
 
 def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
@@ -364,14 +363,8 @@ def _in_order(parts: list[Poses]) -> Poses:
     if len(parts) == 1:
         return parts[0]
     first = min((int(part.time_ns.min()) for part in parts if len(part) > 1), default=0)
-    times = [part.time_ns if len(part) > 1 else np.full(len(part), first) for part in parts]
-    order = np.argsort(np.concatenate(times), kind="stable")
-    return Poses(
-        np.concatenate(times)[order],
-        np.concatenate([part.body for part in parts])[order],
-        np.concatenate([part.position_m for part in parts])[order],
-        np.concatenate([part.quaternion for part in parts])[order],
-    )
+    moved = [part if len(part) > 1 else replace(part, time_ns=np.full(len(part), first)) for part in parts]
+    return Poses.concatenate(moved).in_time_order()
 
 
 def _offset_ns(text: str) -> int:

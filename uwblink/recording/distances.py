@@ -138,8 +138,7 @@ class PoseWindows:
                 bodies.append(np.full(len(times[-1]), body))
                 columns.append(np.column_stack([column[low:high] for column in track.columns]))
         time_ns, found = np.concatenate(times), np.concatenate(columns)
-        poses = Poses(time_ns, np.concatenate(bodies), found[:, :3], found[:, 3:])
-        return poses[np.argsort(time_ns, kind="stable")]
+        return Poses(time_ns, np.concatenate(bodies), found[:, :3], found[:, 3:]).in_time_order()
 
 
 def distances_m(poses: Poses | Tracks, tags: Sequence[Tag], initiator: Ints, target: Ints, time_ns: Ints) -> Floats:

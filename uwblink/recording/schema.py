@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uwblink import __version__, arrays
-from uwblink.arrays import Bools, Floats, Ints
-from uwblink.display import as_html, as_text, excerpt, first_few, printable
+from uwblink.arrays import ColumnTable, Floats, Ints
+from uwblink.display import first_few, printable
 from uwblink.ticks import ANTENNA_DELAY_TICKS, REPORT_BITS, SPEED_OF_LIGHT, TICKS_PER_SECOND
 from uwblink.twr import COLUMNS, LATEST_NS
 
@@ -112,8 +112,8 @@ class Tag:
     lever_arm_m: tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Poses:
+@dataclass(frozen=True, slots=True, repr=False)
+class Poses(ColumnTable):
     """Poses of bodies as columns of length n, in order of time.
 
     `position_m` (n, 3) is r_iw_a, the body's position resolved in the world frame (ENU);
@@ -124,14 +124,6 @@ class Poses:
     body: NDArray[np.str_]
     position_m: Floats
     quaternion: Floats
-
-    def __len__(self) -> int:
-        """Return the number of poses."""
-        return len(self.time_ns)
-
-    def __getitem__(self, rows: slice | Bools | Ints) -> Poses:
-        """Return the chosen rows, in their order."""
-        return Poses(self.time_ns[rows], self.body[rows], self.position_m[rows], self.quaternion[rows])
 
     @classmethod
     def from_arrays(
@@ -152,10 +144,8 @@ class Poses:
         attitude = arrays.vectors("quaternion", (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion, count, 4)
         norm = np.linalg.norm(attitude, axis=1)
         arrays.reject("quaternion", attitude, (norm < 0.9) | (norm > 1.1), "x y z w of length 1")
-        poses = cls(
-            time, arrays.words("body", body, count), arrays.vectors("position_m", position_m, count, 3), attitude
-        )
-        return replace(poses, quaternion=attitude / norm[:, None])[np.argsort(time, kind="stable")]
+        position = arrays.vectors("position_m", position_m, count, 3)
+        return cls(time, arrays.words("body", body, count), position, attitude / norm[:, None]).in_time_order()
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
         """Return the columns of the table `poses` by name, (n,) each, as data frames take them.
@@ -166,14 +156,6 @@ class Poses:
         """
         named = {"time_ns": self.time_ns, "body": self.body}
         return named | dict(zip(POSE, (*self.position_m.T, *self.quaternion.T), strict=True))
-
-    def __repr__(self) -> str:
-        """Return a headline and the first rows, in lines of 79 characters."""
-        return as_text(self._title(), excerpt(self.to_dict()))
-
-    def _repr_html_(self) -> str:
-        """Return the same for a notebook."""
-        return as_html(self._title(), excerpt(self.to_dict()))
 
     def _title(self) -> str:
         return f"{len(self)} poses of {first_few(map(printable, np.unique(self.body).tolist()))}"

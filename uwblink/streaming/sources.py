@@ -218,7 +218,7 @@ def _exchanges(path: Path, correct: Correction | None) -> Exchanges:
         found = recording.exchanges()
     if correct and len(found):  # one of each pair, so that what cannot be corrected is told before the first range
         correct(found[np.unique(np.column_stack([found.initiator, found.target]), axis=0, return_index=True)[1]])
-    return found[np.argsort(found.time_ns, kind="stable")]
+    return found.in_time_order()
 
 
 def _play(

@@ -16,7 +16,7 @@ from uwblink.protocols.table import ON_BOARDS
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import CirRow, Fault, FrameRow, Poses, Tag
 from uwblink.ticks import TICK_S, elapsed
-from uwblink.twr import COLUMNS, Exchanges, raw_range
+from uwblink.twr import Exchanges, raw_range
 from uwblink.wire.bulk import ColumnDecoder
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import RangeReport
@@ -173,8 +173,6 @@ def through_wire(simulated: Simulated) -> tuple[Simulated, list[FrameRow]]:
     for frame in frames:
         decoders[frame.board].feed(frame.data, frame.time_ns)
     parts = [d.exchanges() for d in decoders.values()] or [simulated.exchanges]  # nothing was received
-    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
-    order = np.argsort(columns["time_ns"], kind="stable")
-    exchanges = replace(parts[0], **{name: column[order] for name, column in columns.items()})
+    exchanges = Exchanges.concatenate(parts).in_time_order()
     ports = {name.removeprefix("board "): name for name in decoders}
     return replace(simulated, exchanges=exchanges, meta=simulated.meta | {"ports": ports}), frames
