@@ -22,7 +22,7 @@ power = "dBm"              # or "-dBm": without its sign
 from_id = 1
 [ids]                      # numbers for ids that are words or too large
 "AA:01" = 1
-[antenna_delays]           # what was programmed into the devices; zeros where nothing was
+[antenna_delays]           # what was programmed into the devices; write zeros if nothing was
 unit = "ticks"             # or "ns"
 tx = 16436
 rx = 16436
@@ -42,6 +42,7 @@ from typing import Any, Final
 
 from uwblink.errors import ImportTableError
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.recording.antenna_delays import AntennaDelays, read_antenna_delays
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
 from uwblink.ticks import TICKS_PER_SECOND
 from uwblink.twr import BITS, LARGEST_ID, STAMPS
@@ -148,8 +149,6 @@ FILE_KEYS: Final = (
     ),
 )
 KEYS: Final = heads(FILE_KEYS)
-REGISTER_MAX: Final = 65_535
-"""Antenna delays have registers of 16 bits (DW1000 User Manual 2.10, sections 7.2.25 and 7.2.40.4)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,7 +173,7 @@ class ColumnMap:
     power_unit: str | None = None
     constants: dict[str, float | str] = field(default_factory=dict)
     ids: dict[str, int] = field(default_factory=dict)
-    antenna_delays: dict[int | None, dict[str, int]] = field(default_factory=dict)
+    antenna_delays: AntennaDelays = field(default_factory=dict)
     each: str | None = None
     topics: dict[str, dict[str, float | str]] = field(default_factory=dict)
 
@@ -230,7 +229,7 @@ def load_map(path: Path) -> ColumnMap:
         power_unit=file.choice("units.power", units.get("power"), (None, "dBm", "-dBm")),
         constants={name: v if isinstance(v, str) else float(v) for name, v in constants.items()},
         ids=ids,
-        antenna_delays=_antenna_delays(file),
+        antenna_delays=read_antenna_delays(file, {name: STAMP_UNITS[name] for name in ("ticks", "ns")}),
         each=each,
         topics=file.section("topics"),
     )
@@ -255,31 +254,3 @@ def _ticks_per_unit(file: TomlReader, unit: Any) -> float:
     if is_number(unit) and unit > 0:
         return float(unit * TICKS_PER_SECOND)
     return STAMP_UNITS[file.choice("units.stamps", unit, STAMP_UNITS)]
-
-
-def _antenna_delays(file: TomlReader) -> dict[int | None, dict[str, int]]:
-    section = file.section("antenna_delays")
-    if not section:
-        return {}
-    file.known(section, ("unit", "tx", "rx", "tags"), "antenna_delays.")
-    unit = file.choice("antenna_delays.unit", section.get("unit", "ticks"), ("ticks", "ns"))
-    scale = STAMP_UNITS[unit]
-    found: dict[int | None, dict[str, int]] = {None: _registers(file, "antenna_delays", section, scale)}
-    tags = section.get("tags", {})
-    file.check("antenna_delays.tags", tags, isinstance(tags, dict), "a table for each device")
-    for name, row in tags.items():
-        where = f"antenna_delays.tags.{name}"
-        file.check(where, row, isinstance(row, dict) and name.isdecimal(), "a table with tx and rx, named by an id")
-        file.known(row, ("tx", "rx"), f"{where}.")
-        found[int(name)] = _registers(file, where, row, scale)
-    return found
-
-
-def _registers(file: TomlReader, where: str, row: dict[str, Any], scale: float) -> dict[str, int]:
-    found = {}
-    for name in ("tx", "rx"):
-        value = row.get(name, 0)
-        good = is_number(value) and 0 <= value * scale <= REGISTER_MAX
-        file.check(f"{where}.{name}", value, good, f"a delay of 0 to {REGISTER_MAX} ticks")
-        found[name] = round(value * scale)
-    return found

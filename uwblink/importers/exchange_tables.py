@@ -12,10 +12,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from uwblink.importers.stamps import (
 from uwblink.importers.tables import Columns
 from uwblink.importers.units import check_units, optional, truth_m
 from uwblink.importers.usable_rows import ENDS, Faults, UsableRows, usable_exchanges, usable_ranges
+from uwblink.recording.antenna_delays import AntennaDelay, delay_of, meta_of_delays
 from uwblink.recording.contents import Contents
 from uwblink.recording.file import Recording
 from uwblink.recording.schema import Fault, Poses, Tag
@@ -48,9 +49,6 @@ from uwblink.twr import LARGEST_ID, STAMPS, Exchanges, raw_range
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 ROW_PERIOD_NS: Final = 1_000_000
 """Between rows of a table that has no times."""
-
-
-Parts = TypeVar("Parts", Exchanges, Poses)
 
 
 @contextmanager
@@ -179,8 +177,8 @@ def _longer_m(column_map: ColumnMap, rows: Columns) -> Floats:
     lacking, delays = np.zeros(len(rows["origin"])), column_map.antenna_delays
     for name in IDS if delays else ():
         ids, back = np.unique(rows[name], return_inverse=True)
-        programmed = [sum(delays.get(int(tag), delays[None]).values()) for tag in ids]
-        lacking += (2 * ANTENNA_DELAY_TICKS - np.array(programmed, dtype=np.float64))[back]
+        programmed = [delay_of(delays, int(tag)) or AntennaDelay() for tag in ids]
+        lacking += (2 * ANTENNA_DELAY_TICKS - np.array([one.tx + one.rx for one in programmed], np.float64))[back]
     return lacking / 2 * METRES_PER_TICK
 
 
@@ -255,9 +253,9 @@ class TableImport:
         notes, faults = self._notes_and_faults()
         exchanges, powers = zip(*self._exchanges(), strict=True)
         return Contents(
-            exchanges=_joined(exchanges),
+            exchanges=Exchanges.concatenate(exchanges),
             tags=self._tags(),
-            poses=_joined([Poses.from_arrays([], "", (0.0, 0.0, 0.0)), *self._poses()]),
+            poses=Poses.concatenate([Poses.from_arrays([], "", (0.0, 0.0, 0.0)), *self._poses()]),
             powers={name: np.concatenate([some[name] for some in powers]) for name in powers[0]},
             faults=list(chain.from_iterable(faults)),
             meta=self._meta(notes),
@@ -291,7 +289,7 @@ class TableImport:
     def _meta(self, notes: list[str]) -> dict[str, Any]:
         delays, names = self.staging.column_map.antenna_delays, self.staging.names
         if self.reading and self.reading.undelayed:
-            delays = {None: {"tx": 0, "rx": 0}}
+            delays = {None: AntennaDelay(0, 0, 0)}
         meta: dict[str, Any] = {
             "source": self.source,
             "imported_from": self.imported_from,
@@ -300,12 +298,7 @@ class TableImport:
         }
         if names:
             meta["tag_names"] = {str(number): name for number, name in sorted(names.items())}
-        if delays:
-            meta["configured_antenna_delay_ticks"] = delays[None]
-            own = {str(tag): registers for tag, registers in delays.items() if tag is not None}
-            if own:
-                meta["configured_antenna_delay_ticks_by_tag"] = own
-        return meta
+        return meta | meta_of_delays(delays)
 
     def _body(self, tag: int) -> str:
         return self.staging.names.get(tag, f"tag{tag}")
@@ -342,13 +335,6 @@ class TableImport:
             level = np.tile([0.0, 0.0, 0.0, 1.0], (len(which), 1))
             position = np.column_stack([np.ma.getdata(found[axis]) for axis in "xyz"])
             yield Poses(np.ma.getdata(found["time_ns"]), names[which], position, level)
-
-
-def _joined(parts: Sequence[Parts]) -> Parts:
-    """Return exchanges or poses as one."""
-    names = [f.name for f in fields(parts[0]) if f.name != "bits"]
-    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return replace(parts[0], **columns)
 
 
 def likely_repeated(rows: Columns) -> str:

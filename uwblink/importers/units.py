@@ -9,9 +9,10 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
-from uwblink.importers.column_map import DISTANCE_UNITS, POSITIONS, POWERS, REGISTER_MAX, ColumnMap
+from uwblink.importers.column_map import DISTANCE_UNITS, POSITIONS, POWERS, ColumnMap
 from uwblink.importers.stamps import MIN_ROWS
 from uwblink.importers.tables import Columns
+from uwblink.recording.antenna_delays import REGISTER_MAX
 from uwblink.ticks import METRES_PER_TICK
 
 Errors = Callable[[float], Floats]

@@ -29,6 +29,8 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import LARGEST_ID
 
 REGISTER_MAX: Final = 65_535
+"""Antenna delays have registers of 16 bits (DW1000 User Manual 2.10, sections 7.2.25 and 7.2.40.4)."""
+
 ALL: Final = "configured_antenna_delay_ticks"
 BY_TAG: Final = "configured_antenna_delay_ticks_by_tag"
 """Keys of a recording's `meta`."""
@@ -97,37 +99,47 @@ def meta_of_delays(delays: AntennaDelays) -> dict[str, Any]:
     return every | ({BY_TAG: {str(tag): row for tag, row in rows.items()}} if rows else {})
 
 
-def read_antenna_delays(file: TomlReader) -> dict[int | None, AntennaDelay]:
+def read_antenna_delays(
+    file: TomlReader, ticks_per_unit: Mapping[str, float] | None = None
+) -> dict[int | None, AntennaDelay]:
     """Return the `[antenna_delays]` of a file, none where there is none; raises the file's error, with the key.
 
     A device whose registers are not the boards' 16436 needs its `reply`: which constant its firmware was built with
-    cannot be told from its registers.
+    cannot be told from its registers. With `ticks_per_unit` the section is that of another maker's devices: it has only
+    `tx` and `rx`, which are 0 where they are not given, and a `unit`, one of these names.
     """
-    section = file.section("antenna_delays")
+    section, scale = file.section("antenna_delays"), None
     tags = section.pop("tags", {})
+    if ticks_per_unit is not None:
+        scale = ticks_per_unit[file.choice("antenna_delays.unit", section.pop("unit", "ticks"), ticks_per_unit)]
     file.check("antenna_delays.tags", tags, isinstance(tags, dict), "a table for each device")
     found: dict[int | None, AntennaDelay] = {}
     if section:
-        found[None] = _delay(file, "antenna_delays", section, {})
+        found[None] = _delay(file, "antenna_delays", section, {}, scale)
     for name, row in tags.items():
         where = f"antenna_delays.tags.{name}"
         named = name.isascii() and name.isdecimal() and int(name) <= LARGEST_ID
         file.check(where, row, named and isinstance(row, dict), "a table with tx, rx and reply, named by an id")
-        found[int(name)] = _delay(file, where, row, section)
+        found[int(name)] = _delay(file, where, row, section, scale)
     return found
 
 
-def _delay(file: TomlReader, where: str, row: Mapping[str, Any], every: Mapping[str, Any]) -> AntennaDelay:
-    file.known(dict(row), AntennaDelay._fields, f"{where}.")
-    both = {**every, **row}
-    if both.get("tx") == ANTENNA_DELAY_TICKS:
-        both.setdefault("reply", ANTENNA_DELAY_TICKS)
-    for name in AntennaDelay._fields:
-        value = both.get(name)
-        good = isinstance(value, int) and is_number(value) and 0 <= value <= REGISTER_MAX
+def _delay(
+    file: TomlReader, where: str, row: Mapping[str, Any], every: Mapping[str, Any], scale: float | None
+) -> AntennaDelay:
+    names = AntennaDelay._fields if scale is None else ("tx", "rx")
+    file.known(dict(row), names, f"{where}.")
+    given = {**({} if scale is None else {"tx": 0, "rx": 0}), **every, **row}
+    if given.get("tx") == ANTENNA_DELAY_TICKS:
+        given.setdefault("reply", ANTENNA_DELAY_TICKS)
+    found = {}
+    for name in names:
+        value: Any = given.get(name)
+        good = is_number(value) and 0 <= value * (scale or 1) <= REGISTER_MAX and (scale or isinstance(value, int))
         why = f" ({ANTENNA_DELAY_TICKS} where only registers were programmed)" if name == "reply" else ""
-        file.check(f"{where}.{name}", value, good, f"a whole number of ticks, 0 to {REGISTER_MAX}{why}")
-    return AntennaDelay(both["tx"], both["rx"], both["reply"])
+        file.check(f"{where}.{name}", value, bool(good), f"a whole number of ticks, 0 to {REGISTER_MAX}{why}")
+        found[name] = round(value * (scale or 1))
+    return AntennaDelay(found["tx"], found["rx"], found.get("reply", found["tx"]))
 
 
 def load_antenna_delays(path: Path) -> dict[int | None, AntennaDelay]:

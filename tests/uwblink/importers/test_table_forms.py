@@ -233,7 +233,7 @@ def test_iso_times_names_and_programmed_delays(tmp_path):
     text += "[antenna_delays.tags.77]\ntx = 1.0\n"
     found = read_table(write(tmp_path / "t.csv", named), mapped(tmp_path, text))
     assert found.meta["configured_antenna_delay_ticks"] == {"tx": 16422, "rx": 16486}
-    assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"77": {"tx": 64, "rx": 0}}
+    assert found.meta["configured_antenna_delay_ticks_by_tag"] == {"77": {"tx": 64, "rx": 16486}}
     assert found.meta["tag_names"]["77"] == "AA:1"
     assert found.exchanges.initiator[0] == 77
     assert {tag.body for tag in found.tags} >= {"AA:1", "AA:2", "AA:3"}
