@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Final, Self, TypeVar
 
 from uwblink.boards.connection import ANSWER_S, FENCE, QUIET_TARGET_S, Connection
 from uwblink.boards.ports import SerialPort, Transport
+from uwblink.closing import Closing
 from uwblink.errors import BoardError, NoAnswerError, RefusedError
 from uwblink.wire.codec import Event
 from uwblink.wire.messages import (
@@ -42,7 +42,7 @@ PROTOCOL_FLAGS: Final = {"ss": False, "ds": True}
 Reply = TypeVar("Reply", bound=Message)
 
 
-class Board:
+class Board(Closing):
     """One board. Not for use from several threads at once; one board a thread is fine.
 
     `Board.open("/dev/ttyACM0")` opens a board on a serial port; here are two that are simulated:
@@ -80,16 +80,6 @@ class Board:
     def open(cls, port: str) -> Self:
         """Open a serial port or pyserial URL; raises a `PortError`. Nothing is written to it."""
         return cls(SerialPort(port))
-
-    def __enter__(self) -> Self:
-        """Return the board; the `with` block closes it."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the port."""
-        self.close()
 
     def close(self) -> None:
         """Give the port back."""

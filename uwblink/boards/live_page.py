@@ -19,10 +19,10 @@ from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
-from types import TracebackType
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from uwblink.boards.listeners import Correction, Listener, Pair, PairState, Progress, Turn, check_pairs
+from uwblink.closing import Closing
 from uwblink.errors import PortError
 from uwblink.pages.html import CSS
 from uwblink.recording.schema import Fault
@@ -51,7 +51,7 @@ class Point(NamedTuple):
     corrected_m: float
 
 
-class LivePage(Listener):
+class LivePage(Closing, Listener):
     """What is going on, as a page. A context manager: leaving it ends the server."""
 
     def __init__(self, path: Path, *, correct: Correction | None = None, port: int = 0) -> None:
@@ -69,16 +69,6 @@ class LivePage(Listener):
         except OSError as error:
             raise PortError(f"port {port}: the page cannot be served there ({error.strerror})") from error
         threading.Thread(target=self._server.serve_forever, name="uwblink page", daemon=True).start()
-
-    def __enter__(self) -> Self:
-        """Return the page."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """End the server."""
-        self.close()
 
     @property
     def url(self) -> str:

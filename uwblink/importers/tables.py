@@ -11,12 +11,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uwblink.arrays import Floats, Ints
+from uwblink.closing import Closing
 from uwblink.database import connect
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.csv_text import MAX_CELLS, MAX_LINE_BYTES, check_lines, detect, lines_of, open_file, reading
@@ -43,7 +44,7 @@ def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBP
     return connect(paths=paths, temporary=folder, memory_mb=None if folder is None else STAGED_MB)
 
 
-class Table:
+class Table(Closing):
     """One file, whose columns are read when asked for. Close it, or use it as a context manager.
 
     `names` are its columns. `source` is what a query reads FROM, and `number`, `word`, `whole_number` and `time_ns`
@@ -132,11 +133,7 @@ class Table:
         if count > MAX_CELLS:
             raise ImportTableError(f"{self.path}: has {count} columns, expected {MAX_CELLS} at most")
 
-    def __enter__(self) -> Self:
-        """Return the table itself."""
-        return self
-
-    def __exit__(self, *_error: object) -> None:
+    def close(self) -> None:
         """Close the file."""
         if self._own:
             self.db.close()

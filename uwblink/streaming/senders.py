@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 import socket
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
+from uwblink.closing import Closing
 from uwblink.errors import ArgumentError, PortError
 from uwblink.exporters.mcap import RANGE, SCHEMAS, stamped
 from uwblink.streaming.gate import LOOPBACK, Gate, hidden_address
@@ -24,7 +24,7 @@ def host_and_port(text: str, parameter: str) -> tuple[str, int]:
     return host.strip("[]") or LOOPBACK, int(port)
 
 
-class UdpSender:
+class UdpSender(Closing):
     """Sends ranges to a host, whether anybody listens or not. A context manager: leaving it closes the socket.
 
     A datagram is `{"timestamp": seconds, "ranges": {"10_20": {...}}}`: a plotter has one series a pair and name.
@@ -42,13 +42,7 @@ class UdpSender:
             raise PortError(f"udp {address}: no such host ({_reason(error)})") from error
         self._address = address
 
-    def __enter__(self) -> Self:
-        """Return the sender."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Close the socket."""
         self._socket.close()
 
@@ -67,7 +61,7 @@ def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error)
 
 
-class FoxgloveServer:
+class FoxgloveServer(Closing):
     """Serves ranges to as many viewers as come. A context manager: leaving it ends the server.
 
     Viewers are programs, Foxglove's own pages, and pages of the computer that serves; other web sites are refused.
@@ -105,13 +99,7 @@ class FoxgloveServer:
         self._channels: dict[tuple[int, int], foxglove.Channel] = {}
         self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._gate.server_address[1]}"
 
-    def __enter__(self) -> Self:
-        """Return the server."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """End the server."""
         self._gate.close()
         self._server.stop()
