@@ -4,7 +4,7 @@ import io
 import sys
 import time
 
-from uwblink.cli import waiting as room
+from uwblink.cli.waiting import waiting
 
 
 class Terminal(io.StringIO):
@@ -15,8 +15,7 @@ class Terminal(io.StringIO):
 def test_on_a_terminal_it_comes_after_a_while_and_goes(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setattr(room, "PATIENCE_S", 0.01)
-    with room.waiting("fitting [1]"):
+    with waiting("fitting [1]", after_s=0.01):
         begun = time.monotonic()
         while "fitting [1]" not in screen.getvalue():
             assert time.monotonic() - begun < 20
@@ -27,14 +26,12 @@ def test_on_a_terminal_it_comes_after_a_while_and_goes(monkeypatch):
 def test_quick_work_shows_nothing(monkeypatch):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setattr(room, "PATIENCE_S", 60)
-    with room.waiting("fitting"):
+    with waiting("fitting", after_s=60):
         pass
     assert screen.getvalue() == ""
 
 
-def test_elsewhere_it_shows_nothing(capsys, monkeypatch):
-    monkeypatch.setattr(room, "PATIENCE_S", 0.0)
-    with room.waiting("fitting"):
+def test_elsewhere_it_shows_nothing(capsys):
+    with waiting("fitting", after_s=0.0):
         time.sleep(0.05)
     assert capsys.readouterr() == ("", "")
