@@ -3,30 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from uwblink.boards.listeners import Heard
 from uwblink.boards.ports import Terminal, wait_until
-from uwblink.boards.record import overheard_row
+from uwblink.boards.record import Batch
 from uwblink.errors import RecordingError
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import CirRow, FrameRow
-from uwblink.twr import COLUMNS, Exchanges
+from uwblink.recording.schema import FrameRow
+from uwblink.twr import Exchanges
 from uwblink.wire.bulk import ColumnDecoder
-from uwblink.wire.messages import Cir, Overheard, TextLine
+from uwblink.wire.messages import TextLine
 
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """What the stored bytes hold: columns of exchanges in order of time, and the other reports."""
+    """What the stored bytes hold: exchanges in order of time, overheard ones and impulse responses, and counts."""
 
     exchanges: Exchanges
-    overheard: list[dict[str, float]]
-    cirs: list[CirRow]
+    others: Batch
     texts: int
     skipped_bytes: int
     messages: int
@@ -42,22 +40,17 @@ def decode_again(recording: Recording) -> Decoded:
         if name not in decoders:
             decoders[name] = ColumnDecoder(ids.get(name, len(decoders)))
         decoders[name].feed(frame.data, frame.time_ns)
-    overheard, cirs, texts = [], [], 0
+    heard = []
     for name, decoder in decoders.items():
         decoder.finish(frames[-1].time_ns)
-        board = ids.get(name, 0)
-        for time_ns, event in decoder.events:
-            if isinstance(event, Overheard):
-                overheard.append(overheard_row(time_ns, board, event))
-            elif isinstance(event, Cir):
-                index = event.first_path_milli / 1000
-                cirs.append(CirRow(time_ns, board, event.initiator, event.target, index, event.magnitudes))
-            texts += isinstance(event, TextLine)
+        heard += [Heard(time_ns, ids.get(name, 0), event) for time_ns, event in decoder.events]
+    others = Batch()
+    for one in sorted(heard, key=lambda one: one.time_ns):
+        others.add(one)
     return Decoded(
-        _in_order([d.exchanges() for d in decoders.values()]),
-        sorted(overheard, key=lambda row: row["time_ns"]),
-        sorted(cirs, key=lambda row: row.time_ns),
-        texts,
+        Exchanges.concatenate([d.exchanges() for d in decoders.values()]).in_time_order(),
+        others,
+        sum(isinstance(one.message, TextLine) for one in heard),
         sum(d.decoder.skipped_bytes for d in decoders.values()),
         sum(d.decoder.messages for d in decoders.values()),
     )
@@ -71,14 +64,9 @@ def board_ids(recording: Recording) -> dict[str, int]:
 
 def rewrite(source: Recording, decoded: Decoded, output: Path, *, force: bool = False) -> None:
     """Write a recording with what was decoded in place of what was stored; raises what `Recording.create` raises."""
-    with Recording.create(output, meta=source.meta(), force=force) as written:
-        written.append_tags(source.tags())
-        written.append_poses(source.poses())
-        written.append_faults(source.faults())
-        written.append_frames(source.frames())
+    with source.copying(output, without=("exchanges", "overheard", "cirs"), force=force) as written:
         written.append_exchanges(decoded.exchanges)
-        written.append_overheard(decoded.overheard)
-        written.append_cirs(decoded.cirs)
+        decoded.others.append_to(written)
 
 
 def play(
@@ -114,10 +102,12 @@ def play(
 def summarize(recording: Recording, decoded: Decoded) -> dict[str, Any]:
     """Compare what was decoded now with what was stored then, JSON-ready."""
     totals = {name: getattr(decoded, name) for name in ("messages", "skipped_bytes", "texts")}
-    return totals | {
-        table: {"stored": recording.count(table), "decoded": len(getattr(decoded, table))}
-        for table in ("exchanges", "overheard", "cirs")
+    tables: dict[str, Sized] = {
+        "exchanges": decoded.exchanges,
+        "overheard": decoded.others.overheard,
+        "cirs": decoded.others.cirs,
     }
+    return totals | {n: {"stored": recording.count(n), "decoded": len(rows)} for n, rows in tables.items()}
 
 
 def _heard(recording: Recording) -> list[FrameRow]:
@@ -126,9 +116,3 @@ def _heard(recording: Recording) -> list[FrameRow]:
     if not frames:
         raise RecordingError(f"{recording.path}: holds no bytes from boards; only recordings of boards can be replayed")
     return frames
-
-
-def _in_order(parts: list[Exchanges]) -> Exchanges:
-    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
-    order = np.argsort(columns["time_ns"], kind="stable")
-    return Exchanges(**{name: column[order] for name, column in columns.items()})
