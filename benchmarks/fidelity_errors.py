@@ -194,11 +194,11 @@ def twin_rows() -> list[Sequence[str]]:
     return [
         (
             f"{one.name} ({one.unit})",
-            f"{one.low_measured:.2f}, {one.median_measured:.2f}, {one.high_measured:.2f}",
-            f"{one.low_simulated:.2f}, {one.median_simulated:.2f}, {one.high_simulated:.2f}",
-            f"{one.lag1_measured:.2f}, {one.lag1_simulated:.2f}",
+            f"{one.measured.low:.2f}, {one.measured.median:.2f}, {one.measured.high:.2f}",
+            f"{one.simulated.low:.2f}, {one.simulated.median:.2f}, {one.simulated.high:.2f}",
+            f"{one.measured.lag1:.2f}, {one.simulated.lag1:.2f}",
             f"{100 * one.distance:.0f} %",
-            "alike" if one.alike else "not alike",
+            one.verdict,
         )
         for one in found.compare(seeds=3)
     ]

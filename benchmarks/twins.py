@@ -86,14 +86,20 @@ def known(scenario: Scenario) -> dict[str, Any]:
     """Return what a calibration that found everything says."""
     planted = scenario.planted()
     curve = planted["bias_curve"]
+    shape = curve | {"range": [curve["knots"][0], curve["knots"][-1]]}
     return {
         "schema_version": 3,
         "delays_ns": planted["delays_ns"],
+        "delays_std_ns": dict.fromkeys(planted["delays_ns"], 0.0),
+        "loss": "cauchy",
+        "scale_ns": 0.1,
         "lift": "mean-of-lifted",
         "power_at": "reception",
         "alpha_dbm": -82.0,
         "speed_of_light": 299_702_547.0,
-        "bias_curve": curve | {"range": [curve["knots"][0], curve["knots"][-1]]},
+        "bias_curve": shape,
+        "sigma_curve": shape | {"coefficients": [0.05] * len(curve["coefficients"])},
+        "provenance": {},
     }
 
 

@@ -301,20 +301,20 @@ def _results(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[str
 
 TWIN_COLUMNS: Final[dict[str, Callable[[Compared], str]]] = {
     "quantity": lambda c: f"{c.name} ({c.unit})",
-    "verdict": lambda c: "alike" if c.alike else "differ",
-    "median": lambda c: _both(c.median_measured, c.median_simulated),
-    "10 %": lambda c: _both(c.low_measured, c.low_simulated),
-    "90 %": lambda c: _both(c.high_measured, c.high_simulated),
-    "to a pair's next": lambda c: _both(c.lag1_measured, c.lag1_simulated, ".2f"),
-    "worth": lambda c: f"{c.worth_measured:.0f} of {c.count}",
-    "D": lambda c: f"{c.distance:.3f}",
-    "p": lambda c: f"{c.probability:.2g}",
+    "verdict": lambda c: c.verdict,
+    "median": lambda c: _both(c.measured.median, c.simulated.median),
+    "10 %": lambda c: _both(c.measured.low, c.simulated.low),
+    "90 %": lambda c: _both(c.measured.high, c.simulated.high),
+    "to a pair's next": lambda c: _both(c.measured.lag1, c.simulated.lag1, ".2f"),
+    "worth": lambda c: f"{c.measured.worth:.0f} of {c.measured.count}",
+    "D, seen": lambda c: f"{c.distance:.2f}, {c.detectable:.2f}",
+    "p": lambda c: f"{np.nanmin([c.probability, c.lag1_probability]):.2g}",
 }
 """What tables on the page and on the terminal show of a quantity: measured, then simulated."""
 
 
 def _both(measured: float, simulated: float, form: str = ".3g") -> str:
-    return " / ".join("–" if math.isnan(value) else format(value, form) for value in (measured, simulated))
+    return " / ".join("–" if math.isnan(value) else format(round(value, 4), form) for value in (measured, simulated))
 
 
 def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: bool = False) -> None:
@@ -324,7 +324,7 @@ def write_twin(found: Twin, compared: Sequence[Compared], path: Path, *, force: 
 
 
 def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
-    alike = sum(one.alike for one in compared)
+    alike = sum(one.verdict == "alike" for one in compared)
     pairs = [one for one in compared if one.name in ("residual of calibrated ranges", "first-path power at initiator")]
     numbers = {name: value for name, value in found.found.items() if value is None or isinstance(value, int | float)}
     blocks: list[Block] = [
@@ -335,11 +335,13 @@ def _twin(found: Twin, compared: Sequence[Compared]) -> Document:
         ),
         Heading("Measured and simulated"),
         Text(
-            "Each cell has the measured value, then the simulated one. To a pair's next is the autocorrelation "
-            "to the pair's next exchange, worth how many independent values the measured ones are worth, D the "
-            "largest difference of the cumulative distributions, and p how likely chance makes it so large "
-            f"(Kolmogorov and Smirnov, with sizes as the values are worth); below {LEVEL:g} they differ. The scenario "
-            "was fitted to these same exchanges, so the test is of its form, not of what it predicts."
+            "Each cell has the measured value, then the simulated one. To a pair's next is the autocorrelation to the "
+            "pair's next exchange, and worth how many independent values the measured ones are worth. D is the largest "
+            "difference of the cumulative distributions, beside the one that would be seen in nine of ten such "
+            "recordings. p is how likely chance makes D (Kolmogorov and Smirnov, with sizes as the values are worth) "
+            "or the difference of the autocorrelations so large, the smaller of the two. Below "
+            f"{LEVEL / 2:g} they differ; too few are values of which a D of 0.2 would not be seen. The scenario was "
+            "fitted to these same exchanges, so the test is of its form, not of what it predicts."
         ),
         Table(list(TWIN_COLUMNS), [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]),
         Picture(

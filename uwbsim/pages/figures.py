@@ -395,10 +395,10 @@ def marginals(width_in: float, found: Sequence[Compared]) -> Figure:
     figure, panels = sheet(width_in, len(found), height_in=1.7, across=1 if width_in < NARROW_IN else 3)
     colours = {"measured": BLUE, "simulated": VERMILION}
     for axes, one in zip(panels, found, strict=True):
-        low, high = np.quantile(np.concatenate([one.measured, one.simulated]), [0.005, 0.995])
+        low, high = np.quantile(np.concatenate(one.drawn), [0.005, 0.995])
         edges = np.linspace(low, high if high > low else low + 1, 41)
         lines = {name: {"lw": 1.2, "color": colour, "label": name} for name, colour in colours.items()}
-        outlines(axes, {"measured": one.measured, "simulated": one.simulated}, edges, lines, ends=False)
+        outlines(axes, dict(zip(colours, one.drawn, strict=True)), edges, lines, ends=False)
         axes.set_title(one.name, loc="left")
         axes.set_xlabel(one.unit)
         axes.set_yticks([])
@@ -412,8 +412,8 @@ def by_pair(width_in: float, found: Sequence[Compared], fewest: int = 5) -> Figu
     columns = (("median", "median"), ("high", "90 %"), ("lag1", "to the next"))
     drawn = [(one, what, name) for one in found for what, name in columns]
     for axes, (one, what, name) in zip(panels, drawn, strict=True):
-        pairs = [pair for pair in one.pairs.values() if pair["count"] >= fewest]
-        points = np.array([[pair[f"{what}_measured"], pair[f"{what}_simulated"]] for pair in pairs]).reshape(-1, 2)
+        pairs = [pair for pair in one.pairs.values() if pair[0].count >= fewest]
+        points = np.array([[getattr(side, what) for side in pair] for pair in pairs]).reshape(-1, 2)
         points = points[np.isfinite(points).all(axis=1)]
         if len(points):
             ends = [float(points.min()), float(points.max())]

@@ -6,11 +6,11 @@ import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from pydantic import ValidationError
-from scipy.special import kolmogorov
+from scipy.special import kolmogi, kolmogorov, ndtr, ndtri
 from threadpoolctl import threadpool_limits
 
 from uwblink.arrays import Floats, Ints
@@ -23,57 +23,89 @@ from uwbsim.errors import ParameterError, ScenarioError
 from uwbsim.scenario.model import Scenario
 from uwbsim.simulation.run import simulate
 from uwbsim.tables import write_csv
-from uwbsim.twins.calibration_file import CalibrationSource, KnownDevices, read_calibration
 from uwbsim.twins.clocks import fit_clocks
 from uwbsim.twins.flight import Flight, RecordingSource, effective_size, fit_schedule, lag_one, read_flight, some_rows
 from uwbsim.twins.powers import fit_powers
-from uwbsim.twins.reflections import fit_reflections
+from uwbsim.twins.range_errors import CalibrationSource, KnownDevices, fit_range_errors, read_calibration
 from uwbsim.twins.scenario import Fitted, receive_noise, scenario_text, tables, unknowns
 
 LEVEL: Final = 0.01
-"""Below this probability chance does not explain a difference."""
+"""Probability below which chance does not explain a difference."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Side:
+    """One quantity in a recording or in its twin: `count` values, their quantiles at 10, 50 and 90 %.
+
+    `lag1` is the autocorrelation to the pair's next value, about the mean of all, with a standard error; `worth` is how
+    many independent values the values are worth.
+    """
+
+    count: int
+    low: float
+    median: float
+    high: float
+    lag1: float
+    lag1_std: float
+    worth: float
+
+    @classmethod
+    def of(cls, values: Floats, pair: Ints) -> Self:
+        """Return the figures of values (n,) of pairs (n,), in order of time."""
+        low, middle, high = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
+        lag1, error = lag_one(values, pair)
+        worth = effective_size(values, pair)
+        return cls(count=len(values), low=low, median=middle, high=high, lag1=lag1, lag1_std=error, worth=worth)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
     """One quantity in a recording and in its twin.
 
-    Quantiles are of all values; `lag1_*` is the autocorrelation to the pair's next value, about the mean of all.
-    `worth_*` is how many independent values the values are worth, `distance` the largest difference of the cumulative
-    shares, and `probability` how likely chance makes it as large as that where both are the same (Kolmogorov and
-    Smirnov, with sizes as the values are worth). `alike` says whether that is more than `LEVEL`.
+    `distance` is the largest difference of the cumulative shares, and `probability` how likely chance makes it as large
+    where both are the same (Kolmogorov and Smirnov, with sizes as the values are worth); `lag1_probability` is that of
+    the difference of the autocorrelations (normal). `detectable` and `lag1_detectable` are the differences that nine of
+    ten such recordings would show. `drawn` are some values of both sides, for figures; `pairs` both sides by pair.
     """
 
     name: str
     unit: str
-    measured: Floats
-    simulated: Floats
-    count: int
-    median_measured: float
-    median_simulated: float
-    low_measured: float
-    low_simulated: float
-    high_measured: float
-    high_simulated: float
-    lag1_measured: float
-    lag1_simulated: float
-    worth_measured: float
-    worth_simulated: float
+    measured: Side
+    simulated: Side
     distance: float
     probability: float
-    pairs: dict[str, dict[str, float]]
+    detectable: float
+    lag1_probability: float
+    lag1_detectable: float
+    drawn: tuple[Floats, Floats]
+    pairs: dict[str, tuple[Side, Side]]
 
     @property
-    def alike(self) -> bool:
-        """Return whether chance explains the difference."""
-        return self.probability > LEVEL
+    def verdict(self) -> str:
+        """Return "differ" where chance explains no such difference, "alike" where a larger one would have shown.
+
+        A larger one is 0.2, as two normal distributions have it whose means are half a standard deviation apart; where
+        it would not have shown, "too few". Either test may differ by chance in half of `LEVEL`.
+        """
+        if min(self.probability, np.nan_to_num(self.lag1_probability, nan=1.0)) < LEVEL / 2:
+            return "differ"
+        return "alike" if self.detectable <= 0.2 else "too few"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures, JSON-ready, without the values."""
-        table = asdict(self)
-        values = {key: value for key, value in table.items() if key not in ("measured", "simulated")}
-        numbers = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in values.items()}
-        return numbers | {"alike": self.alike}
+        """Return the figures, JSON-ready, without the values; NaN is None."""
+        own = ("name", "unit", "distance", "probability", "detectable", "lag1_probability", "lag1_detectable")
+        found = {name: getattr(self, name) for name in own} | _both_sides(self.measured, self.simulated)
+        pairs = {name: _both_sides(*sides) for name, sides in self.pairs.items()}
+        return {k: _finite_or_none(v) for k, v in found.items()} | {"verdict": self.verdict, "pairs": pairs}
+
+
+def _both_sides(measured: Side, simulated: Side) -> dict[str, Any]:
+    named = (("measured", measured), ("simulated", simulated))
+    return {f"{key}_{side}": _finite_or_none(v) for side, one in named for key, v in asdict(one).items()}
+
+
+def _finite_or_none(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 Column = Callable[[Flight], Floats]
@@ -116,69 +148,47 @@ def compare_flights(
 def _compared(name: str, measured: Flight, flights: list[Flight]) -> Compared | None:
     unit, column = QUANTITIES[name]
     mine, group = _finite(column(measured), measured.pair)
-    parts = [_finite(column(flight), flight.pair) for flight in flights]
-    if len(mine) < 8 or not all(len(values) for values, _ in parts):
+    if len(mine) < 8:
         return None
     # A seed's pairs are pairs of their own.
-    span = max(int(pairs.max()) for _, pairs in parts) + 1
-    theirs = np.concatenate([values for values, _ in parts])
-    theirs_group = np.concatenate([pairs + k * span for k, (_, pairs) in enumerate(parts)])
-    worth = effective_size(mine, group), float(sum(effective_size(*part) for part in parts))
+    named = {pair: k for k, pair in enumerate(measured.pairs)}
+    numbers = [np.array([named.get(pair, -1) for pair in flight.pairs], dtype=np.int64) for flight in flights]
+    parts = [_finite(column(flight), number[flight.pair]) for flight, number in zip(flights, numbers, strict=True)]
+    theirs, pair = (np.concatenate(values) for values in zip(*parts, strict=True))
+    if not len(theirs):
+        return None
+    seed = np.repeat(np.arange(len(parts)), [len(values) for values, _ in parts])
+    one, other = Side.of(mine, group), Side.of(theirs, pair + seed * len(named))
+    pairs = {}
+    for (a, b), k in named.items():
+        own, rows = mine[group == k], np.flatnonzero(pair == k)
+        if len(own) and len(rows):
+            pairs[f"{a}-{b}"] = Side.of(own, np.zeros(len(own), np.int64)), Side.of(theirs[rows], seed[rows])
     # The largest difference of the two cumulative shares.
     at = np.sort(np.concatenate([mine, theirs]))
     shares = [np.searchsorted(np.sort(values), at, side="right") / len(values) for values in (mine, theirs)]
-    distance = float(np.max(np.abs(shares[0] - shares[1])))
-    low, middle, high = ([float(np.quantile(values, level)) for values in (mine, theirs)] for level in (0.1, 0.5, 0.9))
-    shown = 4000  # values of each side for pictures
+    distance, root = float(np.max(np.abs(shares[0] - shares[1]))), np.sqrt(1 / (1 / one.worth + 1 / other.worth))
+    spread = float(np.hypot(one.lag1_std, other.lag1_std))
+    # A share has the standard deviation 1/2 at most; 1.28 of them leave a tenth below.
+    tenth = float(-ndtri(0.1))
     return Compared(
         name=name,
         unit=unit,
-        measured=mine[some_rows(len(mine), shown)],
-        simulated=theirs[some_rows(len(theirs), shown)],
-        count=len(mine),
-        median_measured=middle[0],
-        median_simulated=middle[1],
-        low_measured=low[0],
-        low_simulated=low[1],
-        high_measured=high[0],
-        high_simulated=high[1],
-        lag1_measured=lag_one(mine, group),
-        lag1_simulated=lag_one(theirs, theirs_group),
-        worth_measured=worth[0],
-        worth_simulated=worth[1],
+        measured=one,
+        simulated=other,
         distance=distance,
-        probability=float(kolmogorov(distance * np.sqrt(worth[0] * worth[1] / (worth[0] + worth[1])))),
-        pairs=_by_pair(measured, column(measured), [(flight, column(flight)) for flight in flights]),
+        probability=float(kolmogorov(distance * root)),
+        detectable=float((kolmogi(LEVEL / 2) + tenth / 2) / root),
+        lag1_probability=float(2 * ndtr(-abs(one.lag1 - other.lag1) / max(spread, 1e-9))),
+        lag1_detectable=float((-ndtri(LEVEL / 4) + tenth) * spread),
+        drawn=(mine[some_rows(len(mine), 4000)], theirs[some_rows(len(theirs), 4000)]),
+        pairs=pairs,
     )
 
 
 def _finite(values: Floats, pair: Ints) -> tuple[Floats, Ints]:
     good = np.isfinite(values)
     return np.asarray(values[good], dtype=np.float64), pair[good]
-
-
-def _by_pair(measured: Flight, values: Floats, simulated: list[tuple[Flight, Floats]]) -> dict[str, dict[str, float]]:
-    """Return medians, 90 % quantiles and autocorrelations of both sides by pair."""
-    found = {}
-    for k, pair in enumerate(measured.pairs):
-        mine = values[measured.pair == k]
-        theirs = [
-            column[flight.pair == flight.pairs.index(pair)] for flight, column in simulated if pair in flight.pairs
-        ]
-        if not theirs:
-            continue
-        groups = np.repeat(np.arange(len(theirs)), [len(part) for part in theirs])
-        together = np.concatenate(theirs)
-        found[f"{pair[0]}-{pair[1]}"] = {
-            "count": float(len(mine)),
-            "median_measured": float(np.median(mine)),
-            "median_simulated": float(np.median(together)),
-            "high_measured": float(np.quantile(mine, 0.9)),
-            "high_simulated": float(np.quantile(together, 0.9)),
-            "lag1_measured": lag_one(mine, np.zeros(len(mine), np.int64)),
-            "lag1_simulated": lag_one(together, groups),
-        }
-    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -296,10 +306,10 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
         clocks = fit_clocks(flight[rows])
         noise = receive_noise(flight[rows], clocks)
         std = np.sqrt(np.mean([noise.at(power) ** 2 for power in flight.power_dbm], axis=0))
-        reflections = fit_reflections(flight, std)
-        powers = fit_powers(flight[rows], reflections.reflected[rows])
+        errors = fit_range_errors(flight, std)
+        powers = fit_powers(flight[rows], errors.reflected[rows])
         schedule = fit_schedule(flight, flown.faults)
-    fitted = Fitted(clocks=clocks, noise=noise, reflections=reflections, powers=powers, schedule=schedule)
+    fitted = Fitted(clocks=clocks, noise=noise, errors=errors, powers=powers, schedule=schedule)
     name = f"twin of {Path(where).stem}"
     table, paths = tables(flight, known, flown.poses, fitted, name)
     try:
@@ -323,7 +333,7 @@ def twin(recording: RecordingSource, calibration: CalibrationSource) -> Twin:
 
 def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
     """Return what was fitted by name, numbers or None, and tables by tag and by pair."""
-    clocks, reflections, powers, schedule = fitted.clocks, fitted.reflections, fitted.powers, fitted.schedule
+    clocks, errors, powers, schedule = fitted.clocks, fitted.errors, fitted.powers, fitted.schedule
     noise = fitted.noise.std_s
     return {
         "exchanges": len(flight),
@@ -336,17 +346,19 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
         "carrier_bias_ppm": clocks.carrier_bias_ppm,
         "warm_up_s": clocks.warm_up_s,
         "ratio_bias_ppm": clocks.ratio_bias_ppm,
+        "saturation_dbm": powers.saturation_dbm,
         "first_path_at_1m_dbm": powers.at_1m_dbm,
         "path_loss_exponent": powers.exponent,
         "power_noise_db": powers.noise_db,
         "fading_db": powers.fading_db,
         "fading_life_s": powers.fading_life_s,
-        "core_mean_m": reflections.core_mean_m,
-        "direct_std_m": reflections.direct_std_m,
-        "reflected_share": reflections.share,
-        "reflected_share_between_pairs": reflections.share_std,
-        "mean_excess_m": reflections.mean_excess_m,
-        "reflection_life_s": reflections.life_s,
+        "mean_delay_ns": errors.mean_ns,
+        "direct_std_m": errors.direct_std_m,
+        "reflected_share": errors.share,
+        "reflected_share_between_pairs": errors.share_std,
+        "mean_excess_m": errors.mean_excess_m,
+        "excess_shape": errors.excess_shape,
+        "reflection_life_s": errors.life_s,
         "reflection_loss_db": powers.reflection_loss_db,
         "tags": {
             str(tag.tag): {
@@ -354,6 +366,7 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
                 "skew_error_ppm": float(clocks.skew_error_ppm[k]),
                 "warm_up_ppm": float(clocks.warm_up_ppm[k]),
                 "walk_ppm_per_sqrt_s": float(clocks.walk_ppm_per_sqrt_s[k]),
+                "delay_ns": errors.delays_ns[tag.tag],
                 "tx_power_db": float(powers.tx_db[k]),
                 "power_offset_db": float(powers.offset_db[k]),
             }
@@ -362,9 +375,9 @@ def summary(flight: Flight, fitted: Fitted) -> dict[str, Any]:
         "pairs": {
             f"{a}-{b}": {
                 "exchanges": int(np.count_nonzero(flight.pair == k)),
-                "reflected_share": float(reflections.pair_share[k]),
-                "mean_excess_m": float(reflections.pair_excess_m[k]),
-                "life_s": None if reflections.life_s is None else float(reflections.pair_life_s[k]),
+                "reflected_share": float(errors.pair_share[k]),
+                "mean_excess_m": float(errors.pair_excess_m[k]),
+                "life_s": None if errors.life_s is None else float(errors.pair_life_s[k]),
             }
             for k, (a, b) in enumerate(flight.pairs)
         },

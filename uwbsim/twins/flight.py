@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -30,15 +30,10 @@ from uwblink.twr import Exchanges, intervals, without_stamps
 from uwbsim.errors import ScenarioError, UnanswerableError
 from uwbsim.random_streams import stream
 from uwbsim.simulation.simulated import Simulated
-from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.units import NS
 
-LONGEST_SHARE: Final = 0.25
-"""Share of a flight's length up to which lags count: longer ones have few independent products."""
-
-
-MIN_EXCHANGES: Final = 100
-"""Exchanges below which a flight has no twin: quantiles of residuals would be wrong by a tenth of their spread."""
+if TYPE_CHECKING:
+    from uwbsim.twins.range_errors import KnownDevices
 
 
 def lasting(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> tuple[float, float | None]:
@@ -75,7 +70,10 @@ def lasting(time_s: Floats, pair: Ints, value: Floats, span_s: float) -> tuple[f
 
 
 def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) -> tuple[Floats, Floats, Ints]:
-    """Return mean products of values of a pair that lie some time apart: lags in seconds, covariances, counts."""
+    """Return mean products of values of a pair that lie some time apart: lags in seconds, covariances, counts.
+
+    Lags reach a quarter of the span: longer ones have few independent products.
+    """
     lags, products = [], []
     for key in np.unique(pair):
         rows = np.flatnonzero(pair == key)
@@ -84,15 +82,15 @@ def _autocovariance(time_s: Floats, pair: Ints, centred: Floats, span_s: float) 
         time, values = time_s[rows], centred[rows]
         # Products lie 1, 2, ... values of the pair apart, denser where they are few; 4 million of them are enough.
         most = int(np.clip(4_000_000 // len(centred), 12, 80))
-        steps = np.rint(np.geomspace(1, max(int(len(rows) * LONGEST_SHARE), 2), most)).astype(np.int64)
+        steps = np.rint(np.geomspace(1, max(len(rows) // 4, 2), most)).astype(np.int64)
         for step in np.unique(steps).tolist():
             apart = time[step:] - time[:-step]
-            if apart.min() > LONGEST_SHARE * span_s:
+            if apart.min() > span_s / 4:
                 break
             lags.append(apart)
             products.append(values[step:] * values[:-step])
     lag, product = (np.concatenate(parts) if parts else np.zeros(0) for parts in (lags, products))
-    near = (lag >= 1e-3) & (lag <= LONGEST_SHARE * span_s)
+    near = (lag >= 1e-3) & (lag <= span_s / 4)
     lag, product = lag[near], product[near]
     if not len(lag):
         return lag, product, np.zeros(0, dtype=np.int64)
@@ -140,15 +138,22 @@ def bulk_spread(value: Floats) -> float:
     return float(high - low) / 2
 
 
-def lag_one(value: Floats, group: Ints) -> float:
-    """Return the autocorrelation of values (n,) to the next of their group, about the mean of all; NaN for none."""
+def lag_one(value: Floats, group: Ints) -> tuple[float, float]:
+    """Return the autocorrelation r of values (n,) to the next of their group, about the mean of all, and its error.
+
+    The standard error is that of the mean of x_k x_{k+1} - r x_k^2 over the variance, whose terms persist, too. NaN
+    where fewer than eight values have a next one.
+    """
     order = np.argsort(group, kind="stable")
-    sorted_value, sorted_group = (value - value.mean())[order], group[order]
-    same = sorted_group[1:] == sorted_group[:-1]
-    variance = float(np.mean(sorted_value**2))
-    if np.count_nonzero(same) < 8 or variance <= 0:
-        return float("nan")
-    return float(np.mean(sorted_value[1:][same] * sorted_value[:-1][same]) / variance)
+    centred, sorted_group = (value - value.mean())[order], group[order]
+    rows = np.flatnonzero(sorted_group[1:] == sorted_group[:-1])
+    variance = float(np.mean(centred**2))
+    if len(rows) < 8 or variance <= 0:
+        return float("nan"), float("nan")
+    product = centred[rows] * centred[rows + 1] / variance
+    r = float(np.mean(product))
+    term = product - r * centred[rows] ** 2 / variance
+    return r, float(np.std(term) / np.sqrt(effective_size(term, sorted_group[rows])))
 
 
 RecordingSource = str | os.PathLike[str] | Contents | Simulated
@@ -173,9 +178,10 @@ class Flight:
     `time_s` counts from `origin_ns`; `ends` are places in `tags` of initiator and target, (2, n), `pair` the places of
     both in `pairs`, whichever began; `towards` are unit vectors to the other end in the frames of the two bodies,
     (2, n, 3). `residual_m` is calibrated range less distance; `ratio_ppm` by how much the initiator's clock is faster
-    than the target's as dt64/dt53 says, NaN where the protocol has no third message.
+    than the target's as dt64/dt53 says, NaN where the protocol has no third message. `where` is the recording's file.
     """
 
+    where: str
     tags: tuple[Tag, ...]
     row: RangingProtocol
     exchanges: Exchanges
@@ -232,9 +238,13 @@ class Flight:
 
     @classmethod
     def of(
-        cls, flown: Contents | Simulated, known: KnownDevices, where: str = "recording", *, fewest: int = MIN_EXCHANGES
+        cls, flown: Contents | Simulated, known: KnownDevices, where: str = "recording", *, fewest: int = 100
     ) -> Self:
-        """Take the columns; raises `ScenarioError` where a recording cannot have a twin."""
+        """Take the columns; raises `ScenarioError` where a recording cannot have a twin.
+
+        That is with less than `fewest` exchanges: of 100, the quantiles of residuals are wrong by a tenth of their
+        spread.
+        """
         names, counts = np.unique(flown.exchanges.protocol, return_counts=True)
         if not len(names):
             raise UnanswerableError(f"{where}: holds no exchanges; record or import some first")
@@ -279,6 +289,7 @@ class Flight:
             for end, way in zip(ends, (unit, -unit), strict=True)
         ]
         return cls(
+            where=where,
             tags=tags,
             row=row,
             exchanges=exchanges,
@@ -359,7 +370,7 @@ class ScheduleFit:
     def outage_life_s(self) -> float:
         """Return how long a pair's outages last on average, from what is lost next after a loss of the pair."""
         pair = np.minimum(self.initiator, self.target) * 1000 + np.maximum(self.initiator, self.target)
-        again = lag_one(self.lost.astype(np.float64), pair)
+        again, _ = lag_one(self.lost.astype(np.float64), pair)
         if not again > 0.02:
             return SHORTEST_LIFE_S
         order = np.argsort(pair, kind="stable")

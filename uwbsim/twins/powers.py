@@ -7,13 +7,11 @@ from math import isqrt
 from typing import Final
 
 import numpy as np
+from scipy.special import expit, logit
 
 from uwblink.arrays import Floats
-from uwbsim.twins.flight import Flight, bulk_spread, effective_size, lasting
-from uwbsim.world.radio import ANTENNAS, harmonics
-
-MIN_LOG_SPREAD: Final = 0.05
-"""Standard deviation of log10(distance) below which path loss is not determined: distances within 12 %."""
+from uwbsim.twins.flight import Flight, bulk_spread, effective_size, lasting, some_rows
+from uwbsim.world.radio import ANTENNAS, before_saturation_dbm, harmonics
 
 MIN_REFLECTED: Final = 5.0
 """Reflected exchanges, by their probabilities, below which their losses are not determined."""
@@ -23,13 +21,14 @@ MIN_REFLECTED: Final = 5.0
 class PowerFit:
     """What powers are made of: levels in dBm and dB.
 
-    `exponent` is None where distances do not differ enough. `tx_db`, `offset_db` (tags,) and `pattern_db`
-    (tags, harmonics) are of tags, by place. `reflection_loss_db` with `reflection_loss_std_db` about it is what a
-    reflection takes off, None where there are too few. `fading_db` is how much fading both ends share,
-    `fading_levels_db` its quantiles; it lasts `fading_life_s`, None where the recording does not tell;
-    `noise_db` is of a reading.
+    `saturation_dbm` is where readings end, None where nothing shows that they do. `exponent` is None where distances
+    do not differ enough. `tx_db`, `offset_db` (tags,) and `pattern_db` (tags, harmonics) are of tags, by place.
+    `reflection_loss_db` with `reflection_loss_std_db` about it is what a reflection takes off, None where there are too
+    few. `fading_db` is how much fading both ends share, `fading_levels_db` its quantiles; it lasts `fading_life_s`,
+    None where the recording does not tell; `noise_db` is of a reading.
     """
 
+    saturation_dbm: float | None
     at_1m_dbm: float
     exponent: float | None
     antenna: str
@@ -58,7 +57,8 @@ class _Solved:
 def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     """Fit powers of a flight whose ranges are reflected with known probabilities (n,)."""
     enough = float(reflected.sum()) >= MIN_REFLECTED
-    plain, *shaped = [_solve(flight, reflected, antenna, rounds=1) for antenna in ANTENNAS]
+    saturation, power = _unsaturated(flight, reflected)
+    plain, *shaped = [_solve(flight, power, reflected, antenna, rounds=1) for antenna in ANTENNAS]
     best = min(shaped, key=lambda one: float(np.var(one.left_db)))
     # An antenna with a shape is taken where it leaves 3 % less than none.
     if np.var(best.left_db) >= 0.97 * np.var(plain.left_db):
@@ -66,11 +66,15 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     # A reading has the variance that is left, as much larger as values that last are worth less than their number.
     both = best.left_db.mean(axis=0)
     scale_db2 = float(np.var(best.left_db) * 2 * len(both) / effective_size(both, flight.pair))
-    solved = _solve(flight, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
+    solved = _solve(flight, power, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
     if solved.loss_db < 0:
         # Reflections are not stronger than what they replace; what looks like that is something else.
         reflected = np.zeros(len(flight))
-        solved = _solve(flight, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
+        solved = _solve(flight, power, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
+    elif enough and solved.loss_db > 0:
+        # Detours shorter than the noise of ranges show in powers.
+        reflected = _by_power(solved, reflected)
+        solved = _solve(flight, power, reflected, best.antenna, rounds=5, scale_db2=scale_db2)
     # Where a tag was seen from one side only, its antenna can take its offsets over; towards there they count together.
     seen = _mean_gains(flight, solved.pattern_db)
     level, own, tx, offset = _split(*(solved.tags_db + seen))
@@ -78,8 +82,9 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     both = solved.left_db.mean(axis=0)
     _, life = lasting(flight.time_s, flight.pair, both, float(flight.time_s[-1])) if fading > 0 else (0.0, None)
     return PowerFit(
+        saturation_dbm=saturation,
         at_1m_dbm=solved.at_1m_dbm + level,
-        exponent=solved.exponent if np.std(np.log10(flight.distance_m)) >= MIN_LOG_SPREAD else None,
+        exponent=solved.exponent if _tells_path_loss(flight) else None,
         antenna=solved.antenna,
         tx_db=tx,
         offset_db=offset,
@@ -93,7 +98,38 @@ def fit_powers(flight: Flight, reflected: Floats) -> PowerFit:
     )
 
 
-def _solve(flight: Flight, reflected: Floats, antenna: str, *, rounds: int, scale_db2: float = 100.0) -> _Solved:
+def _tells_path_loss(flight: Flight) -> bool:
+    """Return whether distances differ by more than some 12 %."""
+    return bool(np.std(np.log10(flight.distance_m)) >= 0.05)
+
+
+def _unsaturated(flight: Flight, reflected: Floats) -> tuple[float | None, Floats]:
+    """Return where readings of power end, and the powers (2, n) without this saturation.
+
+    They end where they would without saturation exceed their maximum so often that chance leaves none there with a
+    probability of 1 %. Where they end is the likeliest of some levels above the maximum.
+    """
+    direct = np.flatnonzero(reflected < 0.5)
+    some = flight[direct[some_rows(len(direct), 4000)]]
+    highest = float(flight.power_dbm.max())
+
+    def fitted(end_dbm: float) -> tuple[Floats, float]:
+        power, slope = before_saturation_dbm(some.power_dbm, end_dbm)
+        left = _solve(some, power, np.zeros(len(some)), "isotropic", rounds=1).left_db
+        return left, float(np.sum(np.log(slope)) - left.size * np.log(np.std(left) + 1e-6))
+
+    left, _ = fitted(np.inf)
+    below = np.searchsorted(np.sort(left.ravel()), highest - (some.power_dbm - left).ravel(), side="right") / left.size
+    worth = effective_size(left.mean(axis=0), some.pair) / len(some)
+    if np.exp(-worth * np.sum(1 - below)) > 0.01:
+        return None, flight.power_dbm
+    end = float(max(highest + np.array([0.1, 0.2, 0.4, 0.8, 1.6, 3.2]), key=lambda level: fitted(level)[1]))
+    return end, before_saturation_dbm(flight.power_dbm, end)[0]
+
+
+def _solve(
+    flight: Flight, power_dbm: Floats, reflected: Floats, antenna: str, *, rounds: int, scale_db2: float = 100.0
+) -> _Solved:
     """Solve one penalized least-squares problem: two readings an exchange, weighed anew in each of the rounds.
 
     `scale_db2` is the variance in dB^2 with which a reading tells something of an antenna. Offsets of tags are thought
@@ -118,9 +154,9 @@ def _solve(flight: Flight, reflected: Floats, antenna: str, *, rounds: int, scal
             for k in range(size):
                 columns[rows, first + k] += wave[:, k]
         blocks.append(columns)
-        readings.append(flight.power_dbm[1 - receiver] - gain)
+        readings.append(power_dbm[1 - receiver] - gain)
     design, value = np.vstack(blocks), np.concatenate(readings)
-    exponent = 1e9 if np.std(np.log10(flight.distance_m)) < MIN_LOG_SPREAD else 0.0
+    exponent = 0.0 if _tells_path_loss(flight) else 1e9
     fine = [scale_db2 * (k / 2.0) ** 2 for k in range(1, degree + 1) for _ in range(2 * k + 1)]
     penalty = np.array([0.0, exponent, 1e-6] + [scale_db2 / 4.0**2] * (2 * tags) + fine * tags)
     prior, weight = np.zeros(design.shape[1]), np.ones(len(value))
@@ -141,6 +177,13 @@ def _solve(flight: Flight, reflected: Floats, antenna: str, *, rounds: int, scal
         pattern_db=found[3 + 2 * tags :].reshape(tags, size),
         left_db=left.reshape(2, -1),
     )
+
+
+def _by_power(solved: _Solved, reflected: Floats) -> Floats:
+    """Return the probabilities (n,) that ranges were reflected, by their powers, too, which reflections lower."""
+    above = solved.left_db.mean(axis=0) - reflected * solved.loss_db
+    spread = max(bulk_spread(above[reflected < 0.5]), 0.1)
+    return np.asarray(expit(logit(reflected) + (above**2 - (above + solved.loss_db) ** 2) / (2 * spread**2)))
 
 
 def _mean_gains(flight: Flight, pattern_db: Floats) -> Floats:

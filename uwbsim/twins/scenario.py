@@ -16,11 +16,10 @@ from uwblink.recording.schema import Poses
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.linked_files import MOST_POSES
 from uwbsim.scenario.radio import Radio, TwoStateMultipath
-from uwbsim.twins.calibration_file import KnownDevices
 from uwbsim.twins.clocks import ClockFit
 from uwbsim.twins.flight import SHORTEST_LIFE_S, Flight, ScheduleFit, attitude, bulk_spread
 from uwbsim.twins.powers import PowerFit
-from uwbsim.twins.reflections import ReflectionFit
+from uwbsim.twins.range_errors import KnownDevices, RangeErrors
 from uwbsim.units import NS, NS_PER_S, PS_PER_S
 from uwbsim.world.radio import lifted
 
@@ -78,7 +77,7 @@ class Fitted:
 
     clocks: ClockFit
     noise: ReceiveNoise
-    reflections: ReflectionFit
+    errors: RangeErrors
     powers: PowerFit
     schedule: ScheduleFit
 
@@ -171,9 +170,9 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
     }
     if powers.exponent is not None:
         found["path_loss_exponent"] = max(powers.exponent, 0.0)
-    shift = fitted.reflections.core_mean_m
-    curve = known.bias.model_dump(mode="json")
-    found["bias"] = curve | {"coefficients": [value + shift for value in curve["coefficients"]]}
+    if powers.saturation_dbm is not None:
+        found["saturation_dbm"] = powers.saturation_dbm
+    found["bias"] = known.bias.model_dump(mode="json")
     found["rx_noise_ps"], noise = 0.0, fitted.noise
     if len(noise.std_s) == 1:
         found["rx_noise_ps"] = float(noise.std_s[0]) * PS_PER_S
@@ -195,7 +194,7 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
 
 
 def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any]:
-    found, powers = fitted.reflections, fitted.powers
+    found, powers = fitted.errors, fitted.powers
     if found.share < 0.002 and found.direct_std_m == 0:
         return {}
     loss = powers.reflection_loss_db
@@ -205,6 +204,7 @@ def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any]:
         "share": found.share,
         "share_std": min(found.share_std, 0.9 * float(np.sqrt(found.share * (1 - found.share)))),
         "mean_excess_m": found.mean_excess_m,
+        "excess_shape": found.excess_shape,
         "direct_std_m": found.direct_std_m,
         "life_s": default.life_s if found.life_s is None else max(found.life_s, SHORTEST_LIFE_S),
         "life_spread": min(found.life_spread, 2.0),
@@ -236,7 +236,7 @@ def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[st
         "id": tag.tag,
         "body": tag.body,
         "lever_arm_m": list(tag.lever_arm_m),
-        "delay_ns": known.calibration.delays_ns[tag.tag],
+        "delay_ns": known.calibration.delays_ns[tag.tag] + fitted.errors.delays_ns[tag.tag],
         "skew_ppm": float(np.clip(clocks.skew_ppm[k], -100, 100)),
         "drift_ppm_per_sqrt_s": float(clocks.walk_ppm_per_sqrt_s[k]),
         "tx_power_db": float(powers.tx_db[k]),
@@ -308,7 +308,6 @@ ALWAYS: Final = (
     "Noise of transmissions (tx_noise_ps: none): it is in that of receptions.",
     "How a delay splits into transmission and reception: 0.44 to 0.56.",
     "What a reflection does to total power and to impulse responses (total_loss_db, rise_ns).",
-    "The shape of detours: exponential (excess_shape).",
     "Which of antenna, transmitter and receiver makes a tag's powers weak: what differs between the two directions is "
     "put on one of transmitter and receiver (the median tag has no difference), and the rest on the antenna.",
     "Powers that were never heard: sensitivity_dbm is the default or just below the weakest reading; capture_db and "
@@ -329,13 +328,9 @@ SOMETIMES: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...]] = (
         "Why dt64/dt53 is off by {ratio_bias:+.2g} ppm against the carrier readings: nothing in a scenario makes that.",
     ),
     (
-        lambda flight, fitted: fitted.reflections.life_s is None and fitted.reflections.share > 0,
+        lambda flight, fitted: fitted.errors.life_s is None and fitted.errors.share > 0,
         "How long reflections last (life_s): a pair ranges again after {interval:.2g} s, and by then nothing is left "
         "that is seen.",
-    ),
-    (
-        lambda flight, fitted: fitted.reflections.share > 0 and fitted.reflections.share_std == 0,
-        "Whether pairs have different shares of reflections: they differ no more than by chance, and have the same.",
     ),
     (
         lambda flight, fitted: fitted.powers.exponent is None,

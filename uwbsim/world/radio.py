@@ -141,17 +141,25 @@ def lifted(power_dbm: Floats) -> Floats:
     return np.asarray(10 ** ((power_dbm - ALPHA_DBM) / 10))
 
 
+SATURATION_SHARPNESS: Final = 1.5
+"""Fitted to the ICRA 2023 flights, half of whose readings end within 3 dB of their highest."""
+
+
 def reported_dbm(radio: Radio, power_dbm: Floats) -> Floats:
     """Return the first-path powers that receivers read: the same, or saturating.
 
-    The inverses of the lifted powers to the power of `sharpness` add up with that of the highest. The sharpness was
-    fitted to the ICRA 2023 flights, half of whose readings end within 3 dB of their highest.
+    The inverses of the lifted powers to the power of `SATURATION_SHARPNESS` add up with that of the highest.
     """
     if radio.saturation_dbm is None:
         return power_dbm
-    sharpness = 1.5
-    above = sharpness / 10 * (power_dbm - radio.saturation_dbm)
-    return np.asarray(power_dbm - 10 / sharpness * np.log10(1 + 10**above))
+    above = SATURATION_SHARPNESS / 10 * (power_dbm - radio.saturation_dbm)
+    return np.asarray(power_dbm - 10 / SATURATION_SHARPNESS * np.log10(1 + 10**above))
+
+
+def before_saturation_dbm(reading_dbm: Floats, saturation_dbm: float) -> tuple[Floats, Floats]:
+    """Return the powers whose readings saturate below `saturation_dbm`, and their slopes by the readings."""
+    left = 1 - 10 ** (SATURATION_SHARPNESS / 10 * (reading_dbm - saturation_dbm))
+    return np.asarray(reading_dbm - 10 / SATURATION_SHARPNESS * np.log10(left)), 1 / left
 
 
 def reception_bias_s(radio: Radio, power_dbm: Floats, total_dbm: Floats | None = None) -> Floats:

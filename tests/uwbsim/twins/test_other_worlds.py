@@ -61,6 +61,18 @@ def test_losses_come_in_bursts(found):
     assert found.found["reflected_share"] == 0.0
 
 
+def test_readings_that_saturate_are_told_from_powers_that_end():
+    tables = antennas()
+    tables["radio"] |= {"saturation_dbm": -82.0}
+    saturated = uwbsim.twin(uwbsim.simulate(tables, contention=False), known(tables))
+    assert saturated.found["saturation_dbm"] == pytest.approx(-82.0, abs=0.3)
+    assert saturated.found["path_loss_exponent"] == pytest.approx(2.4, abs=0.2)
+
+
+def test_powers_without_saturation_have_none(found):
+    assert found.found["saturation_dbm"] is None
+
+
 def test_a_mast_stands_and_robots_fly_as_recorded(found):
     motions = {body.name: body.motion for body in found.scenario.bodies}
     assert [motion.model for motion in motions.values()] == ["recorded", "recorded", "static"]

@@ -13,6 +13,7 @@ from uwblink import Poses, UwblinkError, load
 from uwbsim.cli import main
 from uwbsim.cli.commands import app
 from uwbsim.cli.workbench import _print
+from uwbsim.twins import LEVEL
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def test_reflections_are_found(found):
     assert found.found["reflection_life_s"] == pytest.approx(0.25, rel=0.2)
     assert found.found["mean_excess_m"] == pytest.approx(0.45, rel=0.2)
     assert found.found["reflection_loss_db"] == pytest.approx(6.0, abs=0.5)
-    assert found.found["core_mean_m"] == pytest.approx(0.0, abs=0.003)
+    assert found.found["mean_delay_ns"] == pytest.approx(0.0, abs=0.01)
     assert found.found["direct_std_m"] < 0.01
 
 
@@ -87,9 +88,19 @@ def test_a_saved_twin_flies_the_same_ways(found, flight, tmp_path):
 
 def test_a_twin_of_a_twin_is_alike(found):
     compared = {one.name: one for one in found.compare(1)}
-    assert compared["sum of both carrier readings"].alike
-    assert compared["residual of calibrated ranges"].alike
+    assert compared["sum of both carrier readings"].verdict == "alike"
+    assert compared["residual of calibrated ranges"].verdict == "alike"
     assert compared["reply dt32"].to_dict()["probability"] > 0.01
+
+
+def test_what_persists_differently_is_not_alike(found):
+    """The same values at other instants: their distribution is alike, their autocorrelation is not."""
+    shuffled = np.random.default_rng(4).permutation(len(found.measured))
+    moved = replace(found.measured, residual_m=found.measured.residual_m[shuffled])
+    one = {c.name: c for c in replace(found, measured=moved).compare(1)}["residual of calibrated ranges"]
+    assert one.probability > LEVEL / 2
+    assert one.lag1_probability < LEVEL / 2
+    assert one.verdict == "differ"
 
 
 def test_the_command_writes_a_scenario_and_a_page(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from calib import Calibration
 from tests.uwbsim.twins.worlds import known, world
 from uwbsim.scenario.radio import Radio
-from uwbsim.twins.calibration_file import read_calibration
+from uwbsim.twins.range_errors import read_calibration
 from uwbsim.world.radio import reception_bias_s
 
 CURVE = {"knots": [0.01] * 4 + [1.8] * 4, "coefficients": [-0.07, 0.32, -0.18, -0.08], "degree": 3}

@@ -1,0 +1,213 @@
+"""What calibrations say of a flight: delays, the bias curve, and what `calib.fit` finds the errors of ranges to be.
+
+This is the one place where `uwbsim` imports `calib`. The error model is that of every fit: direct ranges with normal
+noise, reflections by pair, outliers. How long reflections last follows from autocovariances.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from uwblink.arrays import Floats
+from uwblink.ticks import SPEED_OF_LIGHT
+from uwblink.twr import Exchanges, intervals
+from uwbsim.errors import ScenarioError, UnanswerableError
+from uwbsim.scenario.radio import Spline, TwoStateMultipath
+from uwbsim.twins.flight import Flight, lasting
+
+if TYPE_CHECKING:
+    from calib import Calibration
+
+CalibrationSource = str | os.PathLike[str] | Mapping[str, Any] | Any
+"""A calibration: its file, its JSON as nested tables, or a `calib.Calibration`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownDevices:
+    """What a calibration knows, `where` it is from, and its bias curve over the scenario's lifted power."""
+
+    where: str
+    calibration: Calibration
+    bias: Spline
+
+    def corrected_m(self, exchanges: Exchanges) -> Floats:
+        """Return calibrated ranges in metres (n,); raises `ScenarioError` for tags that the calibration lacks."""
+        from calib import Ranges
+
+        self.require(np.unique([exchanges.initiator, exchanges.target]).tolist())
+        return self.calibration.apply(Ranges.from_exchanges(exchanges)).corrected_m
+
+    def require(self, tags: list[int]) -> None:
+        """Raise `ScenarioError` unless the calibration has a delay for each of these tags."""
+        missing = [tag for tag in tags if tag not in self.calibration.delays_ns]
+        if missing:
+            known = ", ".join(map(str, sorted(self.calibration.delays_ns)))
+            raise ScenarioError(
+                f"{self.where}: no delay for tag {', '.join(map(str, missing))} of the recording; it knows {known}; "
+                "fit one from a recording with all tags"
+            )
+
+
+def read_calibration(source: CalibrationSource) -> KnownDevices:
+    """Return what a calibration knows of devices; raises `ScenarioError`, one line that names file and key."""
+    from calib import CalibError, Calibration, load_calibration
+
+    where = str(source) if isinstance(source, str | os.PathLike) else "calibration"
+    try:
+        if isinstance(source, Calibration):
+            found = source
+        elif isinstance(source, Mapping):
+            found = Calibration.from_json(json.dumps(source), where)
+        elif isinstance(source, str | os.PathLike):
+            found = load_calibration(source)
+        else:
+            raise ScenarioError(f"calibration: found {source!r:.60}, expected a file (.json) or a calibration")
+    except CalibError as error:
+        raise ScenarioError(str(error)) from error
+    if found.groups:
+        raise ScenarioError(
+            f"{where}: groups: its tags have curves by group, and a scenario has one; fit one curve for all tags"
+        )
+    if found.pair_offsets:
+        raise ScenarioError(
+            f"{where}: pair_offsets: it knows constants of pairs, and a scenario has delays of tags; fit delays"
+        )
+    # A scenario lifts powers about -82 dBm: 10^((p - alpha)/10) of the calibration differs by a factor.
+    scale, curve = 10 ** ((found.alpha_dbm + 82.0) / 10), found.bias_curve
+    knots = tuple(knot * scale for knot in curve.knots)
+    try:
+        bias = Spline(knots=knots, coefficients=curve.coefficients, degree=curve.degree)
+    except ValidationError as error:
+        raise ScenarioError(f"{where}: bias_curve: {error.errors()[0]['msg']}") from error
+    return KnownDevices(where=where, calibration=found, bias=bias)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeErrors:
+    """The errors of calibrated ranges: all lengths in metres.
+
+    `delays_ns` is what the flight adds to the delays of tags, by id. `direct_std_m` is the spread of direct ranges
+    beyond the noise of receive stamps; `share` that of reflected ranges; `mean_excess_m` the mean of their detours and
+    `excess_shape` the shape of a gamma distribution with their mean and variance. `pair_share`, `pair_excess_m` and
+    `pair_life_s` are those of pairs (pairs,), drawn towards all by how little each tells; `share_std` and
+    `life_spread` their spread between pairs. `life_s` is None where the recording does not tell it. `reflected` (n,)
+    is the probability that a range was reflected.
+    """
+
+    delays_ns: dict[int, float]
+    direct_std_m: float
+    share: float
+    share_std: float
+    mean_excess_m: float
+    excess_shape: float
+    life_s: float | None
+    life_spread: float
+    pair_share: Floats
+    pair_excess_m: Floats
+    pair_life_s: Floats
+    reflected: Floats
+
+    @property
+    def mean_ns(self) -> float:
+        """Return the mean of what the flight adds to delays."""
+        return float(np.mean(list(self.delays_ns.values())))
+
+
+def fit_range_errors(flight: Flight, receive_noise_s: Floats) -> RangeErrors:
+    """Fit a flight whose receive stamps have noises (n,) in seconds, zero where none is known.
+
+    Powers are withheld from the fit: reflections are weaker than direct paths, so a second bias curve beside that of
+    the calibration would follow them. Raises `UnanswerableError` where `calib.fit` cannot answer.
+    """
+    from calib import CalibError, Ranges, fit
+
+    x, pair, count = flight.exchanges, flight.pair, len(flight.pairs)
+    ranges = Ranges.from_arrays(
+        flight.distance_m + flight.residual_m,
+        initiator=x.initiator,
+        target=x.target,
+        fpp1_dbm=-82.0,
+        truth_m=flight.distance_m,
+        time_ns=x.time_ns,
+        source=flight.where,
+    )
+    try:
+        found = fit(ranges, minimum_norm=True).calibration
+    except CalibError as error:
+        raise UnanswerableError(str(error)) from error
+    if found.errors is None:
+        raise UnanswerableError(f"{flight.where}: the errors of its ranges have no spread")
+    applied = found.apply(ranges)
+    shapes = found.errors.shapes(applied.lifted, x.initiator, x.target)
+    excess, reflected = found.errors.least_m + shapes.detour_m, applied.tail_probability
+    white = range_noise_m(flight, receive_noise_s)
+    direct = float(np.sqrt(np.maximum(np.mean(shapes.noise_m**2 - white**2), 0.0)))
+    mean, shape, share = TwoStateMultipath(model="two-state").mean_excess_m, 1.0, np.zeros(count)
+    pair_excess, life, lives = np.full(count, mean), None, (np.full(count, np.nan), 0.0)
+    # Fewer than five ranges that are rather reflected than direct are no tail.
+    if np.count_nonzero(reflected > 0.5) < 5:
+        reflected = np.zeros(len(x))
+    else:
+        mean = float(np.average(excess, weights=reflected))
+        square = float(np.average(found.errors.square_m2(shapes.detour_m), weights=reflected))
+        shape = mean**2 / (square - mean**2)
+        number = np.bincount(pair, minlength=count)
+        share, pair_excess = (np.bincount(pair, v, count) / number for v in (shapes.tail_share, excess))
+        _, life = lasting(flight.time_s, pair, reflected, float(flight.time_s[-1]))
+        lives = lives if life is None else _lives(flight, reflected, life, share)
+    # Ranges of two messages err by the skew of the clocks, which the fit takes for delays and the twin simulates.
+    from_delays = len(flight.row.messages) > 2
+    return RangeErrors(
+        delays_ns={tag: delay if from_delays else 0.0 for tag, delay in found.delays_ns.items()},
+        direct_std_m=direct,
+        share=float(reflected.mean()),
+        share_std=float(np.std(share)),
+        mean_excess_m=mean,
+        excess_shape=shape,
+        life_s=life,
+        life_spread=lives[1],
+        pair_share=share,
+        pair_excess_m=pair_excess,
+        pair_life_s=lives[0],
+        reflected=reflected,
+    )
+
+
+def range_noise_m(flight: Flight, receive_noise_s: Floats) -> Floats:
+    """Return the spread of a range whose stamps have a noise in seconds: c s sqrt((1 + r + r^2)/2) (docs/theory.md)."""
+    spans, ratio = intervals(flight.exchanges), np.zeros(len(flight))
+    if len(flight.row.messages) > 2:
+        ratio = spans.dt32 / np.maximum(spans.dt53, 1.0)
+    return np.asarray(SPEED_OF_LIGHT * receive_noise_s * np.sqrt((1 + ratio + ratio**2) / 2))
+
+
+def _lives(flight: Flight, reflected: Floats, life_s: float, share: Floats) -> tuple[Floats, float]:
+    """Return the lives of pairs, drawn towards that of all, and their spread in logarithms.
+
+    The logarithm of a life has the variance 2/spells. That between pairs is estimated by moments (DerSimonian and
+    Laird 1986).
+    """
+    span = float(flight.time_s[-1])
+    value, noise = np.full(len(share), np.log(life_s)), np.full(len(share), np.inf)
+    for k, spells in enumerate(2 * share * (1 - share) * span / life_s):
+        rows = np.flatnonzero(flight.pair == k)
+        if len(rows) < 30 or spells < 6:
+            continue
+        _, mine = lasting(flight.time_s[rows], np.zeros(len(rows), np.int64), reflected[rows], span)
+        if mine is not None:
+            value[k], noise[k] = float(np.log(mine)), 2 / spells + 0.01
+    weight, told = 1 / noise, np.count_nonzero(np.isfinite(noise))
+    if told < 3:
+        return np.full(len(share), life_s), 0.0
+    total, mean = weight.sum(), np.average(value, weights=weight)
+    excess = np.sum(weight * (value - mean) ** 2) - (told - 1)
+    between = float(max(excess / (total - np.sum(weight**2) / total), 0.0))
+    kept = between * weight / (between * weight + 1)
+    return np.exp(np.log(life_s) + kept * (value - np.log(life_s))), float(np.sqrt(between))
