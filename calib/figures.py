@@ -19,8 +19,8 @@ from calib.calibration.comparison import Comparison
 from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
+from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
-from calib.range_errors.error_mixture import fit_error_mixtures
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE, look
@@ -37,8 +37,11 @@ STAGE_LINES: Final[dict[str, dict[str, Any]]] = {
 PLANTED: Final[dict[str, Any]] = {"color": GREEN, "ls": (0, (5, 1.5))}
 """How the curve of a simulation is drawn."""
 
-FEWEST_IN_BIN: Final = 60
-"""Errors of which a core can be told from a tail; below, their median stands for both."""
+MIN_RANGES_PER_BIN: Final = 60
+"""Of so many, a tenth of them reflected, the parts of errors are known to 15 %; of fewer the median is drawn."""
+
+MOST_RANGES_PER_BIN: Final = 2000
+"""Of so many the centre is known to a fortieth of the noise, less than a drawn point."""
 
 MOST_PAIRS: Final = 24
 """Pairs whose errors are drawn over time, those with the largest spread; more would be too small to see."""
@@ -83,21 +86,19 @@ def over_power(
 def _all_binned(sets: Mapping[str, tuple[Floats, Floats, int]], loss: str) -> dict[str, Binned]:
     """Return binned errors of sets (lifted powers, errors, number of bins); all cores are fitted at once."""
     groups = {
-        name: np.array_split(np.argsort(x), max(1, min(bins, len(x) // FEWEST_IN_BIN)))
+        name: np.array_split(np.argsort(x), max(1, min(bins, len(x) // MIN_RANGES_PER_BIN)))
         for name, (x, _, bins) in sets.items()
     }
     errors = [sets[name][1][rows] for name, some in groups.items() for rows in some]
-    if loss == "l2":
-        centres = [(float(np.mean(error_m)), float(np.std(error_m))) for error_m in errors]
-    else:
-        centres = [(float(np.median(error_m)), float(np.std(error_m))) for error_m in errors]
-        told = [k for k, e in enumerate(errors) if len(e) >= FEWEST_IN_BIN and float(np.ptp(e)) >= 1e-9]
-        for k, core in zip(told, fit_error_mixtures([errors[k] for k in told]), strict=True):
-            centres[k] = (core.location_m, float(core.sigma_m[0]))
+    centres = np.array([(np.mean(e) if loss == "l2" else np.median(e), np.std(e)) for e in errors])
+    told = [k for k, e in enumerate(errors) if len(e) >= MIN_RANGES_PER_BIN and float(np.ptp(e)) >= 1e-9]
+    if loss != "l2" and told:
+        core = fit_grouped_errors([errors[k] for k in told], MOST_RANGES_PER_BIN)
+        centres[told] = np.column_stack([core.centre_m, core.sigma_m])
     found, first = {}, 0
     for name, some in groups.items():
         x, error_m, _ = sets[name]
-        own = np.array(centres[first : first + len(some)])
+        own = centres[first : first + len(some)]
         first += len(some)
         medians = [(np.median(x[rows]), np.median(error_m[rows])) for rows in some]
         powers, middles = np.array(medians).T

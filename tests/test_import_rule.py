@@ -25,6 +25,7 @@ CONFINED = {
         path
         in {
             "calib/fitting/fitting.py",
+            "calib/fitting/new_tag.py",
             "calib/planning/flights.py",
             "calib/surveys/survey.py",
             "calib/trajectories/fitting.py",

@@ -102,6 +102,7 @@ class Recipe:
     curve: bool = True
     constants: str = "tag"
     sequential: bool = False
+    min_ranges: int = FEWEST_RANGES
 
 
 def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
@@ -148,9 +149,9 @@ class Fitted:
 
 def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeModel:
     """Return the model of ranges in order of time; raises what `fit_known_distances` raises."""
-    if len(ranges) < FEWEST_RANGES:
+    if len(ranges) < recipe.min_ranges:
         raise UnanswerableError(
-            f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
+            f"{ranges.source}: {len(ranges)} usable exchanges are too few, at least {recipe.min_ranges} are needed"
         )
     model = RangeModel.of(
         in_order(ranges),

@@ -21,13 +21,15 @@ from numpy.typing import NDArray
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lift
 from calib.data.sources import Data, opened
-from calib.range_errors.error_mixture import fit_error_mixture
+from calib.estimator.grouped_errors import fit_grouped_errors
+from calib.estimator.range_model import METRES_A_NS
 from uwblink.arrays import Floats
 from uwblink.protocols.table import third_from_target
 from uwblink.recording.distances import distances_m
 from uwblink.ticks import REPORT_BITS, SPEED_OF_LIGHT, TICK_S, elapsed
 
-FEWEST: Final = 50
+MIN_OVERHEARD: Final = 50
+"""Of so many, the mean is known to a seventh of the noise of a delay; of fewer it would tell little."""
 PLAUSIBLE_NS: Final = 100.0
 
 
@@ -69,7 +71,7 @@ def heard_delays(data: Data, calibration: Calibration) -> dict[int, OverheardDel
     found = {}
     for tag in np.unique(heard["target"]).tolist():
         values = delay_ns[good & (heard["target"] == tag)]
-        if len(values) >= FEWEST:
+        if len(values) >= MIN_OVERHEARD:
             found[int(tag)] = _centre(values)
     return found
 
@@ -80,14 +82,12 @@ def _span(heard: dict[str, NDArray[Any]], later: str, earlier: str) -> Floats:
 
 
 def _centre(values: Floats) -> OverheardDelay:
-    """Reflections lengthen three receptions: two of them shorten the delay, one lengthens it.
+    """Return the centre of the noise of delays (n,).
 
-    The balance is a tail on the short side, which the mixture tells from the core; what it leaves of the other tail
-    counts as outliers.
+    Reflections lengthen three receptions: two of them shorten the delay, one lengthens it. The balance is a tail on the
+    short side, which the likelihood of ranges tells from noise when the sign is changed.
     """
-    sign, bins = -values * 1e-9 * SPEED_OF_LIGHT, np.zeros(len(values), dtype=np.int64)
-    mixture = fit_error_mixture(sign, bins, 1)
-    scale = 1e9 / SPEED_OF_LIGHT
-    clean = max(1 - mixture.tail_share - mixture.outlier_share, 1e-3)
-    std = float(mixture.sigma_m[0]) * scale / float(np.sqrt(clean * len(values)))
-    return OverheardDelay(float(-mixture.location_m * scale), std, len(values))
+    parts = fit_grouped_errors([-values * METRES_A_NS])
+    return OverheardDelay(
+        -float(parts.centre_m[0]) / METRES_A_NS, float(parts.centre_std_m[0]) / METRES_A_NS, len(values)
+    )

@@ -9,10 +9,10 @@ import numpy as np
 
 from calib import figures
 from calib.calibration.model import curve_rows
+from calib.estimator.grouped_errors import fit_grouped_errors
 from calib.evaluation.localization import PAPER_RMSE_M, Localization, summarize
 from calib.evaluation.statistics import CORRECTION_STAGES, ErrorStatistics, pair_rows
 from calib.evaluation.tracking import Settings
-from calib.range_errors.error_mixture import fit_error_mixtures
 from calib.report.figures import FILTER_NAMES, rmse_bars, track
 from calib.report.results import Results
 from uwblink.pages.blocks import Block, Heading, Picture, Table, Text
@@ -126,26 +126,32 @@ def outliers(results: Results) -> list[Block]:
     error = applied.corrected_m - ranges.truth_m
     z = error / applied.sigma_m
     groups = {**pair_rows(ranges), "all": np.ones(len(ranges), dtype=bool)}
-    told = {name: mine for name, mine in groups.items() if np.count_nonzero(mine) >= figures.FEWEST_IN_BIN}
-    mixtures = fit_error_mixtures([error[mine] for mine in told.values()])
-    for (name, mine), mixture in zip(told.items(), mixtures, strict=True):
+    told = {name: mine for name, mine in groups.items() if np.count_nonzero(mine) >= figures.MIN_RANGES_PER_BIN}
+    if not told:
+        return []
+    parts = fit_grouped_errors([error[mine] for mine in told.values()])
+    for k, (name, mine) in enumerate(told.items()):
+        shares = (100 * float(np.mean(side)) for side in (z[mine] > 3, z[mine] < -3))
         rows.append(
             [
                 name,
-                f"{100 * np.mean(z[mine] > 3):.1f} %",
-                f"{100 * np.mean(z[mine] < -3):.1f} %",
-                f"{100 * mixture.sigma_m[0]:.1f}",
-                f"{100 * mixture.tail_share:.1f} %",
-                f"{100 * mixture.tail_mean_m:.0f}",
-                f"{100 * mixture.outlier_share:.2f} %",
+                *(f"{share:.1f} %" for share in shares),
+                f"{100 * parts.sigma_m[k]:.1f}",
+                f"{100 * parts.reflected[k]:.1f} %",
+                f"{100 * parts.detour_m[k]:.0f}",
+                f"{100 * parts.outliers[k]:.2f} %",
             ]
         )
     return [
         Heading("Outliers"),
-        Table(["pair", "too long", "too short", "core (cm)", "tail", "its mean (cm)", "outliers"], rows, total=True),
+        Table(
+            ["pair", "too long", "too short", "noise (cm)", "reflected", "mean detour (cm)", "outliers"],
+            rows,
+            total=True,
+        ),
         Text(
-            "Too long and too short: share of ranges beyond three sigmas. Core, tail and outliers: a Gaussian, an "
-            "exponential detour on the long side, and what fits neither, by maximum likelihood.",
+            "Too long and too short: share of ranges beyond three sigmas. Noise, reflections, their mean detour and "
+            "outliers: what the errors of each pair are made of, by the likelihood of the fit.",
             "note",
         ),
     ]

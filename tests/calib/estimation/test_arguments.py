@@ -59,7 +59,7 @@ def test_numpy_numbers_are_numbers():
     assert numpy.calibration.to_json() == plain.calibration.to_json()
 
 
-@pytest.mark.parametrize(("tag", "loss", "parameter"), [(-1, "l2", "tag"), (7, "mixture", "loss"), (1, "l2", "tag")])
+@pytest.mark.parametrize(("tag", "loss", "parameter"), [(-1, "l2", "tag"), (7, "arctan", "loss"), (1, "l2", "tag")])
 def test_a_new_tag_is_checked(tag, loss, parameter):
     r = ranges(1200)
     known = fit(r[(r.initiator != 7) & (r.target != 7)]).calibration
