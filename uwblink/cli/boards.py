@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-import sys
+import statistics
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import uwblink
 from uwblink.cli.guide import add, choice, starting
 from uwblink.cli.options import AsJson, Force, Plot, count
 from uwblink.cli.shared import INTERRUPTED, interrupts, print_json
+from uwblink.errors import RangingFailedError, RecordingError, RefusedError, UwblinkError
+from uwblink.output import check_output
 
 if TYPE_CHECKING:
     from uwblink.wire import RangeReport
@@ -56,16 +59,14 @@ def ports(
 
     Nothing is written to a port without --probe.
     """
-    from uwblink import Board
     from uwblink.boards import boards_ports
-    from uwblink.errors import UwblinkError
 
     known: dict[str, dict[str, Any]] = {port.device: asdict(port) for port in boards_ports()}
     unknown = {"description": "", "serial_number": None}
     rows = [known.get(name, {"device": name, **unknown}) for name in names or known]
     for row in rows if probe else ():
         try:
-            with Board.open(str(row["device"])) as board:
+            with uwblink.Board.open(str(row["device"])) as board:
                 row["board"] = board.id
         except UwblinkError as error:
             row["error"] = str(error)
@@ -84,11 +85,10 @@ def ports(
 
 def info(port: Port, as_json: AsJson = False) -> None:
     """Print a board's id and longest frame."""
-    from uwblink import Board
     from uwblink.boards import serial_number
     from uwblink.wire import GetMaxFrame, MaxFrameReport
 
-    with Board.open(port) as board:
+    with uwblink.Board.open(port) as board:
         longest = board.request(GetMaxFrame())
         facts = {
             "port": port,
@@ -113,12 +113,10 @@ def twr(
     as_json: AsJson = False,
 ) -> None:
     """Range with another board; a line for each range, and a summary at the end, also after Ctrl-C."""
-    from uwblink import Board
-    from uwblink.errors import RangingFailedError
 
     ranges: list[float] = []
     failures: list[RangingFailedError] = []
-    with interrupts() as stop, Board.open(port) as board:
+    with interrupts() as stop, uwblink.Board.open(port) as board:
         initiator = board.id
         while len(ranges) + len(failures) < exchanges and not stop():
             try:
@@ -130,25 +128,17 @@ def twr(
                 continue
             ranges.append(report.range_m)
             row = {"initiator": initiator, "target": target, **_fields(report)}
-            _print_now(json.dumps(row) if as_json else _line(initiator, report))
+            typer.echo(json.dumps(row) if as_json else _line(initiator, report))
         interrupted = stop()
     if failures and not ranges and not interrupted:
         raise failures[-1]
     if as_json or exchanges > 1:
-        _print_now(_summary_of(ranges, len(failures), exchanges, as_json=as_json))
+        typer.echo(_summary_of(ranges, len(failures), exchanges, as_json=as_json))
     if interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
-def _print_now(line: str) -> None:
-    """Print a line so that a program that reads it through a pipe has it at once."""
-    typer.echo(line)
-    sys.stdout.flush()
-
-
 def _summary_of(ranges: list[float], failed: int, asked: int, *, as_json: bool) -> str:
-    import statistics
-
     mean = statistics.fmean(ranges) if ranges else None
     spread = statistics.stdev(ranges) if len(ranges) > 1 else None
     if as_json:
@@ -173,9 +163,8 @@ def _fields(report: RangeReport) -> dict[str, float]:
 
 def test(port: Port) -> None:
     """Have a board echo one field of each kind."""
-    from uwblink import Board
 
-    with Board.open(port) as board:
+    with uwblink.Board.open(port) as board:
         board.test()
         typer.echo(f"{port}: board {board.id} echoes every kind of field")
 
@@ -185,9 +174,8 @@ def set_delay(
     delay_uus: Annotated[int, typer.Argument(metavar="N", help="280 to 6500, in units of 512/499.2 us.")],
 ) -> None:
     """Set the response delay of double-sided exchanges for which this board is the target (C08)."""
-    from uwblink import Board
 
-    with Board.open(port) as board:
+    with uwblink.Board.open(port) as board:
         board.set_response_delay(delay_uus)
     typer.echo(f"{port}: response delay {delay_uus} ({delay_uus * 512 / 499.2 + 0.25641:.1f} µs), until power is lost")
 
@@ -196,22 +184,19 @@ def passive(
     port: Port, state: Annotated[str, typer.Argument(help="Whether to listen.", **choice("on", "off"))]
 ) -> None:
     """Have a board listen to the exchanges of others, or stop listening."""
-    from uwblink import Board
-    from uwblink.errors import RefusedError
 
     if state not in ("on", "off"):
         raise RefusedError(f"passive: found {state!r}, expected on or off")
-    with Board.open(port) as board:
+    with uwblink.Board.open(port) as board:
         board.set_passive(state == "on")
     typer.echo(f"{port}: passive listening {state}" + (", until power is lost" if state == "on" else ""))
 
 
 def send(port: Port, text: Annotated[str, typer.Argument(help="Up to 57 bytes in UTF-8.")]) -> None:
     """Broadcast a text to every board in range."""
-    from uwblink import Board
 
     data = os.fsencode(text)  # the bytes that were typed, whatever they are
-    with Board.open(port) as board:
+    with uwblink.Board.open(port) as board:
         board.send(data)
     typer.echo(f"{port}: {len(data)} bytes sent; delivery is not confirmed")
 
@@ -225,15 +210,12 @@ def cir(
     as_json: AsJson = False,
 ) -> None:
     """Range with another board and print the channel impulse response."""
-    from uwblink import Board
-    from uwblink.errors import RecordingError
-    from uwblink.output import check_output
 
     if plot:
         check_output(plot, force=force)
         if plot.suffix.lower() not in (".png", ".svg", ".pdf"):
             raise RecordingError(f"{plot}: found {plot.suffix or 'no suffix'}, expected .png, .svg or .pdf")
-    with Board.open(port) as board:
+    with uwblink.Board.open(port) as board:
         report, response = board.cir(target, protocol=protocol)
         initiator = board.id
     if plot:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import uwblink
 from uwblink.cli import boards, recording
 from uwblink.cli.guide import add, apart, choice, epilog, plain
 from uwblink.cli.options import AsJson, Command, Force, Group, LinkDir, PlaybackSpeed, output
 from uwblink.cli.shared import new_app, print_json
 from uwblink.cli.waiting import waiting
+from uwblink.display import printable
+from uwblink.errors import ImportTableError
+from uwblink.output import check_output, write_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,7 +86,6 @@ def guess(
 ) -> None:
     """Look at a table and write the map that it would be imported with, and why."""
     from uwblink.importers.guess import guess_map
-    from uwblink.output import check_output, write_text
 
     if output is not None:
         check_output(output, force=force)
@@ -101,7 +104,6 @@ def _importing(row: Importer) -> Callable[..., None]:
     """Return the command of an importer: its parameters depend on the row, and typer reads their annotations."""
 
     def run(table: Any, output: Path, map_file: Path | None = None, force: bool = False) -> None:
-        from uwblink.display import printable
         from uwblink.importers import import_file
 
         with waiting("importing") as say:
@@ -139,9 +141,8 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """Print what a recording holds."""
-    from uwblink import Recording
 
-    with waiting("counting"), Recording.open(recording) as opened:
+    with waiting("counting"), uwblink.Recording.open(recording) as opened:
         summary = opened.show()
     if as_json:
         print_json(summary.to_dict())
@@ -156,36 +157,45 @@ def print_summary(summary: Summary, console: Console) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from uwblink.display import printable
     from uwblink.recording import counted
 
-    def row(*values: Any) -> list[str]:
-        return [escape(printable("" if value is None else value)) for value in values]
+    def number(value: float | None, form: str) -> str:
+        return "" if value is None else f"{value:{form}}"
+
+    def show_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+        table = Table(*header)
+        for row in rows:
+            table.add_row(*(escape(printable(value)) for value in row))
+        console.print(table)
 
     console.print(escape(summary.headline()))
-    tags = Table("tag", "body", "lever arm (m)")
-    for tag in summary.tags:
-        tags.add_row(*row(tag.tag, tag.body, " ".join(f"{v:+.3f}" for v in tag.lever_arm_m)))
-    pairs = Table("initiator", "target", "exchanges", "rate (Hz)", "success")
-    for pair in summary.pairs:
-        rate = "" if pair.rate_hz is None else f"{pair.rate_hz:.1f}"
-        tried = pair.exchanges + pair.failed
-        success = f"{100 * pair.exchanges / tried:.1f} %" if tried else ""
-        pairs.add_row(*row(pair.initiator, pair.target, pair.exchanges, rate, success))
-    skews = Table("pair", "by stamps (ppm)", "by carriers", "slope", "residual", "sign")
-    for one in summary.skews:
-        values = ((one.carrier_ppm, "+.2f"), (one.slope, ".3f"), (one.residual_ppm, ".2f"))
-        told = ["" if value is None else f"{value:{form}}" for value, form in values]
-        sign = {True: "same", False: "OTHER", None: ""}[one.same_sign]
-        skews.add_row(*row(one.pair, f"{one.stamps_ppm:+.2f}", *told, sign))
-    for table in (tags, pairs, *([skews] if summary.skews else [])):
-        console.print(table)
+    show_table(
+        ("tag", "body", "lever arm (m)"),
+        ((tag.tag, tag.body, " ".join(f"{v:+.3f}" for v in tag.lever_arm_m)) for tag in summary.tags),
+    )
+    show_table(
+        ("initiator", "target", "exchanges", "rate (Hz)", "success"),
+        (
+            (p.initiator, p.target, p.exchanges, number(p.rate_hz, ".1f"), number(p.success, ".1%"))
+            for p in summary.pairs
+        ),
+    )
+    if summary.skews:
+        forms = {"stamps_ppm": "+.2f", "carrier_ppm": "+.2f", "slope": ".3f", "residual_ppm": ".2f"}
+        signs = {True: "same", False: "OTHER", None: ""}
+        show_table(
+            ("pair", "by stamps (ppm)", "by carriers", "slope", "residual", "sign"),
+            (
+                (s.pair, *(number(getattr(s, name), form) for name, form in forms.items()), signs[s.same_sign])
+                for s in summary.skews
+            ),
+        )
     if summary.reported_twice:
         console.print(f"{summary.reported_twice} reported by both ends, {summary.contradictory} of them differently")
     console.print(f"poses: {escape(counted(summary.poses))}")
     console.print(f"faults: {escape(counted(summary.faults))}")
     for key, value in summary.provenance.items():
-        console.print("  {}: {}".format(*row(key, value)))
+        console.print(escape(printable(f"  {key}: {value}")))
 
 
 def export(
@@ -239,8 +249,6 @@ def poses(
 
 def _by_body(option: str, what: str, words: list[str]) -> dict[str, str]:
     """Return what stands behind each body; raises `ImportTableError` for words that are not BODY=SOMETHING."""
-    from uwblink.errors import ImportTableError
-
     found: dict[str, str] = {}
     for word in words:
         body, _, rest = word.partition("=")
@@ -248,6 +256,10 @@ def _by_body(option: str, what: str, words: list[str]) -> dict[str, str]:
             raise ImportTableError(f"--{option}: found {word!r}, expected BODY={what}, each body once")
         found[body] = rest
     return found
+
+
+def _announce(names: dict[str, str]) -> None:
+    typer.echo("\n".join(f"{was} plays at {now}" for was, now in names.items()))
 
 
 def replay(
@@ -260,19 +272,13 @@ def replay(
     force: Force = False,
 ) -> None:
     """Decode the stored bytes again, or play them back as boards would have sent them."""
-    from uwblink import Recording
     from uwblink.boards import decode_again, play, rewrite, summarize
-    from uwblink.output import check_output
-
-    def announce(names: dict[str, str]) -> None:
-        for was, now in names.items():
-            typer.echo(f"{was} plays at {now}")
 
     if output:
         check_output(output, force=force, recording=True)
-    with Recording.open(recording) as opened:
+    with uwblink.Recording.open(recording) as opened:
         if serve:
-            count = play(opened, announce, speed=speed, link_dir=link_dir)
+            count = play(opened, _announce, speed=speed, link_dir=link_dir)
             typer.echo(f"{count} pieces played")
             return
         with waiting("decoding"):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import uwblink
 from uwblink.cli.guide import add, choice
 from uwblink.cli.options import (
     AntennaDelays,
@@ -25,6 +26,9 @@ from uwblink.cli.options import (
     output,
 )
 from uwblink.cli.shared import interrupts
+from uwblink.display import printable
+from uwblink.errors import PlanError
+from uwblink.output import check_output
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -87,9 +91,6 @@ def record(
     Ends after --duration, else with Ctrl-C. The page of --live shows ranges that --calibration corrects, too. Without
     --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
-    import uwblink
-    from uwblink.errors import PlanError
-    from uwblink.output import check_output
 
     check_output(output, force=force, recording=True)
     if (plan is None) == (pairs is None):
@@ -149,9 +150,7 @@ def stream(
     Every two boards range, without --plan. Ends after --duration, else with the recording or Ctrl-C. Without
     --antenna-delays, and without those of a plan, 16436 ticks in each board are assumed.
     """
-    import uwblink
     from uwblink.boards import Progress
-    from uwblink.errors import PlanError
     from uwblink.streaming import FoxgloveServer, RangeListener, UdpSender
 
     of_boards = not (len(source) == 1 and source[0].endswith(".uwb"))
@@ -160,7 +159,7 @@ def stream(
             f"{source[0]}: it is streamed as it is; --plan, --rate, --antenna-delays and --output are for boards"
         )
     seen, count = Progress(), 0
-    senders: list[Callable[[StreamedRange], object]] = [] if quiet else [_print]
+    senders: list[Callable[[StreamedRange], object]] = [] if quiet else [lambda found: typer.echo(found.to_json())]
 
     def send_on(found: StreamedRange) -> None:
         nonlocal count
@@ -199,25 +198,17 @@ def stream(
         except BrokenPipeError:
             # The reader of the lines went away, which ends the stream; Python must not write what is left at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    faults = ", ".join(f"{kind} {number}" for kind, number in sorted(seen.faults.items()))
-    typer.echo(f"{count} ranges" + (f"; faults: {faults}" if faults else ""), err=True)
-
-
-def _print(found: StreamedRange) -> None:
-    sys.stdout.write(found.to_json() + "\n")
-    sys.stdout.flush()
+    typer.echo(f"{count} ranges" + (f"; faults: {_faults(seen)}" if seen.faults else ""), err=True)
 
 
 def _plan(
     path: Path | None, rate: float | None, antenna_delays: Path | None, pairs: str | tuple[()] = "all"
 ) -> RangingPlan:
     """Return a plan of a file, or of `pairs`; raises `PlanError` where it has antenna delays of its own."""
-    from uwblink import RangingPlan
     from uwblink.boards import load_plan
-    from uwblink.errors import PlanError
     from uwblink.recording import load_antenna_delays
 
-    chosen = load_plan(path) if path else RangingPlan("all" if pairs == "all" else ())
+    chosen = load_plan(path) if path else uwblink.RangingPlan("all" if pairs == "all" else ())
     if antenna_delays and chosen.antenna_delays:
         raise PlanError(
             f"{antenna_delays}: the plan has [antenna_delays], too; leave one of them out", parameter="antenna_delays"
@@ -229,7 +220,6 @@ def _plan(
 
 def _correction(path: Path | None, plan: RangingPlan | None, recording: str | None = None) -> Correction | None:
     """Return the correction of a calibration, and warn where it is of other antenna delays than the ranges."""
-    from uwblink import Recording
     from uwblink.boards import delays_warning, load_correction
     from uwblink.recording import delays_in_meta
 
@@ -239,7 +229,7 @@ def _correction(path: Path | None, plan: RangingPlan | None, recording: str | No
     if plan is not None:
         warning = delays_warning(correct, plan.delays())
     else:
-        with Recording.open(recording or "") as opened:
+        with uwblink.Recording.open(recording or "") as opened:
             warning = delays_warning(correct, delays_in_meta(opened.meta()), [t.tag for t in opened.tags()])
     if warning:
         typer.echo(f"warning: {path}: {warning}", err=True)
@@ -247,7 +237,6 @@ def _correction(path: Path | None, plan: RangingPlan | None, recording: str | No
 
 
 def _ids(text: str) -> tuple[int, ...]:
-    from uwblink.errors import PlanError
 
     words = [word.strip() for word in text.split(",")] if text else []
     if not all(word.isascii() and word.isdigit() and len(word) < 6 for word in words):
@@ -284,8 +273,7 @@ def _watcher() -> Iterator[Callable[[Progress], None]]:
         nonlocal next_s, fault
         if progress.last_fault != fault:
             fault = progress.last_fault
-            plain = "".join(c if c.isprintable() else "?" for c in fault)
-            typer.echo(f"{progress.time_s:7.1f} s  {plain}", err=True)
+            typer.echo(f"{progress.time_s:7.1f} s  {printable(fault)}", err=True)
         if progress.time_s >= next_s:
             next_s = progress.time_s + 2.0
             typer.echo(f"{progress.time_s:7.1f} s  {_summary(progress)}", err=True)
@@ -294,13 +282,16 @@ def _watcher() -> Iterator[Callable[[Progress], None]]:
 
 
 def _summary(progress: Progress) -> str:
-    text = f"{progress.exchanges} of {progress.tried} exchanges in {progress.time_s:.1f} s"
-    if progress.overheard:
-        text += f", {progress.overheard} overheard"
-    if progress.cirs:
-        text += f", {progress.cirs} impulse responses"
-    faults = ", ".join(f"{kind} {count}" for kind, count in sorted(progress.faults.items()))
-    return text + f"; faults: {faults or 'none'}"
+    others = {"overheard": progress.overheard, "impulse responses": progress.cirs}
+    counts = "".join(f", {count} {name}" for name, count in others.items() if count)
+    return (
+        f"{progress.exchanges} of {progress.tried} exchanges in {progress.time_s:.1f} s{counts}; "
+        f"faults: {_faults(progress) or 'none'}"
+    )
+
+
+def _faults(progress: Progress) -> str:
+    return ", ".join(f"{kind} {count}" for kind, count in sorted(progress.faults.items()))
 
 
 def _progress_table(progress: Progress) -> Table:
@@ -308,7 +299,6 @@ def _progress_table(progress: Progress) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    from uwblink.display import printable
     from uwblink.recording import counted
 
     table = Table(title=f"{progress.time_s:.1f} s, {progress.exchanges} of {progress.tried} exchanges")

@@ -129,6 +129,12 @@ class PairSummary:
     failed: int
     rate_hz: float | None
 
+    @property
+    def success(self) -> float | None:
+        """Return the share of exchanges that did not fail, None where there are none."""
+        tried = self.exchanges + self.failed
+        return self.exchanges / tried if tried else None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
