@@ -23,7 +23,8 @@ import numpy as np
 
 import calib
 from benchmarks.standing import DIMENSIONS, Standing, power_dbm, standing_boards
-from calib.planning.predicted import Layout, SurveyInputs, predict
+from calib.planning import SurveyPlanSettings
+from calib.planning.predicted import Layout, predict
 from uwblink.arrays import Floats
 
 PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
@@ -113,8 +114,8 @@ def promised(world: Standing, dimensions: int, curve_m: float, reflected: float)
     is planted, its size is known and that it bends over 4 dB, and no more.
     """
     if not curve_m:
-        shape = {1: "line", 2: "plane", 3: ""}[dimensions]
-        inputs = SurveyInputs(tags=tuple(world.delays_ns), on=shape, pair_error_m=PAIR_M, reflected=reflected)
+        shape = {1: "line", 2: "plane", 3: "space"}[dimensions]
+        inputs = SurveyPlanSettings(tags=tuple(world.delays_ns), on=shape, pair_error_m=PAIR_M, reflected=reflected)
         return predict(inputs, [Layout(place, dimensions) for place in world.places])[-1].each
     boards = len(world.places[0])
     pairs = np.array(list(combinations(range(boards), 2)))

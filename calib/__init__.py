@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from calib.fitting.fitting import fit
     from calib.fitting.new_tag import add_tag
     from calib.fitting.result import FitResult
-    from calib.planning.flight_result import FlightPlan
     from calib.planning.flights import plan_flight
-    from calib.planning.result import Plan
+    from calib.planning.result import FlightPlan, Plan
+    from calib.planning.settings import FlightPlanSettings, SurveyPlanSettings
     from calib.planning.surveys import plan
     from calib.report.campaign import run_campaign
     from calib.report.sections import register_report_section
@@ -49,11 +49,13 @@ __all__ = [
     "FitResult",
     "FitSettings",
     "FlightPlan",
+    "FlightPlanSettings",
     "Knowledge",
     "KnownPosition",
     "OnboardSettings",
     "Plan",
     "Ranges",
+    "SurveyPlanSettings",
     "SurveyResult",
     "UnanswerableError",
     "add_tag",
@@ -86,12 +88,14 @@ _HOMES: Final = {
     "CorrectedRanges": "calib.calibration.parts",
     "FitResult": "calib.fitting.result",
     "FitSettings": "calib.settings",
-    "FlightPlan": "calib.planning.flight_result",
+    "FlightPlan": "calib.planning.result",
+    "FlightPlanSettings": "calib.planning.settings",
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",
     "OnboardSettings": "calib.evaluation.onboard",
     "Plan": "calib.planning.result",
     "Ranges": "calib.data.ranges",
+    "SurveyPlanSettings": "calib.planning.settings",
     "SurveyResult": "calib.surveys.result",
     "UnanswerableError": "calib.errors",
     "add_tag": "calib.fitting.new_tag",

@@ -1,5 +1,5 @@
 """What to measure with what one has, before anything is measured, and how well each delay will be known then."""
 
-from calib.planning.commands import flight_commands, survey_commands
+from calib.planning.settings import FlightPlanSettings, SurveyPlanSettings, read_whole
 
-__all__ = ["flight_commands", "survey_commands"]
+__all__ = ["FlightPlanSettings", "SurveyPlanSettings", "read_whole"]

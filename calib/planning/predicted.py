@@ -15,18 +15,15 @@ from itertools import combinations
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM
-from calib.errors import BadInputError
 from calib.information import Unknown, Verdict, judge
-from calib.surveys.network import DIMENSIONS, Boards, Case, CurvePrior, Known, Network
+from calib.planning.settings import SurveyPlanSettings
+from calib.surveys.network import Boards, Case, CurvePrior, Known, Network
 from calib.surveys.outcome import DELAY_SCALE_NS
 from calib.surveys.recordings import PairMeans
 from uwblink.arrays import Floats
 
-SIZES_M = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "": (6.0, 5.0, 2.5)}
+SIZES_M = {"line": (5.0, 0.0, 0.0), "plane": (3.0, 2.0, 0.0), "space": (6.0, 5.0, 2.5)}
 """Where boards may stand if nobody says: a string across a room, a large table, a room."""
-
-MOST_REFLECTED = 0.3
-"""Share of reflected pairs beyond which nobody could tell which they are."""
 
 NEAREST_M = 0.4
 """Boards stand no nearer to each other; nearer, powers saturate and fields are not yet waves."""
@@ -50,72 +47,21 @@ class Layout:
     taped: tuple[tuple[int, int], ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SurveyInputs:
-    """What one has, checked: `on` is "line", "plane" or "" (a room), as a survey knows it; lengths in metres.
-
-    `size_m` None stands for `SIZES_M`. Raises `BadInputError` for what cannot be.
-    """
-
-    tags: tuple[int, ...]
-    on: str
-    size_m: Sequence[float] | None = None
-    taped: int = 0
-    tape_sigma_m: float = 0.005
-    pair_error_m: float = 0.02
-    anchors: tuple[int, ...] = ()
-    anchor_sigma_m: float = 0.01
-    seed: int = 1
-    reflected: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check all values."""
-        if not 2 <= len(self.tags) <= 30 or len(set(self.tags)) < len(self.tags):
-            raise BadInputError(f"found {self.tags!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
-        if self.on not in DIMENSIONS:
-            raise BadInputError(f"found {self.on!r:.40}, allowed: line, plane, space", parameter="on")
-        for name in ("tape_sigma_m", "anchor_sigma_m", "pair_error_m"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise BadInputError(f"found {value}, expected more than 0", parameter=name)
-        if self.taped < 0:
-            raise BadInputError(f"found {self.taped}, expected 0 or more", parameter="taped")
-        if not 0 <= self.reflected <= MOST_REFLECTED:
-            raise BadInputError(f"found {self.reflected}, expected 0 to {MOST_REFLECTED}", parameter="reflected")
-        strangers = sorted(set(self.anchors) - set(self.tags))
-        if strangers:
-            raise BadInputError(f"{strangers[0]} is none of the boards", parameter="anchors")
-        if self.anchors and self.on == "line":
-            raise BadInputError(
-                "stand in a plane or in space; on a line say how many distances are taped", parameter="anchors"
-            )
-        size = self.size_m
-        if size is not None and (
-            len(size) != self.dimensions or not all(math.isfinite(length) and length > 0 for length in size)
-        ):
-            text = f"found {list(size)}, expected as many lengths in metres as it has dimensions, {self.dimensions}"
-            raise BadInputError(text, parameter="size_m")
-
-    @property
-    def dimensions(self) -> int:
-        """In how many dimensions boards may stand."""
-        return DIMENSIONS[self.on]
-
-    def lengths_m(self) -> Floats:
-        """Return how large the line, table or room is (3,)."""
-        if self.size_m is None:
-            x, y, z = SIZES_M[self.on]
-            return np.array([max(x, 0.8 * (len(self.tags) - 1)) if self.on == "line" else x, y, z])
-        return np.pad(np.array(self.size_m, dtype=float), (0, 3 - len(self.size_m)))
+def lengths_m(settings: SurveyPlanSettings) -> Floats:
+    """Return how large the line, table or room is (3,)."""
+    if settings.size_m is None:
+        x, y, z = SIZES_M[settings.on]
+        return np.array([max(x, 0.8 * (len(settings.tags) - 1)) if settings.on == "line" else x, y, z])
+    return np.pad(np.array(settings.size_m, dtype=float), (0, 3 - len(settings.size_m)))
 
 
-def random_layouts(inputs: SurveyInputs, count: int, tries: int = 400) -> list[Layout]:
+def random_layouts(inputs: SurveyPlanSettings, count: int, tries: int = 400) -> list[Layout]:
     """Return random arrangements: orders on a line at even steps, random places on a table or in a room.
 
     Fewer than `count` where a line has fewer orders, or a room too little space. Anchors stay where the first one has
     them: the corners of a room are as good a guess as any.
     """
-    rng, boards, size = np.random.default_rng(inputs.seed), len(inputs.tags), inputs.lengths_m()
+    rng, boards, size = np.random.default_rng(inputs.seed), len(inputs.tags), lengths_m(inputs)
     anchors = [inputs.tags.index(tag) for tag in inputs.anchors]
     found: list[Layout] = []
     seen: set[tuple[int, ...]] = set()
@@ -144,7 +90,7 @@ def on_line(order: tuple[int, ...], length_m: float) -> Layout:
     return Layout(place, 1)
 
 
-def rows_of(inputs: SurveyInputs, layout: Layout, curve: CurvePrior | None = None) -> tuple[Floats, Floats]:
+def rows_of(inputs: SurveyPlanSettings, layout: Layout, curve: CurvePrior | None = None) -> tuple[Floats, Floats]:
     """Return the derivatives (n, k) of an arrangement's rows by delays (ns) and curve, and by coordinates, over errors.
 
     First those of all pairs, as `itertools.combinations` has them, then taped distances and known coordinates.
@@ -186,7 +132,7 @@ def rows_of(inputs: SurveyInputs, layout: Layout, curve: CurvePrior | None = Non
     return rows[:, wanted], rows[:, np.setdiff1d(network.free(), wanted)]
 
 
-def delay_information(inputs: SurveyInputs, layout: Layout) -> Floats:
+def delay_information(inputs: SurveyPlanSettings, layout: Layout) -> Floats:
     """Return the information (boards, boards) on delays, 1/ns^2, that an arrangement gives, whatever its places."""
     return information_beside(*rows_of(inputs, layout))
 
@@ -210,7 +156,7 @@ class Prediction:
     common: float
 
 
-def predict(inputs: SurveyInputs, layouts: Sequence[Layout], *, curve: bool = False) -> list[Prediction]:
+def predict(inputs: SurveyPlanSettings, layouts: Sequence[Layout], *, curve: bool = False) -> list[Prediction]:
     """Return what is predicted of the first of the arrangements, of the first two, and so on."""
     boards, pairs = len(inputs.tags), np.array(list(combinations(range(len(inputs.tags)), 2)))
     lengths = [np.linalg.norm(one.place_m[pairs[:, 0]] - one.place_m[pairs[:, 1]], axis=1) for one in layouts]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.data.samples import stamped
-from calib.errors import BadInputError
+from calib.planning.settings import FlightPlanSettings
 from uwblink.arrays import Floats, Ints
 from uwblink.recording.schema import Poses, Tag
 from uwblink.twr import Exchanges
@@ -34,32 +33,6 @@ STARTING_S = 3.0
 """How long it takes from standing to flying."""
 
 
-MOST_TAGS = 60
-MOST_RANGES = 200_000
-BOUNDS = {
-    "seconds": (5.0, 3600.0),
-    "rate_hz": (0.5, 2000.0),
-    "speed_m_s": (0.05, 10.0),
-    "apart_m": (0.0, 3.0),
-}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlightInputs:
-    """How bodies fly: tags by robot, how far apart those are, the room, speed, seconds before they start, anchors."""
-
-    robots: tuple[tuple[int, ...], ...]
-    apart_m: float
-    size_m: tuple[float, float, float]
-    speed_m_s: float
-    seconds: float
-    still_s: float
-    rate_hz: float
-    anchors: tuple[int, ...]
-    inertial: bool
-    seed: int
-
-
 @dataclass(frozen=True, slots=True)
 class ReferenceFlight:
     """What a recording of the flight would hold, without errors or delays."""
@@ -70,7 +43,7 @@ class ReferenceFlight:
     imu: Mapping[str, Any] = field(default_factory=dict)
 
 
-def reference_motion(flown: FlightInputs) -> ReferenceFlight:
+def reference_motion(flown: FlightPlanSettings) -> ReferenceFlight:
     """Return a flight; the same for the same seed."""
     rng = np.random.default_rng(flown.seed)
     bodies = [_Body(flown, number, rng) for number in range(len(flown.robots))]
@@ -100,7 +73,7 @@ class _Body:
     Until it starts it stands; then it is as fast as it will be within `STARTING_S`.
     """
 
-    def __init__(self, flown: FlightInputs, number: int, rng: np.random.Generator) -> None:
+    def __init__(self, flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> None:
         size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
         self.name = f"robot{number + 1}"
         self.still_s = flown.still_s
@@ -148,7 +121,7 @@ def _arms(count: int, apart_m: float) -> Floats:
     return np.column_stack([apart_m / 2 * np.cos(angle), apart_m / 2 * np.sin(angle), np.full(count, -HANGING_M)])
 
 
-def _corners(flown: FlightInputs) -> list[Floats]:
+def _corners(flown: FlightPlanSettings) -> list[Floats]:
     """Return places of anchors around the room, high and low in turn."""
     x, y, z = flown.size_m
     count = len(flown.anchors)
@@ -158,7 +131,7 @@ def _corners(flown: FlightInputs) -> list[Floats]:
     return list(np.column_stack([x * (0.5 + reach * np.cos(angle)), y * (0.5 + reach * np.sin(angle)), z * high]))
 
 
-def _in_turn(flown: FlightInputs, count: int, rng: np.random.Generator) -> Ints:
+def _in_turn(flown: FlightPlanSettings, count: int, rng: np.random.Generator) -> Ints:
     """Return who ranges with whom (n, 2): all pairs of bodies but two anchors, each round in another order."""
     body = {tag: k for k, robot in enumerate(flown.robots) for tag in robot}
     pairs = [(a, b) for a, b in combinations(body, 2) if body[a] != body[b]]
@@ -208,63 +181,3 @@ def _readings(bodies: list[_Body], seconds: float) -> dict[str, Any]:
         for name, column in zip(("wx", "wy", "wz", "ax", "ay", "az"), columns, strict=True):
             found[name].append(column)
     return {name: np.concatenate(parts) for name, parts in found.items()}
-
-
-def flight_inputs(  # noqa: PLR0913 - keyword-only, as `plan_flight` takes them
-    robots: int | Sequence[Sequence[int]],
-    anchors: Sequence[int],
-    *,
-    seconds: float,
-    rate_hz: float,
-    size_m: Sequence[float],
-    speed_m_s: float,
-    apart_m: float,
-    still_s: float,
-    inertial: bool,
-    seed: int,
-) -> FlightInputs:
-    """Return how robots will fly; raises `BadInputError` for what cannot be."""
-    given = {"seconds": seconds, "rate_hz": rate_hz, "speed_m_s": speed_m_s, "apart_m": apart_m}
-    for name, (least, most) in BOUNDS.items():
-        if not least <= given[name] <= most:
-            raise BadInputError(f"found {given[name]}, expected {least:g} to {most:g}", parameter=name)
-    if seconds * rate_hz > MOST_RANGES:
-        raise BadInputError(
-            f"{seconds * rate_hz:.0f} ranges are more than a plan takes, {MOST_RANGES}", parameter="seconds"
-        )
-    if still_s > seconds / 2:
-        raise BadInputError(f"found {still_s:g}, expected at most half of the {seconds:g} s", parameter="still_s")
-    if len(size_m) != 3 or not all(math.isfinite(v) and 0 < v <= 1000 for v in size_m):
-        raise BadInputError(f"found {list(size_m)}, expected three lengths of a room in metres", parameter="size_m")
-    x, y, z = map(float, size_m)
-    return FlightInputs(
-        robots=_robots(robots, anchors),
-        apart_m=apart_m,
-        size_m=(x, y, z),
-        speed_m_s=speed_m_s,
-        seconds=seconds,
-        still_s=still_s,
-        rate_hz=rate_hz,
-        anchors=tuple(map(int, anchors)),
-        inertial=inertial,
-        seed=seed,
-    )
-
-
-def _robots(robots: int | Sequence[Sequence[int]], anchors: Sequence[int]) -> tuple[tuple[int, ...], ...]:
-    found = (
-        tuple((2 * k + 1, 2 * k + 2) for k in range(robots))
-        if isinstance(robots, int)
-        else tuple(tuple(map(int, tags)) for tags in robots)
-    )
-    tags = [tag for robot in found for tag in robot]
-    if not found or not all(found) or len(set(tags)) < len(tags) or len(tags) + len(anchors) > MOST_TAGS:
-        text = f"found {robots!r:.60}, expected robots with a tag or more each, every tag once, at most {MOST_TAGS}"
-        raise BadInputError(text, parameter="robots")
-    if len(set(anchors)) < len(anchors) or set(anchors) & set(tags):
-        raise BadInputError(f"found {list(anchors)}, expected other tags than those of robots", parameter="anchors")
-    if len(found) == 1 and not anchors:
-        raise BadInputError("a single robot without anchors ranges with nobody", parameter="robots")
-    if any(not 0 < tag < 65536 for tag in (*tags, *anchors)):
-        raise BadInputError("found a tag that is none, expected ids of 1 or more", parameter="robots")
-    return found

@@ -1,13 +1,16 @@
-"""A plan: a procedure in steps, the interval that each delay will have, and what one more measurement would bring."""
+"""Plans: steps and commands, the interval that each delay will have, and what one more measurement would bring."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from calib.information import Verdict
+from calib.planning.settings import FlightPlanSettings
+from calib.trajectories.scene import Usable
+from uwblink.arrays import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +26,7 @@ class PlannedArrangement:
         return tuple(sorted(self.place_m, key=lambda tag: self.place_m[tag]))
 
     def where(self, on: str) -> str:
-        """Return in words where boards stand on a "line", a "plane", or in a room ("")."""
+        """Return in words where boards stand on a "line", a "plane", or in a room."""
         if on == "line":
             return "in the order " + " ".join(map(str, self.order()))
         axes = 2 if on == "plane" else 3
@@ -56,15 +59,56 @@ class Halves:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """A procedure in steps, and the interval (ns, half of 95 %) that each delay will have; infinite where none.
+class _Plan:
+    """What plans of both kinds say: half an interval of 95 % of each delay (ns), infinite where it stays open.
 
-    `after_ns` has the intervals when only the first arrangement, the first two and so on are made. `verdict` says what
-    the arrangements determine; `common_ns` is the half interval of what all delays share, to which every absolute
-    distance owes as much; `with_curve_ns` has all intervals where a curve over power is fitted along, as surveys do
-    unless they are told otherwise. Of all pairs a share `reflected` is taken to say nothing. `next_best` are the next
-    arrangement and the next taped distance, the better one first. With `known_beside`, distances or places are known
-    that a survey must be told.
+    `common_ns` is the half interval of what all delays share, to which every absolute distance owes as much. `verdict`
+    says what is determined, `next_best` what one more measurement would bring, the best one first.
+    """
+
+    half_ns: Mapping[int, float]
+    common_ns: float
+    verdict: Verdict
+    next_best: tuple[NextBest, ...]
+    reflected: float
+
+    @property
+    def undetermined(self) -> tuple[int, ...]:
+        """The tags whose delay stays open."""
+        return tuple(int(tag) for tag in self.verdict.named("delay"))
+
+    def _delay_lines(self, otherwise: Mapping[int, str]) -> Iterator[str]:
+        """Yield a line a tag; `otherwise` is what is said of one that stays open."""
+        for tag, half in self.half_ns.items():
+            yield f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else otherwise[tag])
+
+    def _open_lines(self) -> Iterator[str]:
+        if self.undetermined:
+            yield from (f"not determined: {direction.words}" for direction in self.verdict.free)
+
+    def _next_lines(self) -> Iterator[str]:
+        for best in self.next_best:
+            yield f"next best: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}"
+
+    def _common_dict(self) -> dict[str, Any]:
+        """Return what plans of both kinds have, as JSON takes it; null where nothing is determined."""
+        return {
+            "half_interval_ns": {str(tag): _number(half) for tag, half in self.half_ns.items()},
+            "common_ns": _number(self.common_ns),
+            "undetermined": list(self.undetermined),
+            "reflected": self.reflected,
+            "next_best": [asdict(best) for best in self.next_best],
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan(_Plan):
+    """A plan of arrangements of boards that stand still.
+
+    `after_ns` has the intervals when only the first arrangement, the first two and so on are made; `with_curve_ns` all
+    intervals where a curve over power is fitted along, as surveys do unless they are told otherwise. Of all pairs a
+    share `reflected` is taken to say nothing. With `known_beside`, distances or places are known that a survey must be
+    told.
 
     >>> import calib
     >>> plan = calib.plan(4, on="line", arrangements=6)
@@ -77,75 +121,167 @@ class Plan:
     on: str
     tags: tuple[int, ...]
     arrangements: tuple[PlannedArrangement, ...]
-    half_ns: Mapping[int, float]
     after_ns: tuple[Mapping[int, float], ...]
-    common_ns: float
     with_curve_ns: Halves
-    verdict: Verdict
-    next_best: tuple[NextBest, ...]
     rate_hz: float
     seconds_each: float
     pair_error_m: float
-    reflected: float
     known_beside: bool
     steps: tuple[str, ...]
-
-    @property
-    def undetermined(self) -> tuple[int, ...]:
-        """The tags whose delay the arrangements leave open."""
-        return tuple(int(tag) for tag in self.verdict.named("delay"))
 
     def __str__(self) -> str:
         """Return the steps, the pictures and the intervals."""
         return "\n".join([*self.steps, "", *self._intervals()])
 
-    def _intervals(self) -> list[str]:
+    def _intervals(self) -> Iterator[str]:
         share = f", and {100 * self.reflected:g} % of the pairs are reflected" if self.reflected else ""
-        lines = [f"Promised, if the constant error of a pair is {100 * self.pair_error_m:.1f} cm{share}:"]
-        for tag in self.tags:
-            half = self.half_ns[tag]
-            lines.append(f"  tag {tag:3d}  " + (f"± {half:.3f} ns (95 %)" if math.isfinite(half) else "undetermined"))
+        yield f"Promised, if the constant error of a pair is {100 * self.pair_error_m:.1f} cm{share}:"
+        yield from self._delay_lines(dict.fromkeys(self.tags, "undetermined"))
         if math.isfinite(self.common_ns):
-            lines.append(f"  what all share ± {self.common_ns:.3f} ns")
-        if self.undetermined:
-            lines += [f"not determined: {direction.words}" for direction in self.verdict.free]
-        lines.append(self._curved())
-        for best in self.next_best:
-            lines.append(f"next best: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}")
-        return lines
-
-    def _curved(self) -> str:
-        curved = self.with_curve_ns
-        said = [
+            yield f"  what all share ± {self.common_ns:.3f} ns"
+        yield from self._open_lines()
+        curved = ", ".join(
             f"{what} ± {half:.3f} ns" if math.isfinite(half) else f"{what} undetermined"
-            for what, half in (
-                ("a delay", curved.each),
-                ("one against their mean", curved.apart),
-                ("what all share", curved.common),
+            for what, half in zip(
+                ("a delay", "one against their mean", "what all share"),
+                asdict(self.with_curve_ns).values(),
+                strict=True,
             )
-        ]
-        return f"With a curve over power fitted along, as surveys do where powers vary: {', '.join(said)}."
+        )
+        yield f"With a curve over power fitted along, as surveys do where powers vary: {curved}."
+        yield from self._next_lines()
+
+    def commands(self, ports: str) -> Iterator[str]:
+        """Yield the commands that carry it out; `ports` names the boards' serial ports."""
+        for one in self.arrangements:
+            shape = f" --known {self.on}" if self.on else ""
+            shape += f" --order {','.join(map(str, one.order()))}" if self.on == "line" else ""
+            words = f"--pairs all --rate {self.rate_hz:g} --duration {self.seconds_each:.0f} -o {one.name}.uwb"
+            yield f"uwblink record {ports} --arrangement {one.name}{shape} {words}"
+        beside = " --known known.toml" if self.known_beside else ""
+        yield f"calib survey {' '.join(f'{one.name}.uwb' for one in self.arrangements)}{beside} -o calibration.json"
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as JSON takes it; null where nothing is determined."""
-        known = {str(tag): half if math.isfinite(half) else None for tag, half in self.half_ns.items()}
-        return {
+        return self._common_dict() | {
             "on": self.on,
             "rate_hz": self.rate_hz,
             "seconds_each": self.seconds_each,
             "pair_error_m": self.pair_error_m,
-            "half_interval_ns": known,
-            "common_ns": _number(self.common_ns),
-            "with_curve_ns": {k: _number(getattr(self.with_curve_ns, k)) for k in ("each", "apart", "common")},
-            "reflected": self.reflected,
-            "undetermined": list(self.undetermined),
+            "with_curve_ns": {name: _number(half) for name, half in asdict(self.with_curve_ns).items()},
             "arrangements": [
                 {"name": a.name, "place_m": {str(t): list(p) for t, p in a.place_m.items()}, "taped": list(a.taped)}
                 for a in self.arrangements
             ],
-            "next_best": [
-                {"what": b.what, "mean_ns": b.mean_ns, "instead_of_ns": b.instead_of_ns} for b in self.next_best
-            ],
+            "steps": list(self.steps),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightPlan(_Plan):
+    """A plan of a flight.
+
+    `open_ns` is half an interval of every delay, of those that stay open as well. `common_ns` and `apart_ns`, how well
+    each delay is known against the mean of all, are of the delays that are determined, or of all where none is.
+    `path_m` (k, bodies, 3) is where the moving `bodies` are, `stands` where others stand.
+
+    >>> import calib
+    >>> plan = calib.plan_flight(2, seconds=20.0, poses_until_s=0.0, anchors=[11, 12, 13, 14])
+    >>> sorted(plan.half_ns)
+    [1, 2, 3, 4, 11, 12, 13, 14]
+    """
+
+    settings: FlightPlanSettings
+    usable: Usable
+    ranges: int
+    seconds: float
+    source: str
+    open_ns: Mapping[int, float]
+    apart_ns: float
+    taped: tuple[tuple[int, int], ...]
+    path_m: Floats
+    stands: Mapping[str, Floats]
+    bodies: tuple[str, ...]
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """What to do, a line each."""
+        return tuple(f"{k}. {step}" for k, step in enumerate(self._steps(), start=1))
+
+    def __str__(self) -> str:
+        """Return the steps and the intervals."""
+        return "\n".join([*self.steps, "", *self._intervals()])
+
+    def _steps(self) -> Iterator[str]:
+        flown = self.settings
+        if flown.robots is None:
+            yield f"Fly as {self.source} does: {self.ranges} ranges in {self.seconds:.0f} s."
+        else:
+            robots = ", ".join(
+                f"{' and '.join(map(str, tags))} on robot {k}" for k, tags in enumerate(flown.robots, start=1)
+            )
+            yield f"Note where on its body each tag sits, to a centimetre: tags {robots}."
+            if flown.anchors:
+                yield f"Fix anchors {', '.join(map(str, flown.anchors))} around the room, high and low in turn."
+            room = " x ".join(f"{v:g}" for v in flown.size_m)
+            yield (
+                f"Fly for {self.seconds:.0f} s about a room of {room} m at about {flown.speed_m_s:g} m/s, turning to "
+                f"and fro; every pair of different robots ranges in turn, {flown.rate_hz:g} exchanges a second in all."
+            )
+        yield from self._known()
+        yield "Fit delays, curve and trajectories together."
+
+    def _known(self) -> Iterator[str]:
+        if self.usable.poses_until_s:
+            yield f"Let all positions be known for the first {self.usable.poses_until_s:g} s, to about 2 cm."
+        if self.stands:
+            given = self.usable.anchors == "given"
+            yield f"Places of the {len(self.stands)} anchors {'are measured' if given else 'are found along'}."
+        for first, second in self.taped:
+            yield f"Tape the distance of tags {first} and {second}, antenna to antenna{self._while()}."
+        if self.usable.attitudes == "imu":
+            yield "Attitudes come from gyroscopes and accelerometers."
+        elif self.usable.attitudes == "poses":
+            yield f"Attitudes come all along, with headings good to {self.usable.heading_std_deg:g} degrees."
+
+    def _while(self) -> str:
+        return f", while robots stand for the first {self.settings.still_s:g} s" if self.settings.still_s else ""
+
+    def _intervals(self) -> Iterator[str]:
+        noise, percent = 100 * self.settings.noise_m, 100 * self.reflected
+        yield f"Promised, if ranges have {noise:.1f} cm of noise and {percent:.0f} % are reflected:"
+        yield from self._delay_lines({tag: f"undetermined (± {half:.2f} ns)" for tag, half in self.open_ns.items()})
+        which = "" if len(self.undetermined) in (0, len(self.half_ns)) else " of those that are determined"
+        yield f"  what all share{which} ± {self.common_ns:.3f} ns, each against the mean ± {self.apart_ns:.3f} ns"
+        yield from self._open_lines()
+        yield from self._next_lines()
+
+    def commands(self, ports: str, recording: str = "") -> Iterator[str]:
+        """Yield the commands that carry it out; a `recording` that it was planned from is not recorded again."""
+        name = recording or self.source
+        if self.settings.robots is not None:
+            name = "flight.uwb"
+            yield f"uwblink record {ports} --pairs all --duration {self.seconds:.0f} -o {name}"
+            yield f"uwblink poses {name} --from poses.csv --tags robots.toml"
+        usable, still_s = self.usable, self.settings.still_s
+        words = [f"--poses-until {usable.poses_until_s:g}"] if usable.poses_until_s is not None else []
+        words += [f"--attitudes {usable.attitudes}"] if usable.attitudes != "poses" else []
+        words += [f"--heading-std {usable.heading_std_deg:g}"] if usable.heading_std_deg != 3 else []
+        words += [f"--anchors {usable.anchors}"] if self.stands else []
+        when = f"@0..{still_s:g}" if still_s else ""
+        words += [f"--distance {first}-{second}=METRES{when}" for first, second in self.taped]
+        yield f"calib fit {name} --truth ranges {' '.join(words)} -o calibration.json"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the path as JSON takes it; null where nothing is determined."""
+        return self._common_dict() | {
+            "on": "flight",
+            "ranges": self.ranges,
+            "seconds": self.seconds,
+            "noise_m": self.settings.noise_m,
+            "taped": [list(pair) for pair in self.taped],
+            "half_interval_all_ns": {str(tag): half for tag, half in self.open_ns.items()},
+            "apart_ns": self.apart_ns,
             "steps": list(self.steps),
         }
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +14,13 @@ from calib.errors import BadInputError, UnanswerableError
 from calib.planning.predicted import (
     Layout,
     Prediction,
-    SurveyInputs,
     delay_information,
     predict,
     random_layouts,
     verdict_on_delays,
 )
 from calib.planning.result import Halves, NextBest, Plan, PlannedArrangement
+from calib.planning.settings import SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.outcome import students_factor
 from uwblink.arrays import Floats
@@ -41,55 +42,29 @@ GUESS_NS = 1.5
 """How far a delay is known without any data, for the choice alone."""
 
 
-def plan(  # noqa: PLR0913 - what somebody may have, each with its default
-    boards: int | Sequence[int],
-    *,
-    on: str = "line",
-    arrangements: int | None = None,
-    size_m: Sequence[float] | None = None,
-    taped: int = 0,
-    tape_sigma_m: float = 0.005,
-    anchors: Sequence[int] = (),
-    anchor_sigma_m: float = 0.01,
-    pair_error_m: float = 0.02,
-    reflected: float = 0.0,
-    rate_hz: float = 50.0,
-    seed: int = 1,
-) -> Plan:
+def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None, **changes: Any) -> Plan:
     """Return how to calibrate boards without true distances: which arrangements to make, and what comes of them.
 
-    `boards` is how many there are, or their ids; `on` is "line" (a string), "plane" (a table) or "space" (a room), of
-    `size_m` (up to three lengths). `taped` distances will be measured, to `tape_sigma_m`; `anchors` are boards that
-    stay where they are, at places known to `anchor_sigma_m`. Each of `arrangements` (by default as many as are worth
-    it, at most 12) is the best of sixty random ones after those before it. `pair_error_m` is the constant error that a
-    pair has in an arrangement, and `reflected` the share of pairs that are reflected and say nothing: what is promised
-    is then the mean over which pairs those are. Raises `BadInputError` for what cannot be.
+    `boards` is how many there are, or their ids. `settings` and keyword arguments named like its fields
+    (`SurveyPlanSettings`, which explains them) say what one has. Each of the arrangements is the best of sixty random
+    ones after those before it. Where pairs are reflected, what is promised is the mean over which pairs those are.
+    Raises `BadInputError` for what cannot be.
 
     >>> import calib
     >>> calib.plan(3, on="line", arrangements=1).undetermined
     (1, 3)
     """
-    inputs = SurveyInputs(
-        tags=tuple(range(1, boards + 1)) if isinstance(boards, int) else tuple(int(tag) for tag in boards),
-        on="" if on == "space" else on or "none",
-        size_m=size_m,
-        taped=taped,
-        tape_sigma_m=tape_sigma_m,
-        pair_error_m=pair_error_m,
-        anchors=tuple(anchors),
-        anchor_sigma_m=anchor_sigma_m,
-        seed=seed,
-        reflected=reflected,
-    )
-    if arrangements is not None and not 1 <= arrangements <= len(NAMES):
-        raise BadInputError(f"found {arrangements}, expected 1 to {len(NAMES)}", parameter="arrangements")
-    if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise BadInputError(f"found {rate_hz}, expected more than 0", parameter="rate_hz")
+    tags = tuple(range(1, boards + 1)) if isinstance(boards, int) else tuple(int(tag) for tag in boards)
+    if len(tags) < 2:
+        raise BadInputError(f"found {boards!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
+    inputs = replace(settings or SurveyPlanSettings(), tags=tags, **changes)
+    taped, rate_hz = inputs.taped, inputs.rate_hz
+    known = "" if inputs.on == "space" else inputs.on
     candidates = random_layouts(inputs, CANDIDATES)
     if not candidates:
         raise UnanswerableError(f"{len(inputs.tags)} boards find no room: they must stand 0.4 m from each other")
     informations = [delay_information(inputs, layout) for layout in candidates]
-    chosen = [candidates[k] for k in _choose(informations, arrangements)]
+    chosen = [candidates[k] for k in _choose(informations, inputs.arrangements)]
     for _ in range(taped):
         best = _best_tape(inputs, chosen)
         if best is not None:
@@ -104,7 +79,7 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
     wide = _interval(inputs, chosen)
     total = _total(inputs, chosen)
     return Plan(
-        on=inputs.on,
+        on=known,
         tags=inputs.tags,
         arrangements=made,
         half_ns=after[-1],
@@ -115,9 +90,9 @@ def plan(  # noqa: PLR0913 - what somebody may have, each with its default
         next_best=tuple(_next_best(inputs, candidates, informations, chosen)),
         rate_hz=rate_hz,
         seconds_each=seconds,
-        pair_error_m=pair_error_m,
-        reflected=reflected,
-        known_beside=bool(anchors) or taped > 0,
+        pair_error_m=inputs.pair_error_m,
+        reflected=inputs.reflected,
+        known_beside=bool(inputs.anchors) or taped > 0,
         steps=tuple(_steps(inputs, made, seconds)),
     )
 
@@ -138,7 +113,7 @@ def _choose(informations: list[Floats], count: int | None) -> list[int]:
     return found
 
 
-def _best_tape(inputs: SurveyInputs, chosen: list[Layout]) -> tuple[int, Layout, tuple[int, int], Floats] | None:
+def _best_tape(inputs: SurveyPlanSettings, chosen: list[Layout]) -> tuple[int, Layout, tuple[int, int], Floats] | None:
     """Return which arrangement is best taped, that with its tape, between whom, and what all then say, if any."""
     each = [delay_information(inputs, layout) for layout in chosen]
     total = np.sum(each, axis=0)
@@ -163,11 +138,11 @@ def _mean_std(information: Floats) -> float:
     return round(float(np.sqrt(np.trace(np.linalg.inv(information + guess)) / len(information))), 8)
 
 
-def _total(inputs: SurveyInputs, chosen: Sequence[Layout]) -> Floats:
+def _total(inputs: SurveyPlanSettings, chosen: Sequence[Layout]) -> Floats:
     return np.asarray(np.sum([delay_information(inputs, layout) for layout in chosen], axis=0))
 
 
-def _interval(inputs: SurveyInputs, chosen: Sequence[Layout]) -> float:
+def _interval(inputs: SurveyPlanSettings, chosen: Sequence[Layout]) -> float:
     """Return the factor of a standard deviation that makes half an interval of 95 %, by the freedoms that are left."""
     boards, dimensions = len(inputs.tags), inputs.dimensions
     motions = 0 if inputs.anchors else math.comb(dimensions + 1, 2)
@@ -183,7 +158,7 @@ def _halves(prediction: Prediction, wide: float) -> Halves:
 
 
 def _next_best(
-    inputs: SurveyInputs, candidates: list[Layout], informations: list[Floats], chosen: list[Layout]
+    inputs: SurveyPlanSettings, candidates: list[Layout], informations: list[Floats], chosen: list[Layout]
 ) -> list[NextBest]:
     """Return the next arrangement and the next taped distance, the one that brings more first."""
     wide, total = _interval(inputs, chosen), _total(inputs, chosen)
@@ -205,9 +180,13 @@ def _named(name: str, layout: Layout, tags: tuple[int, ...]) -> PlannedArrangeme
     return PlannedArrangement(name, place, tuple((tags[i], tags[j]) for i, j in layout.taped))
 
 
-def _steps(inputs: SurveyInputs, made: tuple[PlannedArrangement, ...], seconds: float) -> list[str]:
+def _steps(inputs: SurveyPlanSettings, made: tuple[PlannedArrangement, ...], seconds: float) -> list[str]:
     """Return what to do, a line each, pictures between."""
-    held = {"line": "Stretch a string and keep it straight", "plane": "Take a flat table or floor", "": "Use the room"}
+    held = {
+        "line": "Stretch a string and keep it straight",
+        "plane": "Take a flat table or floor",
+        "space": "Use the room",
+    }
     lines = [f"1. {held[inputs.on]}. Places are guides: nothing but what is taped is measured, orders matter."]
     for k, one in enumerate(made, start=2):
         lines.append(f"{k}. Arrangement {one.name}: boards {one.where(inputs.on)}.")
@@ -215,7 +194,7 @@ def _steps(inputs: SurveyInputs, made: tuple[PlannedArrangement, ...], seconds: 
         for i, j in one.taped:
             lines.append(f"   Tape the distance of {i} and {j}, antenna to antenna.")
         lines.append(f"   Record all pairs as arrangement {one.name} for {seconds:.0f} s.")
-    shape = f", known to be on a {inputs.on}" if inputs.on else ""
+    shape = f", known to be on a {inputs.on}" if inputs.on != "space" else ""
     lines.append(f"{len(made) + 2}. Survey all recordings together{shape}.")
     if inputs.taped or inputs.anchors:
         lines.append("   A file says what is known beside: the taped distances, the anchors' places.")

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 
 from calib.evaluation.localization import Localization, summarize
 from calib.evaluation.onboard import OnboardTrack
-from calib.planning.flight_result import FlightPlan
-from calib.planning.result import NextBest, Plan, PlannedArrangement
+from calib.planning.result import FlightPlan, NextBest, Plan, PlannedArrangement
 from uwblink.pages.colours import BLUE, GREY, INK, MUTED, VERMILION, WINE, look
 from uwblink.pages.figures import NARROW_IN, label, legend, mark, sheet
 

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from calib.planning.flight_result import FlightPlan
-from calib.planning.result import Plan
+from calib.planning.result import FlightPlan, Plan
 from calib.report.figures import arrangement, flight, more, planned_delays
 from calib.report.writing import check_places
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text, write_document
@@ -59,7 +58,7 @@ def _of_boards(plan: Plan) -> Iterator[Block]:
 def _of_flight(plan: FlightPlan) -> Iterator[Block]:
     yield Text(
         f"{_known(plan)}, and what they share to ± {plan.common_ns:.3f} ns, if ranges have "
-        f"{100 * plan.noise_m:.1f} cm of noise and {100 * plan.reflected:.0f} % are reflected.",
+        f"{100 * plan.settings.noise_m:.1f} cm of noise and {100 * plan.reflected:.0f} % are reflected.",
         "lead",
     )
     yield Heading("What to do")

@@ -10,14 +10,15 @@ from typer.testing import CliRunner
 import calib
 from benchmarks.standing import standing_boards
 from calib.cli.commands import app
-from calib.planning.predicted import Layout, SurveyInputs, delay_information, on_line
+from calib.planning import SurveyPlanSettings
+from calib.planning.predicted import Layout, delay_information, on_line
 
 C_M_PER_NS = 0.299702547
 
 
 def test_three_in_a_row_give_the_middle_delay_by_what_was_counted_by_hand():
     """r12 + r23 - r13 is twice half the middle's delay: its variance is that of three pairs."""
-    information = delay_information(SurveyInputs(tags=(1, 2, 3), on="line"), on_line((0, 1, 2), 2.0))
+    information = delay_information(SurveyPlanSettings(tags=(1, 2, 3), on="line"), on_line((0, 1, 2), 2.0))
     values, vectors = np.linalg.eigh(information)
     assert np.count_nonzero(values > 1e-6 * values[-1]) == 1
     assert np.abs(vectors[:, -1]) == pytest.approx([0, 1, 0], abs=1e-9)
@@ -26,7 +27,7 @@ def test_three_in_a_row_give_the_middle_delay_by_what_was_counted_by_hand():
 
 def test_four_in_a_row_say_of_each_board_inside_its_own_delay_and_nothing_else():
     """So eight orders, in which each of four stands inside four times, leave sqrt(2 / 4) of a pair's error, at best."""
-    information = delay_information(SurveyInputs(tags=(1, 2, 3, 4), on="line"), on_line((2, 0, 3, 1), 3.0))
+    information = delay_information(SurveyPlanSettings(tags=(1, 2, 3, 4), on="line"), on_line((2, 0, 3, 1), 3.0))
     unit = (C_M_PER_NS / 0.02) ** 2
     assert information == pytest.approx(np.diag([0.5, 0, 0, 0.5]) * unit, abs=1e-6 * unit)
 
@@ -135,7 +136,7 @@ def test_what_cannot_be_planned_is_refused(boards, settings, message):
 
 
 def test_information_of_a_known_place_is_that_of_its_coordinates():
-    inputs = SurveyInputs(tags=(1, 2), on="plane", anchors=(1, 2), anchor_sigma_m=1e-6)
+    inputs = SurveyPlanSettings(tags=(1, 2), on="plane", anchors=(1, 2), anchor_sigma_m=1e-6)
     place = np.array([[0.0, 0, 0], [2.0, 0, 0]])
     information = delay_information(inputs, Layout(place, 2)) * (0.02 / C_M_PER_NS) ** 2
     assert information == pytest.approx(np.full((2, 2), 0.25), rel=1e-3)

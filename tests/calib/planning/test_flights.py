@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 import calib
 from calib.cli.commands import app
-from calib.planning import flight_commands, flight_information
+from calib.planning import FlightPlanSettings, flight_information
 from calib.planning.flight_information import Errors, Information, flight_of
-from calib.planning.reference_motion import FlightInputs, reference_motion
+from calib.planning.reference_motion import reference_motion
 from calib.trajectories.scene import Usable
 from tests import processes
 from tests.calib.trajectories.sines import flight
@@ -30,9 +30,8 @@ def mean(plan):
 
 
 def rehearsed(**other):
-    given: Any = {"robots": ROBOTS, "anchors": ANCHORS, "inertial": False, "seconds": 10.0, "rate_hz": 50.0, "seed": 1}
-    given |= {"still_s": 0.0, "apart_m": 0.5, "size_m": (6.0, 5.0, 2.5), "speed_m_s": 1.0}
-    return reference_motion(FlightInputs(**(given | other)))
+    given: Any = {"robots": ROBOTS, "anchors": ANCHORS, "seconds": 10.0, "rate_hz": 50.0}
+    return reference_motion(FlightPlanSettings(**(given | other)))
 
 
 def covariance_ns2(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
@@ -135,7 +134,7 @@ def test_better_knowledge_never_widens():
 def test_an_accelerometer_bridges_few_ranges_and_a_good_one_more():
     few = {"rate_hz": 12.0, "seconds": 20.0}
     without = foreseen_ns(rehearsed(**few), poses_until_s=5.0)
-    poor, good = (foreseen_ns(rehearsed(**few, inertial=True), poses_until_s=5.0, force=std) for std in (0.6, 0.02))
+    poor, good = (foreseen_ns(rehearsed(**few, imu="consumer"), poses_until_s=5.0, force=std) for std in (0.6, 0.02))
     assert good < 0.97 * without
     assert good < poor < 1.05 * without
 
@@ -172,7 +171,7 @@ def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
     (pair,) = taped.taped
     assert said.what == f"the distance of tags {pair[0]} and {pair[1]} by tape"
     assert said.mean_ns == pytest.approx(taped.next_best[0].instead_of_ns, rel=1e-6)
-    assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(flight_commands(taped, "PORTS", "3"))
+    assert f"--distance {pair[0]}-{pair[1]}=METRES@0..4" in "\n".join(taped.commands("PORTS"))
 
 
 def test_the_best_tape_is_the_best_of_all():
@@ -193,14 +192,14 @@ def test_a_grade_is_noise_of_a_tenth_of_a_second_and_what_propellers_leave():
     few: Any = {"rate_hz": 15.0, "seconds": 10.0}
     plan = calib.plan_flight(2, anchors=ANCHORS, imu="consumer", poses_until_s=5.0, **few)
     force = 3 * math.hypot(3e-3 / math.sqrt(0.1), 0.2)
-    seen = rehearsed(**few, inertial=True)
+    seen = rehearsed(**few, imu="consumer")
     assert mean(plan) == pytest.approx(1.96 * foreseen_ns(seen, poses_until_s=5.0, force=force), rel=1e-4)
     assert mean(plan) > 1.001 * 1.96 * foreseen_ns(seen, poses_until_s=5.0, force=force / 10)
 
 
 def test_the_motion_that_is_rehearsed_is_one_motion():
     """Ranges are those of poses and lever arms; readings are the second derivative of the poses."""
-    seen = rehearsed(robots=((1, 2), (7,)), anchors=(9,), inertial=True, seconds=8.0, still_s=2.0, seed=3)
+    seen = rehearsed(robots=((1, 2), (7,)), anchors=(9,), imu="consumer", seconds=8.0, still_s=2.0, seed=3)
     ranges = calib.load_ranges(seen)
     assert set(map(tuple, np.sort(np.column_stack([ranges.initiator, ranges.target])).tolist())) == {
         (1, 7), (2, 7), (1, 9), (2, 9), (7, 9)

@@ -8,11 +8,11 @@ import pytest
 import calib
 from benchmarks import surveys
 from benchmarks.standing import places_of, standing_boards
+from calib.planning import SurveyPlanSettings
 from calib.planning.predicted import (
     CURVE_M,
     POWER_AT_1_M_DBM,
     Layout,
-    SurveyInputs,
     delay_information,
     on_line,
     predict,
@@ -20,7 +20,7 @@ from calib.planning.predicted import (
 
 
 def given(boards, on="line", **settings):
-    return SurveyInputs(tags=tuple(range(1, boards + 1)), on=on, **settings)
+    return SurveyPlanSettings(tags=tuple(range(1, boards + 1)), on=on, **settings)
 
 
 def test_without_reflections_and_curve_it_is_the_inverse_of_the_information():

@@ -1,0 +1,227 @@
+"""The settings of plans, once for Python and for the command line, and the checks of what they may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from calib.errors import BadInputError
+from calib.settings import check_choice
+from uwblink.settings import setting
+
+DIMENSIONS: Final = {"line": 1, "plane": 2, "space": 3}
+"""In how many dimensions boards may stand."""
+
+IMU_GRADES: Final = ("consumer", "industrial", "tactical")
+
+MAX_TAGS: Final = 60
+MAX_RANGES: Final = 200_000
+"""A bound that keeps a mistyped duration from filling the memory."""
+
+
+def read_numbers(text: str) -> list[float]:
+    """Return numbers from a text with commas; raises `BadInputError`."""
+    try:
+        return [float(part) for part in text.split(",")] if text.strip() else []
+    except ValueError:
+        raise BadInputError(f"found {text!r:.40}, expected numbers with commas") from None
+
+
+def read_whole(text: str) -> list[int]:
+    """Return ids or a count from a text with commas; raises `BadInputError`."""
+    found = read_numbers(text)
+    if not found or not all(math.isfinite(value) and value == int(value) for value in found):
+        raise BadInputError(f"found {text!r:.40}, expected whole numbers with commas")
+    return [int(value) for value in found]
+
+
+def _check_bounds(settings: object, bounds: Mapping[str, tuple[float, float]]) -> None:
+    """Raise `BadInputError` for a setting that is not within its bounds."""
+    for name, (least, most) in bounds.items():
+        value = getattr(settings, name)
+        if not (math.isfinite(value) and least <= value <= most):
+            raise BadInputError(f"found {value}, expected {least:g} to {most:g}", parameter=name)
+
+
+def _lengths(size_m: Sequence[float], dimensions: int) -> None:
+    if len(size_m) != dimensions or not all(math.isfinite(v) and 0 < v <= 1000 for v in size_m):
+        raise BadInputError(
+            f"found {list(size_m)}, expected as many lengths in metres as dimensions, {dimensions}", parameter="size_m"
+        )
+
+
+_SIZE: Any = {"flag": "--size", "kind": str | None, "parse": read_numbers, "metavar": "M,M,M"}
+_ANCHORS: Any = {"flag": "--anchor-tags", "kind": str | None, "parse": read_whole, "metavar": "TAG,TAG..."}
+_ANCHORS_HELP = "Boards at known positions, which stay there."
+_RATE_HELP = "Exchanges per second, all pairs together (Hz)."
+_TAPED_HELP = "Number of distances that will be measured with a tape."
+_TAPE_HELP = "Standard deviation of a distance by tape (m)."
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveyPlanSettings:
+    """The settings of `calib.plan`, which it takes as keyword arguments, too; raises `BadInputError`.
+
+    `on` is "line" (a string), "plane" (a table) or "space" (a room), of `size_m` (up to three lengths). `taped`
+    distances will be measured to `tape_sigma_m`; `anchors` are boards that stay where they are, at places known to
+    `anchor_sigma_m`. `arrangements` None makes as many as are worth it, at most 12. `pair_error_m` is the constant
+    error that a pair has in an arrangement, `reflected` the share of pairs that are reflected and tell nothing.
+    `tags` are the boards, which `plan` fills in.
+    """
+
+    tags: tuple[int, ...] = ()
+    on: str = setting(
+        "line",
+        "Where the boards stand: on a string (line), on a table (plane), or in a room (space).",
+        names=tuple(DIMENSIONS),
+    )
+    arrangements: int | None = setting(None, "Number of arrangements; by default as many as are worth it.")
+    size_m: Sequence[float] | None = setting(None, "Length of the line, or sides of plane or room (m).", **_SIZE)
+    taped: int = setting(0, _TAPED_HELP)
+    tape_sigma_m: float = setting(0.005, _TAPE_HELP, flag="--tape-sigma")
+    anchors: Sequence[int] = setting((), _ANCHORS_HELP, **_ANCHORS)
+    anchor_sigma_m: float = setting(0.01, "Standard deviation of known positions (m).", flag="--anchor-sigma")
+    pair_error_m: float = setting(0.02, "Constant error of a pair in an arrangement (m).", flag="--pair-error")
+    reflected: float = setting(0.0, "Share of pairs that are reflected.")
+    rate_hz: float = setting(50.0, _RATE_HELP, flag="--rate")
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        """Check all values."""
+        check_choice("on", self.on, DIMENSIONS)
+        sigma = (1e-9, 100.0)
+        _check_bounds(
+            self,
+            {
+                "taped": (0, 1000),
+                "tape_sigma_m": sigma,
+                "anchor_sigma_m": sigma,
+                "pair_error_m": sigma,
+                # Of more pairs nobody could tell which are reflected.
+                "reflected": (0.0, 0.3),
+                "rate_hz": (1e-3, 1e5),
+            },
+        )
+        if self.arrangements is not None and not 1 <= self.arrangements <= 26:
+            raise BadInputError(f"found {self.arrangements}, expected 1 to 26", parameter="arrangements")
+        if self.tags and not (2 <= len(self.tags) <= 30 and len(set(self.tags)) == len(self.tags)):
+            raise BadInputError(f"found {self.tags!r:.60}, expected 2 to 30 boards, each once", parameter="boards")
+        strangers = sorted(set(self.anchors) - set(self.tags)) if self.tags else []
+        if strangers:
+            raise BadInputError(f"{strangers[0]} is none of the boards", parameter="anchors")
+        if self.anchors and self.on == "line":
+            raise BadInputError(
+                "stand in a plane or in space; on a line say how many distances are taped", parameter="anchors"
+            )
+        if self.size_m is not None:
+            _lengths(self.size_m, self.dimensions)
+
+    @property
+    def dimensions(self) -> int:
+        """In how many dimensions boards may stand."""
+        return DIMENSIONS[self.on]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightPlanSettings:
+    """The settings of `calib.plan_flight`, which it takes as keyword arguments, too; raises `BadInputError`.
+
+    Without a recording robots fly for `seconds` about a room of `size_m` at about `speed_m_s`, tags of a robot are
+    `apart_m` from each other, and all pairs but those of two `anchors` (ids of tags about the walls) range in turn,
+    `rate_hz` times a second. Robots stand for the first `still_s`.
+
+    Positions will be known for the first `poses_until_s` (None: all along); `attitudes` come from "poses" (an attitude
+    reference), from the "imu" or from nothing ("none"); `imu` is its grade. `anchor_places` are "given" or "sought".
+    `taped` distances are measured to `tape_sigma_m` where they bring most: of tags of robots that stand, and of anchors
+    whose places are sought. A range has `noise_m`, and a share `reflected` is longer by 0.3 m on average. `robots` are
+    the tags of each robot, which `plan_flight` fills in.
+    """
+
+    robots: Any = None
+    seconds: float = setting(60.0, "Duration in seconds.", flag="--duration")
+    rate_hz: float = setting(80.0, _RATE_HELP, flag="--rate")
+    size_m: Sequence[float] = setting((6.0, 5.0, 2.5), "Sides of the room (m).", **_SIZE)
+    speed_m_s: float = setting(1.0, "Mean speed of the robots (m/s).", flag="--robot-speed")
+    apart_m: float = setting(0.5, "Distance between the tags of a robot (m).", flag="--tag-spacing")
+    poses_until_s: float | None = setting(
+        10.0, "How long positions are known at first.", flag="--poses-until", metavar="SECONDS"
+    )
+    attitudes: str = setting(
+        "poses",
+        "Source of attitudes: poses (an attitude reference), the IMU, or none.",
+        names=("poses", "imu", "none"),
+    )
+    heading_std_deg: float = setting(
+        3.0, "Standard deviation of headings; 0: headings are exact.", flag="--heading-std", metavar="DEGREES"
+    )
+    imu: str | None = setting(None, "Grade of the robots' inertial sensors.", names=IMU_GRADES)
+    anchors: Sequence[int] = setting((), _ANCHORS_HELP, **_ANCHORS)
+    anchor_places: str = setting(
+        "given", "Positions of anchors: given, or sought (estimated).", flag="--anchors", names=("given", "sought")
+    )
+    still_s: float = setting(
+        0.0, "How long the robots stand before they fly, for a tape.", flag="--standstill", metavar="SECONDS"
+    )
+    taped: int = setting(0, _TAPED_HELP)
+    tape_sigma_m: float = setting(0.01, _TAPE_HELP, flag="--tape-sigma")
+    noise_m: float = setting(0.04, "Noise of a range (m).", flag="--range-noise")
+    reflected: float = setting(0.08, "Share of ranges that are reflected.")
+    delays_only: bool = setting(False, "Plan for a fit without a curve over power.")
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        """Check all values, and the robots where there are some."""
+        check_choice("anchor_places", self.anchor_places, ("given", "sought"))
+        if self.imu is not None:
+            check_choice("imu", self.imu, IMU_GRADES)
+        _check_bounds(
+            self,
+            {
+                "seconds": (5.0, 3600.0),
+                "rate_hz": (0.5, 2000.0),
+                "speed_m_s": (0.05, 10.0),
+                "apart_m": (0.0, 3.0),
+                "noise_m": (1e-4, 10.0),
+                "reflected": (0.0, 0.9),
+                "still_s": (0.0, 600.0),
+                "taped": (0, 10),
+                "tape_sigma_m": (1e-4, 1.0),
+            },
+        )
+        _lengths(self.size_m, 3)
+        if self.robots is None:
+            return
+        if self.seconds * self.rate_hz > MAX_RANGES:
+            text = f"{self.seconds * self.rate_hz:.0f} ranges are more than a plan takes, {MAX_RANGES}"
+            raise BadInputError(text, parameter="seconds")
+        if self.still_s > self.seconds / 2:
+            text = f"found {self.still_s:g}, expected at most half of the {self.seconds:g} s"
+            raise BadInputError(text, parameter="still_s")
+        object.__setattr__(self, "robots", _tags_by_robot(self.robots, self.anchors))
+
+    @property
+    def inertial(self) -> bool:
+        """Whether robots have an IMU."""
+        return self.imu is not None or self.attitudes == "imu"
+
+
+def _tags_by_robot(robots: int | Sequence[Sequence[int]], anchors: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Return the tags of each robot, two each where only their number is given; raises `BadInputError`."""
+    found = (
+        tuple((2 * k + 1, 2 * k + 2) for k in range(robots))
+        if isinstance(robots, int)
+        else tuple(tuple(map(int, tags)) for tags in robots)
+    )
+    tags = [tag for robot in found for tag in robot]
+    if not found or not all(found) or len(set(tags)) < len(tags) or len(tags) + len(anchors) > MAX_TAGS:
+        text = f"found {robots!r:.60}, expected robots with a tag or more each, every tag once, at most {MAX_TAGS}"
+        raise BadInputError(text, parameter="robots")
+    if len(set(anchors)) < len(anchors) or set(anchors) & set(tags):
+        raise BadInputError(f"found {list(anchors)}, expected other tags than those of robots", parameter="anchors")
+    if len(found) == 1 and not anchors:
+        raise BadInputError("a single robot without anchors ranges with nobody", parameter="robots")
+    if any(not 0 < tag < 65536 for tag in (*tags, *anchors)):
+        raise BadInputError("found a tag that is none, expected ids of 1 or more", parameter="robots")
+    return found
