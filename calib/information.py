@@ -19,7 +19,8 @@ from calib.errors import BadInputError
 from uwblink.arrays import Bools, Floats
 
 LOOSEST: Final = 0.5
-"""Largest standard deviation of a direction that counts as known, as a share of what is known without any data."""
+"""Largest standard deviation of a direction that counts as known, as a share of what is known without any data: data
+then weigh four times as much as the guess."""
 
 ROUNDING: Final = 1e-12
 """Share of the largest eigenvalue below which an eigenvalue is rounding."""
@@ -46,13 +47,8 @@ class Unknown:
 
 @dataclass(frozen=True, slots=True)
 class FreeDirection:
-    """A combination of unknowns that the data leave free: its parts (n,), the largest 1, in the unknowns' own units.
+    """A combination of unknowns that the data leave free, in words: what moves together, or one against another."""
 
-    `std` is how far it is known, in units of the part that is 1: infinite where not at all.
-    """
-
-    parts: Floats
-    std: float
     words: str
 
 
@@ -61,46 +57,23 @@ class Verdict:
     """What an information matrix determines.
 
     `std` (n,) is infinite where the data do not determine an unknown, and `covariance` (n, n) is NaN in its row and
-    column. Combinations of such unknowns may be determined all the same: `std_of` and `covariance_of` say so.
+    column.
     """
 
     unknowns: tuple[Unknown, ...]
     std: Floats
     covariance: Floats
     free: tuple[FreeDirection, ...]
-    _spread: Floats
-    _loosest: float
 
     @property
     def determined(self) -> Bools:
         """Which unknowns (n,) the data determine."""
         return np.isfinite(self.std)
 
-    @property
-    def whole(self) -> bool:
-        """Whether everything is determined."""
-        return not self.free
-
     def named(self, kind: str) -> tuple[str, ...]:
         """Return of what a kind of unknown is not determined, each once and in order: tags whose delay is free."""
         loose = zip(self.unknowns, self.determined.tolist(), strict=True)
         return tuple(dict.fromkeys(u.of for u, known in loose if u.kind == kind and not known))
-
-    def std_of(self, combination: Floats) -> float:
-        """Return the standard deviation of a linear combination (n,) of the unknowns, infinite where it is free.
-
-        A combination counts as free where its standard deviation is more than `loosest` of what it was without data.
-        """
-        scaled = np.array([u.scale for u in self.unknowns]) * combination
-        found = float(np.linalg.norm(scaled @ self._spread))
-        return found if found <= self._loosest * float(np.linalg.norm(scaled)) else math.inf
-
-    def covariance_of(self, combinations: Floats) -> Floats:
-        """Return the covariance (k, k) of linear combinations (k, n), NaN in row and column of those that are free."""
-        scale = np.array([u.scale for u in self.unknowns])
-        root = (combinations * scale) @ self._spread
-        loose = ~np.isfinite([self.std_of(row) for row in combinations])
-        return _blanked(root @ root.T, loose)
 
     def __str__(self) -> str:
         """Return what is free, a line each."""
@@ -119,8 +92,6 @@ def judge(information: Floats, unknowns: Sequence[Unknown], *, loosest: float = 
     >>> verdict = judge(1e4 * apart.T @ apart, [Unknown("delay", tag) for tag in "123"])
     >>> print(verdict)
     delay of 1 against delays of 2 and 3
-    >>> round(verdict.std_of(np.array([0.0, 1.0, -1.0])), 4)
-    0.0141
     """
     scale = _checked(information, unknowns, loosest)
     values, vectors = np.linalg.eigh(scale[:, None] * information * scale)
@@ -136,10 +107,8 @@ def judge(information: Floats, unknowns: Sequence[Unknown], *, loosest: float = 
     return Verdict(
         unknowns=tuple(unknowns),
         std=np.where(loose, math.inf, deviation * scale),
-        covariance=_blanked((spread @ spread.T) * scale[:, None] * scale, loose),
-        free=tuple(_directions(vectors[:, free], np.where(nothing, 0.0, values)[free], scale, unknowns)),
-        _spread=spread,
-        _loosest=loosest,
+        covariance=np.where(loose[:, None] | loose, np.nan, (spread @ spread.T) * scale[:, None] * scale),
+        free=tuple(FreeDirection(_in_words(found, unknowns)) for found in _sparse(vectors[:, free])),
     )
 
 
@@ -181,25 +150,6 @@ def _checked(information: Floats, unknowns: Sequence[Unknown], loosest: float) -
     return np.array([unknown.scale for unknown in unknowns])
 
 
-def _blanked(covariance: Floats, loose: Bools) -> Floats:
-    found: Floats = np.array(covariance)
-    found[loose] = np.nan
-    found[:, loose] = np.nan
-    return found
-
-
-def _directions(free: Floats, values: Floats, scale: Floats, unknowns: Sequence[Unknown]) -> Iterator[FreeDirection]:
-    """Yield the directions (n, k) that are free, with eigenvalues (k,): each with as few unknowns as it can have."""
-    for found in _sparse(free):
-        parts = found * scale
-        largest = float(np.abs(parts).max())
-        along = (found @ free) / np.linalg.norm(found)
-        information = float(along**2 @ values)
-        std = math.inf if information <= 0 else largest / (math.sqrt(information) * float(np.linalg.norm(found)))
-        parts = parts / parts[np.argmax(np.abs(parts))]
-        yield FreeDirection(parts, std, _in_words(found, unknowns))
-
-
 def _sparse(free: Floats) -> Iterator[Floats]:
     """Yield a basis of the span of `free` (n, k), each vector with one unknown of its own, the first ones preferred."""
     left = free.T.copy()
@@ -208,13 +158,8 @@ def _sparse(free: Floats) -> Iterator[Floats]:
         column = int(np.argmax(size > 0.5 * size.max()))
         # The vector of the span with the largest part in that unknown; the rest is turned to have none.
         turned = np.linalg.svd(left[:, [column]], full_matrices=True)[0].T @ left
-        yield from _cleared(turned[:1])
+        yield turned[0]
         left = turned[1:]
-
-
-def _cleared(found: Floats) -> Iterator[Floats]:
-    for row in found:
-        yield np.where(np.abs(row) < 1e-9 * np.abs(row).max(), 0.0, row)
 
 
 def _in_words(direction: Floats, unknowns: Sequence[Unknown]) -> str:

@@ -69,6 +69,11 @@ class SurveyPlanSettings:
     `anchor_sigma_m`. `arrangements` None makes as many as are worth it, at most 12. `pair_error_m` is the constant
     error that a pair has in an arrangement, `reflected` the share of pairs that are reflected and tell nothing.
     `tags` are the boards, which `plan` fills in.
+
+    >>> import calib
+    >>> settings = calib.SurveyPlanSettings(on="plane", size_m=(3.0, 2.0), arrangements=2)
+    >>> len(calib.plan(5, settings).arrangements)
+    2
     """
 
     tags: tuple[int, ...] = ()
@@ -137,6 +142,11 @@ class FlightPlanSettings:
     `taped` distances are measured to `tape_sigma_m` where they bring most: of tags of robots that stand, and of anchors
     whose places are sought. A range has `noise_m`, and a share `reflected` is longer by 0.3 m on average. `robots` are
     the tags of each robot, which `plan_flight` fills in.
+
+    >>> import calib
+    >>> settings = calib.FlightPlanSettings(seconds=10.0, rate_hz=40.0)
+    >>> calib.plan_flight(3, settings).undetermined
+    ()
     """
 
     robots: Any = None

@@ -1,7 +1,5 @@
 """What an information matrix determines: planted free directions, and the words for them."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -25,7 +23,6 @@ def ring(*, closed=True):
 def test_a_full_matrix_gives_the_inverse():
     information = from_rows(ring())
     verdict = judge(information, DELAYS)
-    assert verdict.whole
     assert verdict.determined.all()
     assert str(verdict) == "everything is determined"
     np.testing.assert_allclose(verdict.covariance, np.linalg.inv(information), rtol=1e-9, atol=1e-15)
@@ -35,17 +32,9 @@ def test_a_full_matrix_gives_the_inverse():
 def test_an_even_ring_leaves_one_direction_free_and_says_which():
     verdict = judge(from_rows(ring(closed=False)), DELAYS)
     assert [d.words for d in verdict.free] == ["delays of 1 and 3 against delays of 2 and 4"]
-    assert math.isinf(verdict.free[0].std)
-    np.testing.assert_allclose(verdict.free[0].parts * verdict.free[0].parts[0], [1, -1, 1, -1], atol=1e-9)
     assert np.isinf(verdict.std).all()
     assert np.isnan(verdict.covariance).all()
     assert verdict.named("delay") == ("1", "2", "3", "4")
-    # Sums of neighbours are what was measured.
-    assert verdict.std_of(np.array([1.0, 1.0, 0.0, 0.0])) == pytest.approx(0.01 * math.sqrt(3 / 4))
-    assert math.isinf(verdict.std_of(np.array([1.0, 0.0, 0.0, 0.0])))
-    both = verdict.covariance_of(np.array([[1.0, 1, 0, 0], [1, 0, 0, 0]]))
-    assert both[0, 0] == pytest.approx(0.75e-4)
-    assert np.isnan(both[1]).all()
 
 
 def test_two_free_directions_are_told_apart_whatever_basis_rounding_chose():
@@ -61,21 +50,19 @@ def test_a_common_shift_with_distances_is_called_so():
     verdict = judge(from_rows(rows), unknowns)
     assert [d.words for d in verdict.free] == ["all delays together with all distances together"]
     assert verdict.named("distance") == ("1-2", "2-3", "1-3")
-    assert verdict.std_of(np.array([1.0, -1, 0, 0, 0, 0])) < 0.05
 
 
 def test_what_is_hardly_known_counts_as_free_by_the_scale_of_an_unknown():
     information = np.diag([1e4, 1.0])
     delays = [Unknown("delay", "1"), Unknown("delay", "2")]
     assert judge(information, delays).named("delay") == ("2",)
-    assert judge(information, delays, loosest=1.5).whole
+    assert not judge(information, delays, loosest=1.5).free
     wide = [Unknown("delay", "1"), Unknown("delay", "2", scale=10.0)]
     verdict = judge(information, wide)
-    assert verdict.whole
+    assert not verdict.free
     assert verdict.std[1] == pytest.approx(1.0)
     loose = judge(np.diag([1e4, 0.0025]), wide)
     assert loose.named("delay") == ("2",)
-    assert loose.free[0].std == pytest.approx(20.0)
 
 
 def test_a_known_unknown_beside_free_ones_keeps_its_variance():
