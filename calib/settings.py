@@ -96,7 +96,9 @@ class FitSettings:
     `loss` is "mixture", the likelihood of direct ranges, reflections and outliers with a share of reflections by pair,
     or a robust loss of residuals: "cauchy", "huber", "soft_l1", "l2", one that `register_loss` added; None chooses the
     mixture, and "cauchy" for a sequential fit and for one without a curve. `scale_ns` is the scale of a robust
-    loss in time of flight, None to estimate it. `lift` and `alpha_dbm` make the lifted power of an exchange.
+    loss in time of flight, None to estimate it. `between_m` is the standard deviation of what stays in the ranges of a
+    pair for a recording and is another in the next; None to estimate it from pairs and from eight parts of the data.
+    `lift` and `alpha_dbm` make the lifted power of an exchange.
 
     `fixed_ns` are known delays by tag; `groups` are tags that share curves, by name (all do by default); `sequential`
     fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). `minimum_norm` fits the
@@ -124,6 +126,14 @@ class FitSettings:
         kind=str | None,
         parse=read_scale,
         metavar="NS|auto",
+        rich_help_panel=ERRORS_PANEL,
+    )
+    between_m: float | None = setting(
+        None,
+        "Standard deviation in metres by which ranges of a pair differ between recordings; by default estimated from "
+        "what stays for a part of this one.",
+        flag="--between",
+        metavar="M",
         rich_help_panel=ERRORS_PANEL,
     )
     lift: str = setting(
@@ -191,6 +201,8 @@ class FitSettings:
         check_choice("constants", self.constants, CONSTANTS)
         if self.scale_ns is not None and not (_is_finite(self.scale_ns) and self.scale_ns > 0):
             raise BadInputError(f"found {self.scale_ns!r}, expected a positive number of ns", parameter="scale_ns")
+        if self.between_m is not None and not (_is_finite(self.between_m) and 0 <= self.between_m < 1):
+            raise BadInputError(f"found {self.between_m!r}, expected metres, 0 to 1", parameter="between_m")
         for name, power in (("alpha_dbm", self.alpha_dbm), ("reference_power_dbm", self.reference_power_dbm)):
             if not _is_finite(power) and (name == "alpha_dbm" or power is not None):
                 raise BadInputError(f"found {power!r}, expected a power in dBm", parameter=name)

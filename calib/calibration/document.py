@@ -74,6 +74,7 @@ FILE_KEYS: Final = (
     FileKey("errors.detour_m", "number, m", "needed", "Mean of what reflections travel beyond that, exponential."),
     FileKey("errors.long_share", "number, 0 to 1", "0", "Share of the reflections that are of the long kind."),
     FileKey("errors.long_factor", "number, above 0", "1", "Mean of the long detours over that of the others."),
+    FileKey("errors.between_m", "number, m", "0", "Of the noise, what differs between recordings, by pair."),
     FileKey("errors.outlier_share", "number, 0 to 1", "needed", "Share of ranges that belong to nothing else."),
     FileKey("errors.outlier_m", "number, m", "needed", "Standard deviation of those."),
     FileKey("errors.location_m", "number, m", "needed", "Where the middle of the noise lies."),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Any
@@ -52,7 +52,8 @@ class ErrorModel:
     "smaller-larger"). `levels` are shares of errors and the model's levels that these were found below while fitting:
     what makes quantiles hold where the shape does not. `scale` does so for the total standard deviation. `detour_m` is
     the mean of both kinds of exponential detour; `long_share` of the reflections are `long_factor` times as long as the
-    others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0.
+    others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0. Of the noise `between_m` is what
+    stays in the ranges of a pair for a recording, or a spell of it, and changes by the next.
     """
 
     lifted: tuple[Number, ...]
@@ -67,7 +68,13 @@ class ErrorModel:
     levels: tuple[tuple[Share, Share], ...] = ()
     long_share: Share = 0.0
     long_factor: Positive = 1.0
+    between_m: StdM = 0.0
     pairs: dict[PairName, PairErrors] = field(default_factory=dict)
+
+    def between(self, between_m: float) -> ErrorModel:
+        """Return the model of ranges of other recordings, whose pairs are off by so much more."""
+        noise_m = tuple(np.hypot(self.noise_m, between_m).tolist())
+        return replace(self, noise_m=noise_m, between_m=between_m)
 
     @property
     def long(self) -> LongDetours:

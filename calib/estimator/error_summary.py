@@ -7,13 +7,15 @@ in common by that, and what stays unknown of a share is in the share that is pre
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calib.calibration.error_model import ErrorModel, PairErrors
-from calib.estimator.range_model import RangeModel, Spline
+from calib.estimator.range_model import OFFSETS, TYPICAL_OFFSET_M, RangeModel, Spline
+from calib.estimator.range_rows import RESIDUAL
 from calib.estimator.time_blocks import TimeBlocks, lasting_in_pairs
 from calib.range_errors.densities import LONG_FACTOR, LongDetours
 from calib.range_errors.density import error_slopes
@@ -44,6 +46,10 @@ SMALLEST_SHARE = 1e-4
 WIDEST_ODDS, WIDEST_DETOUR = 4.0, 1.0
 """Variances of a pair's log odds and log detour: two in three pairs between an eighth and eight times the common odds,
 a third and three times the common detour. What a few lasting reflections leave open is more than any room has."""
+
+
+SPELLS = 8
+"""Parts of a recording between which what stays for a spell is compared."""
 
 
 def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks) -> ErrorModel:
@@ -92,6 +98,44 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
         },
     )
     return _put_right(stated, model, residual)
+
+
+def between_recordings(
+    model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks, pairs_m: float | None
+) -> float:
+    """Return the standard deviation in metres of what another recording has in the ranges of a pair that this has not.
+
+    One recording shows offsets of pairs (`pairs_m`, None where they are not determined) and of pairs in spells of it,
+    which are as large as those of another day (public flights: 3 to 4 cm both).
+    """
+    found = error_slopes(residual - errors.location_m, errors.parameters, span_m=errors.span_m)
+    pair, score = model.pairs.number, found.by[RESIDUAL]
+    pairs, cell = len(model.pairs.ends), pair * SPELLS + np.arange(len(pair)) * SPELLS // len(pair)
+    lasting = lasting_in_pairs(score, pair, blocks, SPELLS)
+    slope, known = (
+        np.bincount(cell, column, pairs * SPELLS).reshape(pairs, SPELLS) / lasting for column in (score, score**2)
+    )
+    # What is the same in all spells is the pair's.
+    slope -= known * slope.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1e-300)
+    spells_m = math.sqrt(mean_variance(known.ravel(), slope.ravel(), TYPICAL_OFFSET_M, OFFSETS[1:]))
+    return math.hypot(spells_m, spells_m if pairs_m is None else pairs_m)
+
+
+def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tuple[float, float]) -> float:
+    """Return the posterior mean of the variance of draws (k,), of which data tell independently.
+
+    `information` (k,) and `slope` (k,) are those of the log likelihood of each draw at zero: under a variance s it is
+    (1 + s l)^-1/2 exp(b^2 s / (1 + s l) / 2). The standard deviation is half-normal beforehand, about `typical`, within
+    `bounds` (Gelman 2006). A likeliest variance would be zero where few values are uncertain.
+    """
+    deviation = np.geomspace(*bounds, 200)
+    variance = deviation[:, None] ** 2
+    told = 1 + variance * information
+    likelihood = 0.5 * np.sum(slope**2 * variance / told - np.log(told), axis=1)
+    # In steps of the logarithm, each is as wide as the deviation.
+    posterior = likelihood - 0.5 * (deviation / typical) ** 2 + np.log(deviation)
+    share = np.exp(posterior - posterior.max())
+    return float(share @ deviation**2 / share.sum())
 
 
 def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:

@@ -309,6 +309,9 @@ def _curve(kind: str, spline: Spline) -> Unknown:
     )
 
 
+TYPICAL_OFFSET_M = 0.035
+"""Standard deviation of such offsets between days, and between halves of a flight (3 to 4 cm: MILUV, STAR-loc)."""
+
 OFFSETS = (0.01, 1e-4, 1.0)
 """Standard deviation of what else is constant in the ranges of a pair, such as a wall: start, least and most, m."""
 

@@ -140,13 +140,14 @@ class Persistence:
         return float(stdtrit(self.freedom, 0.975))
 
 
-def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks) -> float:
-    """Return by how much more sums of slopes (n,) by pair (n,) vary than those of independent ranges would."""
+def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks, spans: int = 1) -> float:
+    """Return by how much more sums of slopes (n,) by pair (n,) vary, in so many spans, than those of independent
+    ranges would."""
     pairs = int(pair.max()) + 1
     flat = np.bincount(blocks.number * pairs + pair, slope, blocks.count * pairs)
     sums: Floats = flat.astype(np.float64).reshape(blocks.count, pairs)
     within = float(np.sum(sums**2) / max(float(slope @ slope), 1e-300))
-    return max(within, 1.0) * max(persistence(sums, blocks, pairs).factor, 1.0)
+    return max(within, 1.0) * max(persistence(sums, blocks, pairs, spans).factor, 1.0)
 
 
 def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int = 1) -> Persistence:

@@ -10,7 +10,7 @@ import numpy as np
 from calib.calibration.model import Calibration
 from calib.calibration.parts import Matrix, PairOffset, TagGroup, Uncertainty
 from calib.calibration.power_curves import DEGREE, SIGMA_FLOOR_M, Curve, flat_curve
-from calib.estimator.error_summary import error_model
+from calib.estimator.error_summary import between_recordings, error_model
 from calib.estimator.known_distances import LARGEST_SPREAD_M, KnownDistances, described_errors
 from calib.estimator.range_model import METRES_A_NS, RangeModel, Spline
 from calib.spread import robust_spread
@@ -30,8 +30,12 @@ def calibration_of(
     alpha_dbm: float,
     fixed: Mapping[int, float],
     groups: Mapping[str, tuple[int, ...]],
+    between_m: float | None = None,
 ) -> Calibration:
-    """Return the calibration of a fit, with a covariance of its delays (tags, tags)."""
+    """Return the calibration of a fit, with a covariance of its delays (tags, tags).
+
+    `between_m` is by how much pairs differ between recordings, None to estimate it.
+    """
     model, search = found.model, found.searches[0]
     names = model.unknowns[0].names
     of_pairs = model.constants == "pair"
@@ -54,6 +58,9 @@ def calibration_of(
     if LEAST_SPREAD_M < spread < LARGEST_SPREAD_M:
         described = described_errors(found)
         errors = error_model(model, found.residuals, described, found.blocks)
+        if between_m is None:
+            between_m = between_recordings(model, found.residuals, described, found.blocks, _between_pairs(found))
+        errors = errors.between(between_m)
         sigmas, sigma_m2 = sigma_curves(model, described.values, described.covariances["noise"])
     return Calibration(
         delays_ns={tag: float(found.delays[k]) for k, tag in zip(fitted, tags, strict=not of_pairs)} | dict(fixed),
@@ -76,6 +83,13 @@ def calibration_of(
         errors=errors,
         antenna_delays=known_delays(model.ranges.antenna_delays, model.ranges.tags()),
     )
+
+
+def _between_pairs(found: KnownDistances) -> float | None:
+    """Return the standard deviation of offsets of pairs, in a session and from one to the next, in metres."""
+    search = found.searches[0].optimum
+    kinds = [kind for kind in ("offset of pair", "offset of pair in session") if kind in search.layout.where]
+    return math.hypot(*map(search.priors.deviation, kinds)) if kinds else None
 
 
 def bias_curves(found: KnownDistances) -> dict[str, Curve]:

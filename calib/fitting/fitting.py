@@ -87,7 +87,13 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         refuse_refuted(fitted, found.residuals, found.model.ranges)
         doubts = examine_fit(found)
         calibration = calibration_of(
-            found, doubts.covariance_ns2, lift=lift, alpha_dbm=alpha_dbm, fixed=fixed, groups=groups
+            found,
+            doubts.covariance_ns2,
+            lift=lift,
+            alpha_dbm=alpha_dbm,
+            fixed=fixed,
+            groups=groups,
+            between_m=settings.between_m,
         )
     given = set(fixed) - set(pinned)
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
