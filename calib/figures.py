@@ -61,15 +61,6 @@ class Binned:
     median_m: Floats
 
 
-def binned(lifted: Floats, error_m: Floats, loss: str, bins: int) -> Binned:
-    """Return errors (n,) by lifted power (n,) in bins of equal counts, as a fit with this loss sees them.
-
-    The curve of a robust fit follows the errors' core: reflections only lengthen, so medians and means lie above it.
-    Least squares follow the mean.
-    """
-    return _all_binned({"": (lifted, error_m, bins)}, loss)[""]
-
-
 def over_power(
     ranges: Ranges, applied: CorrectedRanges, calibration: Calibration, which: Literal["bias", "sigma"]
 ) -> dict[str, Binned]:
@@ -80,11 +71,15 @@ def over_power(
     lifted = applied.lifted
     error_m = (applied.delay_corrected_m if which == "bias" else applied.corrected_m) - ranges.truth_m
     sets = {name: (lifted[rows], error_m[rows], 6) for name, rows in pair_rows(ranges).items()}
-    return _all_binned({**sets, "all": (lifted, error_m, 20)}, calibration.loss)
+    return binned({**sets, "all": (lifted, error_m, 20)}, calibration.loss)
 
 
-def _all_binned(sets: Mapping[str, tuple[Floats, Floats, int]], loss: str) -> dict[str, Binned]:
-    """Return binned errors of sets (lifted powers, errors, number of bins); all cores are fitted at once."""
+def binned(sets: Mapping[str, tuple[Floats, Floats, int]], loss: str) -> dict[str, Binned]:
+    """Return sets of (lifted powers (n,), errors (n,), number of bins) in bins of equal counts, as a fit sees them.
+
+    The curve of a fit follows the errors of direct ranges: reflections only lengthen, so medians and means lie above
+    it. Least squares ("l2") follow the mean.
+    """
     groups = {
         name: np.array_split(np.argsort(x), max(1, min(bins, len(x) // MIN_RANGES_PER_BIN)))
         for name, (x, _, bins) in sets.items()
@@ -141,76 +136,55 @@ def cumulative(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = Non
     return _explained(axes)
 
 
-def bias_over_power(
+def curve_over_power(
     ranges: Ranges,
     applied: CorrectedRanges,
-    calibration: Calibration,
-    axes: Axes | None = None,
-    *,
-    found: Mapping[str, Binned] | None = None,
-) -> Axes:
-    """Draw the centre of the delay-corrected errors over lifted power: by pair, all, fitted, planted; and medians.
-
-    `found` is what `over_power` returned, where it is known already.
-    """
-    axes = axes or new_axes()
-    planted = planted_curve(ranges, "bias_curve", np.linspace(*calibration.bias_curve.range, 300))
-    beside = beside_planted(ranges, applied, calibration) if planted is not None else None
-    if planted is not None and beside is not None:
-        planted += beside.shift_ns * 1e-9 * SPEED_OF_LIGHT
-    found = found or over_power(ranges, applied, calibration, "bias")
-    _over_power(axes, found, calibration, "bias", planted)
-    return _explained(axes)
-
-
-def sigma_over_power(
-    ranges: Ranges,
-    applied: CorrectedRanges,
-    calibration: Calibration,
-    axes: Axes | None = None,
-    *,
-    found: Mapping[str, Binned] | None = None,
-) -> Axes:
-    """Draw the standard deviation of the calibrated errors over lifted power, in the same way."""
-    axes = axes or new_axes()
-    planted = planted_curve(ranges, "sigma_curve", np.linspace(*calibration.sigma_curve.range, 300))
-    found = found or over_power(ranges, applied, calibration, "sigma")
-    _over_power(axes, found, calibration, "sigma", planted)
-    return _explained(axes)
-
-
-def _over_power(
-    axes: Axes,
-    found: Mapping[str, Binned],
     calibration: Calibration,
     which: Literal["bias", "sigma"],
-    planted: Floats | None,
-) -> None:
-    what = "centre_m" if which == "bias" else "std_m"
-    values = {name: 100 * getattr(own, what) for name, own in found.items()}
+    axes: Axes | None = None,
+    found: Mapping[str, Binned] | None = None,
+) -> Axes:
+    """Draw the "bias" or "sigma" curve over lifted power with its band, what was planted, and errors of pairs and all.
+
+    Errors are those of `over_power`, or what it `found` already; of the bias their medians are drawn, too.
+    """
+    axes, found = axes or new_axes(), found or over_power(ranges, applied, calibration, which)
+    bias, squares = which == "bias", calibration.loss == "l2"
+    values = {name: 100 * (own.centre_m if bias else own.std_m) for name, own in found.items()}
     for k, (name, own) in enumerate(found.items()):
         if name != "all":
-            text = "" if k else "each pair"
-            mark(axes.plot(own.lifted, values[name], color=PALE, lw=0.8, label=text)[0], f"pair {name}")
-    everything, squares = found["all"], calibration.loss == "l2"
-    name = "mean of all pairs" if squares else "core of all pairs"
-    axes.plot(everything.lifted, values["all"], "o", color=INK, ms=3, label=name, zorder=4)
+            line = axes.plot(own.lifted, values[name], color=PALE, lw=0.8, label="" if k else "each pair")[0]
+            mark(line, f"pair {name}")
+    everything = found["all"]
+    text = "mean of all pairs" if squares else "core of all pairs"
+    axes.plot(everything.lifted, values["all"], "o", color=INK, ms=3, label=text, zorder=4)
     keep_strays_out(axes, np.concatenate(list(values.values())))
-    if which == "bias" and not squares:
+    if bias and not squares:
         medians = 100 * everything.median_m
         axes.plot(everything.lifted, medians, "_", color=MUTED, ms=6, label="medians, reflections included")
-    curve = calibration.bias_curve if which == "bias" else calibration.sigma_curve
+    curve = calibration.bias_curve if bias else calibration.sigma_curve
     grid = np.linspace(*curve.range, 300)
-    middle, std_m = 100 * curve(grid), calibration.band(grid, which)
+    _curve(axes, calibration, which, grid, 100 * curve(grid), color=BLUE, lw=1.6, label="fitted", zorder=3)
+    planted = planted_curve(ranges, f"{which}_curve", grid)
+    if planted is not None:
+        beside = beside_planted(ranges, applied, calibration) if bias else None
+        planted += 0.0 if beside is None else beside.shift_ns * 1e-9 * SPEED_OF_LIGHT
+        axes.plot(grid, 100 * planted, label="planted, same gauge" if bias else "planted", **PLANTED)
+    if not bias:
+        axes.set_ylim(bottom=0)
+    _power_axes(axes, calibration, "bias (cm)" if bias else "standard deviation (cm)")
+    return _explained(axes)
+
+
+def _curve(
+    axes: Axes, calibration: Calibration, which: Literal["bias", "sigma"], grid: Floats, values: Floats, **line: Any
+) -> None:
+    """Draw values of a curve (n,) in cm over lifted powers (n,), with the band of 95 % where there is one."""
+    std_m = calibration.band(grid, which)
     if std_m is not None:
         half = 100 * TWO_SIDED_95 * std_m
-        axes.fill_between(grid, middle - half, middle + half, color=BLUE, alpha=0.3, lw=0, label="95 % band")
-    axes.plot(grid, middle, color=BLUE, lw=1.6, label="fitted", zorder=3)
-    if planted is not None:
-        axes.plot(grid, 100 * planted, label="planted, same gauge" if which == "bias" else "planted", **PLANTED)
-    if which == "sigma":
-        axes.set_ylim(bottom=0)
-    _power_axes(axes, calibration, "bias (cm)" if which == "bias" else "standard deviation (cm)")
+        axes.fill_between(grid, values - half, values + half, color=line["color"], alpha=0.25, lw=0, label="95 % band")
+    mark(axes.plot(grid, values, **line)[0], line["label"])
 
 
 def _power_axes(axes: Axes, calibration: Calibration, y: str) -> None:
@@ -456,14 +430,11 @@ def both_curves(width_in: float, known: Sequence[Calibration], names: Sequence[s
         for one, name, line in zip(known, names, lines, strict=True):
             curve = one.bias_curve if which == "bias" else one.sigma_curve
             grid = np.linspace(*curve.range, 200)
-            values, std_m = 100 * curve(grid), one.band(grid, which)
+            values = 100 * curve(grid)
             values -= values.mean() if which == "bias" else 0.0
-            if std_m is not None:
-                half = 100 * TWO_SIDED_95 * std_m
-                axes.fill_between(grid, values - half, values + half, color=line["color"], alpha=0.2, lw=0)
-            mark(axes.plot(grid, values, label=name, **line)[0], name)
+            _curve(axes, one, which, grid, values, label=name, **line)
     label(panels[0], "lifted power", "bias, mean taken out (cm)")
     label(panels[1], "lifted power", "standard deviation (cm)")
     panels[1].set_ylim(bottom=0)
-    legend(figure, panels[0])
+    legend(figure, panels[0], texts=names)
     return figure

@@ -57,15 +57,15 @@ class FitResult:
 
     def plot_bias(self, axes: Axes | None = None) -> Axes:
         """Draw medians of the delay-corrected errors over lifted power, in cm, and the fitted curve with its band."""
-        from calib.figures import bias_over_power
+        from calib.figures import curve_over_power
 
-        return bias_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, axes)
+        return curve_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, "bias", axes)
 
     def plot_sigma(self, axes: Axes | None = None) -> Axes:
         """Draw robust standard deviations of the errors over lifted power, in cm, and the curve with its band."""
-        from calib.figures import sigma_over_power
+        from calib.figures import curve_over_power
 
-        return sigma_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, axes)
+        return curve_over_power(self.ranges, self.calibration.apply(self.ranges), self.calibration, "sigma", axes)
 
     def plot_residuals(self, axes: Axes | None = None) -> Axes:
         """Draw a histogram of the errors in cm: raw, with the delays corrected, and fully corrected."""

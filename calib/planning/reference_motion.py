@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from calib.data.samples import stamped
 from calib.planning.settings import FlightPlanSettings
@@ -29,6 +30,9 @@ POWER_AT_2_M_DBM = -80.0
 FADING_DB = 3.0
 GRAVITY_M_S2 = 9.81
 EDGE = 0.05
+SAMPLE_S = 0.02
+"""Motion is sampled so often: cubic splines through it are then right to micrometres and 1e-4 m/s^2."""
+
 STARTING_S = 3.0
 """How long it takes from standing to flying."""
 
@@ -68,52 +72,30 @@ def reference_motion(flown: FlightPlanSettings) -> ReferenceFlight:
 
 
 class _Body:
-    """One body's motion: two sines an axis about a middle of its own, upright, turning to and fro.
+    """One body's motion, upright and turning to and fro: two sines an axis about a middle of its own.
 
-    Until it starts it stands; then it is as fast as it will be within `STARTING_S`.
+    Until it starts it stands; `STARTING_S` later it is as fast as it will be. `place` and `yaw` are splines over time.
     """
 
     def __init__(self, flown: FlightPlanSettings, number: int, rng: np.random.Generator) -> None:
         size, angle = np.array(flown.size_m), 2 * np.pi * number / len(flown.robots) + 0.4
         self.name = f"robot{number + 1}"
-        self.still_s = flown.still_s
-        self.middle = size * (0.5 + MIDDLES * np.array([np.cos(angle), np.sin(angle), 0.0]))
-        self.reach = REACH * size
-        slow = 2 * np.pi * float(np.linalg.norm(self.reach)) / flown.speed_m_s
-        self.rate = 2 * np.pi / (slow * rng.uniform(*PERIODS, (3, 2)))
-        self.phase = rng.uniform(0, 2 * np.pi, (3, 2))
-        self.turning = 2 * np.pi / rng.uniform(*TURNS_S)
-        self.heading = float(rng.uniform(-np.pi, np.pi))
-
-    def _pace(self, time_s: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return how far along its motion it is, how fast it goes on, and how that changes (n,)."""
-        if not self.still_s:
-            return time_s, np.ones_like(time_s), np.zeros_like(time_s)
-        u = np.clip((time_s - self.still_s) / STARTING_S, 0.0, 1.0)
-        along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time_s - self.still_s - STARTING_S, 0.0)
-        return along, 3 * u**2 - 2 * u**3, 6 * (u - u**2) / STARTING_S
-
-    def _wave(self, along_s: Floats, derivative: int) -> Floats:
-        wave = np.sin(self.rate * along_s[:, None, None] + self.phase + derivative * np.pi / 2)
-        return np.asarray(self.reach * (wave * self.rate**derivative).sum(axis=2))
-
-    def place(self, time_s: Floats) -> Floats:
-        """Return where it is (n, 3)."""
-        return self.middle + self._wave(self._pace(time_s)[0], 0)
-
-    def acceleration(self, time_s: Floats) -> Floats:
-        """Return the second derivative of its place (n, 3)."""
-        along, pace, change = self._pace(time_s)
-        return np.asarray(self._wave(along, 2) * pace[:, None] ** 2 + self._wave(along, 1) * change[:, None])
-
-    def yaw(self, time_s: Floats) -> Floats:
-        """Return its heading (n,)."""
-        return np.asarray(self.heading + TURN_RAD * np.sin(self.turning * self._pace(time_s)[0]))
-
-    def yaw_rate(self, time_s: Floats) -> Floats:
-        """Return how fast its heading changes (n,)."""
-        along, pace, _ = self._pace(time_s)
-        return np.asarray(TURN_RAD * self.turning * np.cos(self.turning * along) * pace)
+        middle = size * (0.5 + MIDDLES * np.array([np.cos(angle), np.sin(angle), 0.0]))
+        reach = REACH * size
+        slow = 2 * np.pi * float(np.linalg.norm(reach)) / flown.speed_m_s
+        rate = 2 * np.pi / (slow * rng.uniform(*PERIODS, (3, 2)))
+        phase = rng.uniform(0, 2 * np.pi, (3, 2))
+        turning = 2 * np.pi / rng.uniform(*TURNS_S)
+        heading = float(rng.uniform(-np.pi, np.pi))
+        time = np.arange(-1.5, flown.seconds + 1.5, SAMPLE_S)
+        along = time
+        if flown.still_s:
+            # The pace rises from 0 to 1 by 3 u^2 - 2 u^3, whose integral this is.
+            u = np.clip((time - flown.still_s) / STARTING_S, 0.0, 1.0)
+            along = STARTING_S * (u**3 - u**4 / 2) + np.maximum(time - flown.still_s - STARTING_S, 0.0)
+        waves = np.sin(rate * along[:, None, None] + phase).sum(axis=2)
+        self.place = make_interp_spline(time, middle + reach * waves)
+        self.yaw = make_interp_spline(time, heading + TURN_RAD * np.sin(turning * along))
 
 
 def _arms(count: int, apart_m: float) -> Floats:
@@ -174,8 +156,8 @@ def _readings(bodies: list[_Body], seconds: float) -> dict[str, Any]:
     found: dict[str, list[Any]] = {name: [] for name in ("time_ns", "body", "wx", "wy", "wz", "ax", "ay", "az")}
     for body in bodies:
         c, s = np.cos(body.yaw(time)), np.sin(body.yaw(time))
-        x, y, z = body.acceleration(time).T
-        columns = (0 * c, 0 * c, body.yaw_rate(time), c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
+        x, y, z = body.place(time, 2).T
+        columns = (0 * c, 0 * c, body.yaw(time, 1), c * x + s * y, c * y - s * x, z + GRAVITY_M_S2)
         found["time_ns"].append(np.rint(time * 1e9).astype(np.int64))
         found["body"].append(np.full(len(time), body.name))
         for name, column in zip(("wx", "wy", "wz", "ax", "ay", "az"), columns, strict=True):

@@ -16,6 +16,7 @@ from calib.evaluation.tracking import Settings
 from calib.report.figures import FILTER_NAMES, rmse_bars, track
 from calib.report.results import Results
 from uwblink.pages.blocks import Block, Heading, Picture, Table, Text
+from uwblink.pages.figures import Draw
 
 
 def curves(results: Results) -> list[Block]:
@@ -41,23 +42,18 @@ def curves(results: Results) -> list[Block]:
         "stand above the figures."
     )
     known = (results.trained, calibration.apply(results.trained), calibration)
-    # Binned once for both widths.
-    bias, sigma = (cache(partial(figures.over_power, *known, which)) for which in ("bias", "sigma"))
-    return [
-        Heading("Bias and standard deviation over power"),
-        Text(follows, "note"),
-        Text(lifted, "note"),
-        Picture(
-            "bias",
-            lambda width: figures.alone(partial(figures.bias_over_power, *known, found=bias()), width),
-            "Bias over power: what the delay-corrected errors centre on, and the curve with its 95 % band.",
-        ),
-        Picture(
-            "sigma",
-            lambda width: figures.alone(partial(figures.sigma_over_power, *known, found=sigma()), width),
-            "Standard deviation over power: that of the calibrated errors' noise, and the curve with its 95 % band.",
-        ),
-    ]
+    captions = {
+        "bias": "Bias over power: what the delay-corrected errors centre on, and the curve with its 95 % band.",
+        "sigma": "Standard deviation over power: that of the noise, and the curve with its 95 % band.",
+    }
+    pictures = [Picture(which, _over_power(known, which), caption) for which, caption in captions.items()]
+    return [Heading("Bias and standard deviation over power"), Text(follows, "note"), Text(lifted, "note"), *pictures]
+
+
+def _over_power(known: tuple[Any, Any, Any], which: Any) -> Draw:
+    """Return what draws a curve at a width, from errors that are binned once for all widths."""
+    found = cache(lambda: figures.over_power(*known, which))
+    return lambda width: figures.alone(lambda axes: figures.curve_over_power(*known, which, axes, found()), width)
 
 
 def before_after(results: Results) -> list[Block]:

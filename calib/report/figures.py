@@ -155,17 +155,22 @@ def _boards(axes: Axes, one: PlannedArrangement, height: int, *, on_line: bool) 
         axes.grid(visible=False)
 
 
-def _intervals(axes: Axes, after: Mapping[int, float], before: Mapping[int, float]) -> None:
-    """Draw the interval of each delay after an arrangement, and before it; what is not determined is open."""
+def _intervals(
+    axes: Axes,
+    after: Mapping[int, float],
+    before: Mapping[int, float],
+    names: tuple[str, str] = ("after this arrangement", "before it"),
+) -> None:
+    """Draw half intervals by tag as bars, others as outlines about them; what is not determined is open."""
     tags = list(after)
     rows = np.arange(len(tags))
     top = max((value for value in [*after.values(), *before.values()] if math.isfinite(value)), default=1.0)
-    bars = [(after, 0.5, "after this arrangement", BLUE, BLUE)]
-    if before:
-        bars.insert(0, (before, 0.8, "before it", "none", MUTED))
-    for values, width, text, face, edge in bars:
-        shown = [min(values[tag], 1.2 * top) if math.isfinite(values[tag]) else math.nan for tag in tags]
-        axes.bar(rows, shown, width, label=text, facecolor=face, edgecolor=edge, lw=0.8)
+    bars: Any = ((before, names[1], 0.8, "none", MUTED), (after, names[0], 0.5, BLUE, BLUE))
+    for values, text, width, face, edge in bars:
+        shown = np.array([values.get(tag, math.nan) for tag in tags])
+        shown[~np.isfinite(shown)] = np.nan
+        if not np.isnan(shown).all():
+            axes.bar(rows, shown, width, label=text, facecolor=face, edgecolor=edge, lw=0.8)
     for row, tag in zip(rows.tolist(), tags, strict=True):
         if not math.isfinite(after[tag]):
             turned = 90 if len(tags) > 5 else 0
@@ -173,7 +178,7 @@ def _intervals(axes: Axes, after: Mapping[int, float], before: Mapping[int, floa
     axes.set_xticks(rows, [str(tag) for tag in tags])
     axes.set_xlim(-0.6, len(tags) - 0.4)
     axes.set_ylim(0, 1.08 * top)
-    label(axes, "board", "± ns (95 %)")
+    label(axes, "tag", "± ns (95 %)")
     axes.grid(visible=False, axis="x")
 
 
@@ -200,18 +205,8 @@ def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
 def planned_delays(width_in: float, plan: FlightPlan) -> Figure:
     """Draw the interval of each delay; of those that stay open, how far they would be known."""
     figure, (axes,) = sheet(width_in, height_in=2.2)
-    tags = list(plan.half_ns)
-    known = np.array([plan.half_ns[tag] for tag in tags])
-    open_ones = np.where(np.isfinite(known), math.nan, [plan.open_ns.get(tag, math.nan) for tag in tags])
-    known = np.where(np.isfinite(known), known, math.nan)
-    rows = np.arange(len(tags))
-    if np.isfinite(known).any():
-        axes.bar(rows, known, 0.6, color=BLUE, label="determined")
-    if np.isfinite(open_ones).any():
-        axes.bar(rows, open_ones, 0.6, facecolor="none", edgecolor=VERMILION, lw=0.9, label="stays open")
-    axes.set_xticks(rows, [str(tag) for tag in tags])
-    label(axes, "tag", "± ns (95 %)")
-    axes.grid(visible=False, axis="x")
+    left_open = {tag: math.nan if math.isfinite(half) else plan.open_ns[tag] for tag, half in plan.half_ns.items()}
+    _intervals(axes, plan.half_ns, left_open, ("determined", "stays open"))
     legend(figure)
     return figure
 

@@ -7,13 +7,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from calib.figures import (
-    bias_over_power,
     binned,
     cumulative,
     delays,
     histogram,
     scale_sensitivity,
-    sigma_over_power,
     within_fence,
 )
 from calib.fitting.fitting import fit
@@ -42,19 +40,18 @@ def test_points_are_the_core_that_the_curve_follows_and_medians_lie_above():
     # Planted: a core of 5 cm about nothing, a fifth of it lengthened by 40 cm in the mean.
     rng = np.random.default_rng(5)
     error = rng.normal(0, 0.05, 40_000) + np.where(rng.random(40_000) < 0.2, rng.exponential(0.4, 40_000), 0)
-    found = binned(rng.uniform(0, 1.5, 40_000), error, "mixture", 20)
+    found = binned({"": (rng.uniform(0, 1.5, 40_000), error, 20)}, "mixture")[""]
     # Of 2000 in a bin the centre is known to 1.5 mm, and its spread, told with the tail's, to 2 mm.
     assert np.abs(found.centre_m).max() < 0.006
     assert np.abs(found.centre_m.mean()) < 0.001
     assert found.std_m == pytest.approx(0.05, abs=0.008)
     assert found.median_m.mean() == pytest.approx(0.0145, abs=0.003)
-    assert binned(np.arange(40_000.0), error, "l2", 4).centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
+    squares = binned({"": (np.arange(40_000.0), error, 4)}, "l2")[""]
+    assert squares.centre_m.mean() == pytest.approx(error.mean(), abs=1e-9)
 
 
 def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
-    axes = axes_of(
-        lambda a: bias_over_power(fitted.ranges, fitted.calibration.apply(fitted.ranges), fitted.calibration, a)
-    )
+    axes = axes_of(fitted.plot_bias)
     points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
     at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
     # 600 a bin: the centre of a core of 5 cm beside a fifth of reflections is known to 3 mm; medians lie 1.5 cm above.
@@ -68,18 +65,14 @@ def test_the_drawn_curve_goes_through_the_drawn_points(fitted):
 
 
 def test_the_sigma_curve_goes_through_its_points(fitted):
-    axes = axes_of(
-        lambda a: sigma_over_power(fitted.ranges, fitted.calibration.apply(fitted.ranges), fitted.calibration, a)
-    )
+    axes = axes_of(fitted.plot_sigma)
     points, curve = labelled(axes, "core of all pairs"), labelled(axes, "fitted")
     at = np.interp(points.get_xdata(), curve.get_xdata(), curve.get_ydata())
     assert np.mean(points.get_ydata() / at) == pytest.approx(1, abs=0.06)
 
 
 def test_powers_in_dbm_stand_above_the_same_places(fitted):
-    axes = axes_of(
-        lambda a: bias_over_power(fitted.ranges, fitted.calibration.apply(fitted.ranges), fitted.calibration, a)
-    )
+    axes = axes_of(fitted.plot_bias)
     (top,) = axes.child_axes
     for place, text in zip(top.get_xticks(), top.get_xticklabels(), strict=True):
         assert 10 ** ((float(text.get_text().replace("−", "-")) + 82) / 10) == pytest.approx(place)
