@@ -175,7 +175,7 @@ def dask() -> str:
         path = Path(folder) / "plan.toml"
         path.write_text(SWEEP.format(scenario="icra2023/test1", seeds=40))
         plan = load_design(path)
-        work = Work.of_here(plan.scenario.stem, plan.protocols, plan.ranges)
+        work = Work.of_here(plan.scenario.stem, plan.protocols, plan.settings.ranges)
         _, once = run_chunk([_task(plan, 0)], work)
         _, once = run_chunk([_task(plan, 1)], work)
         size = max(int(1 / once), 1)

@@ -15,7 +15,7 @@ from uwblink.importers.column_map import FILE_KEYS as COLUMN_MAP
 from uwbsim.cli.commands import app as uwbsim_app
 from uwbsim.scenario.faults import Faults
 from uwbsim.scenario.model import Scenario
-from uwbsim.sweep.design import FILE_KEYS as SWEEP
+from uwbsim.sweep.design import SweepFile
 
 GENERATED: Final = Path(__file__).parents[1] / "generated"
 
@@ -24,7 +24,7 @@ PAGES: Final[dict[str, Callable[[], str]]] = {
     "faults": lambda: schema.reference(Faults.model_json_schema(), "Faults"),
     "column_map": lambda: file_keys.reference(COLUMN_MAP),
     "plan": lambda: file_keys.reference(PLAN),
-    "sweep": lambda: file_keys.reference(SWEEP),
+    "sweep": lambda: schema.reference(SweepFile.model_json_schema(), "SweepFile"),
     "calibration": lambda: file_keys.reference(CALIBRATION),
     "checks": checks.reference,
     "uwbsim": lambda: commands.reference(uwbsim_app, "uwbsim"),

@@ -28,8 +28,7 @@ from uwbsim.scenario.ranging import (
     before_marker_s,
 )
 from uwbsim.simulation.timestamps import draw_reply_s
-from uwbsim.units import NS_PER_S
-from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import SampledWorld, World

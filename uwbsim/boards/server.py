@@ -27,8 +27,7 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.bodies import Carried
 from uwbsim.scenario.faults import Bytes, Fault, Faults, Hang, LateReplies, SplitWrites, Unplug
 from uwbsim.scenario.model import Scenario
-from uwbsim.units import NS_PER_S
-from uwbsim.world.clocks import LONGEST_RUN_S
+from uwbsim.world.clocks import LONGEST_RUN_S, NS_PER_S
 from uwbsim.world.world import World
 
 

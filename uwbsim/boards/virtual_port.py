@@ -24,7 +24,7 @@ from uwbsim.boards.virtual_board import Bench
 from uwbsim.errors import ParameterError
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
-from uwbsim.units import NS_PER_S
+from uwbsim.world.clocks import NS_PER_S
 
 MOST_TRANSFERS: Final = 20_000
 """Of what boards sent so much is kept for a look at it: some MB, however long a recording is."""

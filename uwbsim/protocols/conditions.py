@@ -147,7 +147,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         back = world.link(j, i, start)
         arrivals.append(arrive(radio, back))
     delays = AntennaDelays.of(scenario)
-    white = np.array([tag.white_sqrt_s for tag in scenario.tags])
+    white = np.array([(tag.white_ppm_sqrt_s * 1e-6) for tag in scenario.tags])
     share, mean_m = radio.independent_multipath
     nothing = np.zeros(len(rows))
     return Conditions(
@@ -162,7 +162,7 @@ def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:
         white_target=white[j],
         late=np.mean([arrival.bias_s for arrival in arrivals], axis=0),
         rx_std=np.sqrt(np.mean([arrival.std_s**2 for arrival in arrivals], axis=0)),
-        tx_std=np.full(len(rows), radio.tx_noise_s),
+        tx_std=np.full(len(rows), (radio.tx_noise_ps * 1e-12)),
         tx_delay_initiator=delays.transmit_s(i, start),
         rx_delay_initiator=delays.receive_s(i, start),
         tx_delay_target=delays.transmit_s(j, start),

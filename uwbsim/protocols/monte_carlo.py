@@ -18,7 +18,6 @@ from uwblink.protocols.rows import Intervals, ProtocolMessage, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, TICK_S
 from uwbsim.protocols.conditions import STATES, Conditions
 from uwbsim.random_streams import stream
-from uwbsim.units import PPM_PER_ONE
 from uwbsim.world.clocks import RATE_SPAN_S
 
 SIDES: Final = ("initiator", "target")
@@ -213,7 +212,7 @@ def _carrier_ppm(wander: dict[str, _Wander], departure: Floats) -> Floats:
     span = RATE_SPAN_S / TICK_S
     begun = {side: path.at(departure - span) for side, path in wander.items()}
     gained = {side: path.at(departure) - begun[side] for side, path in wander.items()}
-    return np.asarray((gained["initiator"] - gained["target"]) / span * PPM_PER_ONE)
+    return np.asarray((gained["initiator"] - gained["target"]) / span * 1e6)
 
 
 def _intervals(

@@ -19,7 +19,6 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK,
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, chosen
 from uwbsim.scenario.devices import TX_SHARE
-from uwbsim.units import NS, PPM_PER_ONE, PS, PS_PER_S, US
 from uwbsim.world.clocks import RATE_SPAN_S
 
 
@@ -169,7 +168,7 @@ def _white_clocks(
     rate over the preamble of the second message.
     """
     # How the flight changes with what the phase gains during the preamble.
-    gain = c.carrier_sign * slopes["carrier_ppm"] * PPM_PER_ONE * TICK_S / RATE_SPAN_S
+    gain = c.carrier_sign * slopes["carrier_ppm"] * 1e6 * TICK_S / RATE_SPAN_S
     total = np.zeros(len(c))
     for side, white, sign in (("initiator", c.white_initiator, 1), ("target", c.white_target, -1)):
         read = [(leave[1] - RATE_SPAN_S, -sign * gain), (leave[1], sign * gain)]
@@ -303,14 +302,14 @@ def predict_state(q: State) -> Prediction:
         rate_target=-q.skew_ppm * 0.5e-6,
         drift_initiator=q.drift_ppm_per_s * 0.5e-6,
         drift_target=-q.drift_ppm_per_s * 0.5e-6,
-        tx_std=q.tx_noise_ps * PS,
-        rx_std=q.rx_noise_ps * PS,
-        tx_delay_initiator=TX_SHARE * NS * q.delay_initiator_ns,
-        rx_delay_initiator=(TX_SHARE - 1) * NS * q.delay_initiator_ns,
-        tx_delay_target=TX_SHARE * NS * q.delay_target_ns,
-        rx_delay_target=(TX_SHARE - 1) * NS * q.delay_target_ns,
-        at_once=at_once * US,
-        scheduled=scheduled * US,
+        tx_std=q.tx_noise_ps * 1e-12,
+        rx_std=q.rx_noise_ps * 1e-12,
+        tx_delay_initiator=TX_SHARE * 1e-9 * q.delay_initiator_ns,
+        rx_delay_initiator=(TX_SHARE - 1) * 1e-9 * q.delay_initiator_ns,
+        tx_delay_target=TX_SHARE * 1e-9 * q.delay_target_ns,
+        rx_delay_target=(TX_SHARE - 1) * 1e-9 * q.delay_target_ns,
+        at_once=at_once * 1e-6,
+        scheduled=scheduled * 1e-6,
         carrier_bias_ppm=q.carrier_bias_ppm,
         carrier_std_ppm=q.carrier_noise_ppm,
         quantize=q.whole_ticks,
@@ -329,7 +328,7 @@ def predict_state(q: State) -> Prediction:
         bias_m=bias,
         std_m=variance**0.5,
         variance_m2=variance,
-        bias_ps=bias / SPEED_OF_LIGHT * PS_PER_S,
-        std_ps=variance**0.5 / SPEED_OF_LIGHT * PS_PER_S,
+        bias_ps=bias / SPEED_OF_LIGHT * 1e12,
+        std_ps=variance**0.5 / SPEED_OF_LIGHT * 1e12,
         parts_m={name: float(part[0]) ** 0.5 for name, part in parts.items()},
     )

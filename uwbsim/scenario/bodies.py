@@ -8,7 +8,6 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
-from uwbsim.units import MM
 
 
 class RandomFlight(Section):
@@ -235,11 +234,6 @@ class Obstacle(Section):
         """Return loss in dB a metre, and refractive index."""
         return properties(self.material)
 
-    @property
-    def roughness_m(self) -> float:
-        """Return the standard deviation of its surface's heights in metres."""
-        return self.roughness_mm * MM
-
 
 def properties(material: str | Material) -> tuple[float, float]:
     """Return loss in dB a metre and refractive index of a material, by its name or as given."""
@@ -275,11 +269,6 @@ class Room(Section):
         if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
             raise ValueError("min_m: must be below max_m in every direction")
         return self
-
-    @property
-    def roughness_m(self) -> float:
-        """Return the standard deviation of its surfaces' heights in metres."""
-        return self.roughness_mm * MM
 
     def materials(self) -> tuple[str | Material, ...]:
         """Return those of the six surfaces: two walls across x, two across y, floor and ceiling."""

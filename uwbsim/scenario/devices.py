@@ -14,7 +14,6 @@ from uwblink.ticks import ANTENNA_DELAY_TICKS, TICK_S
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId, Vector
 from uwbsim.scenario.bodies import Height, Imu, Motion, Shadow
-from uwbsim.units import NS, PPM
 
 
 class Constant(Section):
@@ -301,32 +300,7 @@ class Tag(Section):
     def antenna_delays_s(self) -> tuple[float, float]:
         """Return what is added to a transmit and to a receive stamp beyond what belongs there, in seconds."""
         transmit, receive = self.delays_ns()
-        return transmit * NS, receive * NS
-
-    @property
-    def skew(self) -> float:
-        """Return how much faster than true time the clock runs at first, as a fraction."""
-        return self.skew_ppm * PPM
-
-    @property
-    def drift_per_sqrt_s(self) -> float:
-        """Return the random walk of the clock's rate, as a fraction per root of a second."""
-        return self.drift_ppm_per_sqrt_s * PPM
-
-    @property
-    def white_sqrt_s(self) -> float:
-        """Return the white noise of the clock's rate, as a fraction times the root of a second."""
-        return self.white_ppm_sqrt_s * PPM
-
-    @property
-    def flicker(self) -> float:
-        """Return the Allan deviation of flicker noise of the clock's rate, as a fraction."""
-        return self.flicker_ppm * PPM
-
-    @property
-    def ramp_per_s(self) -> float:
-        """Return what a change of temperature adds to the clock's rate, as a fraction per second."""
-        return self.ramp_ppm_per_s * PPM
+        return transmit * 1e-9, receive * 1e-9
 
     def delays_ns(self) -> tuple[float, float]:
         """Return what is added to a transmit and to a receive stamp beyond what belongs there, in nanoseconds.
@@ -336,7 +310,9 @@ class Tag(Section):
         aggregate = self.delay_ns or 0.0
         transmit = TX_SHARE * aggregate if self.tx_delay_ns is None else self.tx_delay_ns
         receive = (TX_SHARE - 1) * aggregate if self.rx_delay_ns is None else self.rx_delay_ns
-        more = [(ticks - ANTENNA_DELAY_TICKS) * TICK_S / NS for ticks in (self.antenna_delay.tx, self.antenna_delay.rx)]
+        more = [
+            (ticks - ANTENNA_DELAY_TICKS) * TICK_S / 1e-9 for ticks in (self.antenna_delay.tx, self.antenna_delay.rx)
+        ]
         return transmit + more[0], receive - more[1]
 
 

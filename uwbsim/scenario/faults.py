@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from uwblink.text_files import read_text
 from uwbsim.errors import ScenarioError
 from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
+from uwbsim.scenario.loading import parse_toml, validated
 
 
 class Bytes(Section):
@@ -90,16 +91,8 @@ def load_faults(path: str | os.PathLike[str], tags: Iterable[int]) -> Faults:
     >>> uwbsim.load_faults("faults.toml", [10, 20]).faults[0].at_s
     0.5
     """
-    tags = list(tags)
-    try:
-        table = tomllib.loads(read_text(path, ScenarioError, "file of faults (.toml)"))
-        faults = Faults.model_validate(table)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ScenarioError(f"{path}: {where}: {first['msg'][0].lower()}{first['msg'][1:]}") from error
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ScenarioError(f"{path}: cannot be read as a file of faults (.toml): {error}") from error
+    tags, path = list(tags), Path(path)
+    faults = validated(Faults, parse_toml(read_text(path, ScenarioError, "file of faults (.toml)"), path), path)
     for number, fault in enumerate(faults.faults):
         tag = getattr(fault, "tag", None)
         if tag is not None and tag not in tags:

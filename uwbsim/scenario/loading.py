@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from copy import deepcopy
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -20,8 +20,6 @@ from uwblink.text_files import read_text
 from uwbsim.errors import ParameterError, ScenarioError, UnknownKeyError
 from uwbsim.scenario.linked_files import Folders, fill_in
 from uwbsim.scenario.model import Scenario
-
-SUFFIX: Final = ".toml"
 
 
 def shipped_scenarios() -> Mapping[str, Path]:
@@ -36,7 +34,7 @@ def shipped_scenarios() -> Mapping[str, Path]:
     240.0
     """
     folder = _folder()
-    named = {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob(f"*{SUFFIX}")}
+    named = {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob("*.toml")}
     return MappingProxyType(dict(sorted(named.items())))
 
 
@@ -54,12 +52,12 @@ def found(path: Path) -> Path:
     """
     if os.path.exists(path) or path.is_absolute():  # False, where Path.exists raises: for want of permission
         return path
-    return shipped_scenarios().get(path.as_posix().removesuffix(SUFFIX), path)
+    return shipped_scenarios().get(path.as_posix().removesuffix(".toml"), path)
 
 
 def nearest(path: Path) -> str:
     """Return `, did you mean ...?` with the shipped scenarios that a path could stand for; nothing where none is."""
-    plain, known = path.as_posix().removesuffix(SUFFIX), list(shipped_scenarios())
+    plain, known = path.as_posix().removesuffix(".toml"), list(shipped_scenarios())
     parts = [name for name in known if plain in name.split("/")]
     near = [] if os.path.lexists(path) else parts or difflib.get_close_matches(plain, known, 2)
     return f", did you mean {' or '.join(near)}?" if near else ""
@@ -105,7 +103,7 @@ def _chosen(names: list[str]) -> Mapping[str, Path]:
     known = shipped_scenarios()
     chosen: dict[str, Path] = {}
     for name in names:
-        plain = name.removesuffix(SUFFIX).rstrip("/")
+        plain = name.removesuffix(".toml").rstrip("/")
         some = {other: path for other, path in known.items() if other == plain or other.startswith(f"{plain}/")}
         if not some:
             raise ScenarioError(f"{name}: no such scenario; known are {', '.join(known)}")
@@ -149,14 +147,11 @@ def load(source: Source, overrides: Overrides = (), seed: int | None = None, *, 
     table, where = _table(source)
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(_split, overrides)
     for key, value in pairs:
-        _override(table, key, value)
+        _override(table, key, deepcopy(value))
     if seed is not None:
         _override(table, "run.seed", seed)
     fill_in(table, where, allow_files)
-    try:
-        return Scenario.model_validate(table)
-    except ValidationError as error:
-        raise _mistake(where, error) from error
+    return validated(Scenario, table, where)
 
 
 def as_scenario(source: Scenario | Source) -> Scenario:
@@ -233,16 +228,25 @@ def _index(node: list[Any], step: str, key: str) -> int:
     raise UnknownKeyError(f"{key}: found {step!r}, expected an index 0 to {len(node) - 1}")
 
 
-def _mistake(path: Path, error: ValidationError) -> ScenarioError:
-    # An unknown key explains a missing one better than the other way round.
-    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    if first["type"] == "extra_forbidden":
-        return UnknownKeyError(f"{path}: {_key_path(first)}: unknown key{_suggestion(first['loc'])}")
-    return ScenarioError(f"{path}: {_explain(first)}")
+Model = TypeVar("Model", bound=BaseModel)
 
 
-def _explain(first: Mapping[str, Any]) -> str:
-    where = _key_path(first)
+def validated(model: type[Model], table: Mapping[str, Any], path: str | Path) -> Model:
+    """Return a table of a file as its model; raises `ScenarioError`, one line that names the file and the key path."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        # An unknown key explains a missing one better than the other way round.
+        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        where, known = _key_path(model, first)
+        if first["type"] == "extra_forbidden":
+            near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            raise UnknownKeyError(f"{path}: {where}: unknown key; {hint}") from error
+        raise ScenarioError(f"{path}: {_explain(where, first)}") from error
+
+
+def _explain(where: str, first: Mapping[str, Any]) -> str:
     if first["type"] == "missing":
         return f"{where}: missing, and it must be given"
     message = str(first["msg"]).removeprefix("Value error, ")
@@ -255,31 +259,25 @@ def _explain(first: Mapping[str, Any]) -> str:
     return f"{where}: found {found}, {message[0].lower()}{message[1:]}"
 
 
-def _key_path(first: Mapping[str, Any]) -> str:
-    """Return the path of a mistake as a user writes it: without the names of union members that pydantic adds."""
-    path, unknown = "", first["type"] == "extra_forbidden"
-    models: list[type[BaseModel]] = [Scenario]
+def _key_path(root: type[BaseModel], first: Mapping[str, Any]) -> tuple[str, list[str]]:
+    """Return the path of a mistake as a user writes it, without the names of union members that pydantic adds.
+
+    With it come the keys that are known beside the last one.
+    """
+    path, unknown, known = "", first["type"] == "extra_forbidden", list[str]()
+    models: list[type[BaseModel]] = [root]
     for k, part in enumerate(first["loc"]):
+        known = sorted({name for m in models for name in m.model_fields})
         children = [f.annotation for m in models if (f := m.model_fields.get(str(part)))]
         models = [m for child in children for m in _models_in(child)] or models
         if isinstance(part, int):
             path += f"[{part}]"
         elif children or (unknown and k == len(first["loc"]) - 1):
             path += f".{part}"
-    return path.lstrip(".")
+    return path.lstrip("."), known
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [m for a in get_args(annotation) for m in _models_in(a)]
-
-
-def _suggestion(loc: tuple[int | str, ...]) -> str:
-    models: list[type[BaseModel]] = [Scenario]
-    for part in loc[:-1]:
-        children = [f.annotation for m in models if (f := m.model_fields.get(str(part)))]
-        models = [m for child in children for m in _models_in(child)] or models
-    known = sorted({name for m in models for name in m.model_fields})
-    near = difflib.get_close_matches(str(loc[-1]), known, n=1)
-    return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"

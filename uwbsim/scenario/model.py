@@ -17,7 +17,6 @@ from uwbsim.scenario.bodies import Carried, Obstacle, RandomFlight, Room, Static
 from uwbsim.scenario.devices import Body, Devices, Tag
 from uwbsim.scenario.radio import GeometricMultipath, Radio, Spline, TwoStateMultipath
 from uwbsim.scenario.ranging import Ranging
-from uwbsim.units import MS
 
 WAVELENGTH_M: Final = SPEED_OF_LIGHT / 3993.6e6
 
@@ -42,11 +41,6 @@ class Mocap(Section):
     latency_ms: float = Field(0.0, description="How late the times of the poses are.")
     gaps_per_min: NotNegative = Field(0.0, description="How many times a minute it loses sight of each body.")
     gap_s: Positive = Field(0.5, description="For how long it does.")
-
-    @property
-    def latency_s(self) -> float:
-        """Return in seconds how late its times are."""
-        return self.latency_ms * MS
 
 
 class Scenario(Section):

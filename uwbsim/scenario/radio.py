@@ -8,7 +8,6 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from uwbsim.scenario.base import NotNegative, Positive, Section, Share, TagId
 from uwbsim.scenario.devices import GroupDelay, check_grid
-from uwbsim.units import MS, NS, PS
 
 _AUGUST: Final = [0.014173673264269979] * 4 + [1.599984520527571] * 4
 _JULY: Final = [0.009024434505913748] * 4 + [1.8988661927089594] * 4
@@ -138,11 +137,6 @@ class TwoStateMultipath(Section):
                 )
         return self
 
-    @property
-    def rise_s(self) -> float:
-        """Return in seconds how much later the strongest path comes on average."""
-        return self.rise_ns * NS
-
 
 class Fading(Section):
     """Power that comes and goes with the place, alike in both directions of a pair of tags.
@@ -212,16 +206,6 @@ class GeometricMultipath(Section):
         12.0,
         description="How many times below the first path's threshold the noise is.",
     )
-
-    @property
-    def decay_s(self) -> float:
-        """Return over which time the power of what bounces around falls to a share of 1/e."""
-        return self.decay_ns * NS
-
-    @property
-    def step_s(self) -> float:
-        """Return in seconds how often responses are computed."""
-        return self.step_ms * MS
 
 
 def _independent_unless_named(value: Any) -> Any:
@@ -395,13 +379,3 @@ class Radio(Section):
         if isinstance(self.multipath, IndependentMultipath):
             return self.multipath.probability, self.multipath.mean_excess_m
         return 0.0, 0.0
-
-    @property
-    def tx_noise_s(self) -> float:
-        """Return the standard deviation of transmissions about their stamps, in seconds."""
-        return self.tx_noise_ps * PS
-
-    @property
-    def rx_noise_s(self) -> float:
-        """Return the standard deviation of receive stamps that does not depend on power, in seconds."""
-        return self.rx_noise_ps * PS

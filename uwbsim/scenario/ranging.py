@@ -6,13 +6,12 @@ import math
 from typing import Annotated, Final, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwbsim.scenario.base import NotNegative, Positive, Section, TagId
-from uwbsim.units import MS, US
 
 PREAMBLE_SYMBOL_S: Final = 508 / 499.2e6
 """Of a preamble at a pulse repetition frequency of 64 MHz (DW1000 User Manual, section 10)."""
@@ -70,7 +69,15 @@ def exchange_s(protocol: RangingProtocol, preamble_symbols: int, scheduled_s: fl
     return before_marker_s(preamble_symbols) + replies + after_marker_s(message_bytes(protocol)[-1])
 
 
-ProtocolName = Annotated[str, Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))]
+def _known(name: str) -> str:
+    if name not in PROTOCOLS:
+        raise ValueError(f"found {name!r}, allowed: {', '.join(PROTOCOLS)}")
+    return name
+
+
+ProtocolName = Annotated[
+    str, AfterValidator(_known), Field(json_schema_extra=lambda schema: schema.update(enum=sorted(PROTOCOLS)))
+]
 
 
 PlanName = Literal["round-robin", "tdma", "aloha", "common-list"]
@@ -91,7 +98,7 @@ class FixedReply(Section):
     @property
     def delay_s(self) -> float:
         """Return the latency in seconds."""
-        return self.delay_us * US
+        return self.delay_us * 1e-6
 
 
 class QuantileReply(Section):
@@ -111,7 +118,7 @@ class QuantileReply(Section):
     def at_s(self, share: Floats) -> Floats:
         """Return the latencies in seconds that shares (n,) of all replies stay below."""
         levels = np.linspace(0, 1, len(self.delays_us))
-        return np.asarray(np.interp(share, levels, self.delays_us) * US)
+        return np.asarray(np.interp(share, levels, self.delays_us) * 1e-6)
 
 
 class PlanFile(Section):
@@ -163,24 +170,12 @@ class Ranging(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.protocol not in PROTOCOLS:
-            raise ValueError(f"protocol: found {self.protocol!r}, allowed: {', '.join(PROTOCOLS)}")
         if self.pairs == ():
             raise ValueError("pairs: found none, give at least one [initiator, target]")
         for pair in self.pairs if self.pairs != "between-bodies" else ():
             if pair[0] == pair[1]:
                 raise ValueError(f"pairs: tag {pair[0]} cannot range with itself")
         return self
-
-    @property
-    def sync_error_s(self) -> float:
-        """Return the standard deviation of hosts' clocks in seconds."""
-        return self.sync_error_ms * MS
-
-    @property
-    def list_timeout_s(self) -> float:
-        """Return in seconds how long a robot waits for an exchange that it cannot hear."""
-        return self.list_timeout_ms * MS
 
     @property
     def scheduled_s(self) -> float:

@@ -61,7 +61,7 @@ def schedule(scenario: Scenario) -> Schedule:
     if scenario.ranging.plan != "tdma":
         return _schedule(start, turn, np.zeros(count, dtype=np.int64))
     error_s = stream(scenario.run.seed, "sync error").normal(size=len(scenario.tags))
-    late = error_s * scenario.ranging.sync_error_s
+    late = error_s * (scenario.ranging.sync_error_ms * 1e-3)
     return _schedule(np.maximum(start + late[turn[:, 0]], 0), turn, turn[:, 0])
 
 

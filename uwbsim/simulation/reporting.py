@@ -20,9 +20,8 @@ from uwbsim.simulation import air
 from uwbsim.simulation.air import Schedule
 from uwbsim.simulation.timestamps import Begun, Stamped
 from uwbsim.tables import in_time_order
-from uwbsim.units import NS_PER_S
 from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
 from uwbsim.world.impulse_response import INDEX_STEPS, impulse_response
 from uwbsim.world.reception import Frames, Medium
 from uwbsim.world.world import World

@@ -109,7 +109,7 @@ def _slots(medium: Medium, world: World, plan: Schedule, draws: Draws) -> air.Sl
         others = np.flatnonzero(before != mine)
         power = world.link(before[others], mine[others], plan.start[others + 1]).power_dbm
         none[others[power < scenario.radio.sensitivity_dbm] + 1] = round(
-            scenario.ranging.list_timeout_s * SUBTICKS_PER_SECOND
+            (scenario.ranging.list_timeout_ms * 1e-3) * SUBTICKS_PER_SECOND
         )
     return air.Slots(
         plan.start.tolist(),

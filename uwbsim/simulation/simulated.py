@@ -21,7 +21,7 @@ from uwblink.wire.bulk import ColumnDecoder
 from uwblink.wire.codec import encode
 from uwblink.wire.messages import RangeReport
 from uwbsim.errors import ScenarioError
-from uwbsim.units import NS_PER_S
+from uwbsim.world.clocks import NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

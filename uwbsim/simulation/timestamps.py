@@ -20,7 +20,6 @@ from uwblink.ticks import (
 )
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.units import US
 from uwbsim.world.clocks import SUBTICKS
 from uwbsim.world.reception import Frames, Medium
 
@@ -101,7 +100,7 @@ def draw_reply_s(scenario: Scenario, rng: np.random.Generator, count: int) -> Fl
         [rng.normal(0.6, 0.3, count), rng.normal(2.4, 0.7, count), rng.normal(4.8, 0.7, count)],
         rng.uniform(6.5, 83.0, count),
     )
-    return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * US)
+    return np.asarray((303.5 + np.maximum(microseconds, -0.1)) * 1e-6)
 
 
 def stamp(

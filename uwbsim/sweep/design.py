@@ -2,60 +2,77 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from uwblink.protocols.table import PROTOCOLS
-from uwblink.text_files import FileKey, read_text
+from uwblink.text_files import read_text
 from uwbsim.errors import ScenarioError, UnknownKeyError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.linked_files import Folders, check_linked
-from uwbsim.scenario.loading import SUFFIX, load, parse_toml, shipped_scenarios
+from uwbsim.scenario.loading import load, parse_toml, shipped_scenarios, validated
+from uwbsim.scenario.ranging import ProtocolName
 
 MOST_RUNS: Final = 10_000_000
 """Runs of a sweep, seeds and values of a Latin hypercube at most: their numbers fit into memory."""
 
-FILE_KEYS: Final = (
-    FileKey("sweep.name", "text", "the name of the file", "What the sweep is called."),
-    FileKey("sweep.scenario", "text", "needed", "The scenario that varies, from the folder of this file."),
-    FileKey(
-        "sweep.kind",
-        '"compare" or "calibrate"',
-        '"compare"',
-        "What a run does: compare protocols, or simulate a flight, calibrate and judge.",
-    ),
-    FileKey("sweep.protocols", "list of protocols", 'all, or ["ds"] to calibrate', "The protocols of each run."),
-    FileKey("sweep.ranges", "whole number, 1 to 10,000,000", "100000", "Ranges with each protocol in a run."),
-    FileKey("sweep.seeds", "whole number, or list of them", "1", "How many seeds each point gets, or which."),
-    FileKey(
-        "sweep.design",
-        '"grid", "latin-hypercube" or "list"',
-        '"grid"',
-        "Every combination of values; points spread over spans; or points one by one.",
-    ),
-    FileKey("sweep.samples", "whole number, 1 to 10,000,000", "16", "Points of a Latin hypercube."),
-    FileKey(
-        'vary."KEY"', "list of values", "none", "Of a grid: values of a key of the scenario, such as radio.tx_noise_ps."
-    ),
-    FileKey('vary."KEY".low', "number", "needed", "Of a Latin hypercube: the lower end of the span."),
-    FileKey('vary."KEY".high', "number", "needed", "Of a Latin hypercube: the upper end of the span."),
-    FileKey('vary."KEY".scale', '"linear" or "log"', '"linear"', "How points are spread over the span."),
-    FileKey(
-        'vary."KEY".whole', "true or false", "true where low and high are whole", "Whether values are whole numbers."
-    ),
-    FileKey('list[]."KEY"', "a value", "that of the scenario", "Of a list: the value of a key at one point."),
-)
-KEYS: Final = tuple(key.name.removeprefix("sweep.") for key in FILE_KEYS if key.name.startswith("sweep."))
-"""Of the table [sweep]."""
+Count = Annotated[int, Field(strict=True, ge=1, le=MOST_RUNS)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SweepSettings(_Table):
+    """The table [sweep] of the file of a sweep."""
+
+    name: str | None = Field(None, description="What the sweep is called; by default as the file.")
+    scenario: str = Field(description="The scenario that varies, from the folder of this file, or a shipped one.")
+    kind: Literal["compare", "calibrate"] = Field(
+        "compare", description="What a run does: compare protocols, or simulate a flight, calibrate and judge."
+    )
+    protocols: Annotated[tuple[ProtocolName, ...], Field(min_length=1)] | None = Field(
+        None, description='The protocols of each run; by default all, or ["ds"] to calibrate.'
+    )
+    ranges: Count = Field(100_000, description="Ranges with each protocol in a run.")
+    seeds: Count | Annotated[tuple[Annotated[int, Field(strict=True, ge=0)], ...], Field(min_length=1)] = Field(
+        1, description="How many seeds each point gets, or which."
+    )
+    design: Literal["grid", "latin-hypercube", "list"] = Field(
+        "grid", description="Every combination of values; points spread over spans; or points one by one."
+    )
+    samples: Count = Field(16, description="Points of a Latin hypercube.")
+
+
+class Span(_Table):
+    """The span of a key in a Latin hypercube."""
+
+    low: float = Field(strict=True, description="The lower end of the span.")
+    high: float = Field(strict=True, description="The upper end of the span.")
+    scale: Literal["linear", "log"] = Field("linear", description="How points are spread over the span.")
+    whole: bool | None = Field(None, description="Whether values are whole numbers; by default where low and high are.")
+
+
+class SweepFile(_Table):
+    """The file of a sweep."""
+
+    sweep: SweepSettings = Field(description="What a run does, and how many there are.")
+    vary: dict[str, Any] = Field(
+        {},
+        description='By key of the scenario, such as "radio.tx_noise_ps": a list of values of a grid, or the span of '
+        "a Latin hypercube: a table of low, high, scale (linear or log) and whole (whether values are whole numbers).",
+    )
+    points: list[dict[str, Any]] = Field(
+        [], alias="list", description="Of a list: a table a point, of values by key of the scenario."
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,26 +83,25 @@ class Run:
     values: dict[str, Any]
     seed: int
 
-    def settings(self) -> list[str]:
-        """Return the values as `--set` would have them."""
-        return [f"{key}={toml_value(value)}" for key, value in self.values.items()]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepDesign:
     """A sweep as its file has it, and where its runs come from: `axes` of a grid, or `rows` one by one."""
 
     path: Path
-    name: str
-    scenario: Path
-    kind: str
+    settings: SweepSettings
     protocols: tuple[str, ...]
-    ranges: int
+    scenario: Path
     seeds: tuple[int, ...]
     axes: dict[str, list[Any]]
     rows: list[dict[str, Any]] | None
     fingerprint: str
     allow_files: tuple[str | os.PathLike[str], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return the name of the sweep."""
+        return self.settings.name or self.path.stem
 
     @property
     def points(self) -> int:
@@ -134,36 +150,18 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
     """
     path, folders = Path(path), tuple(allow_files)
     text = read_text(path, ScenarioError, "file of a sweep (.toml)")
-    table = parse_toml(text, path)
-    unknown = sorted(set(table) - {"sweep", "vary", "list"})
-    if unknown:
-        raise ScenarioError(f"{path}: {unknown[0]}: unknown table; known are sweep, vary, list")
-    head = table.get("sweep")
-    if not isinstance(head, dict):
-        raise ScenarioError(f"{path}: sweep: missing table [sweep]")
-    for key in head:
-        if key not in KEYS:
-            near = difflib.get_close_matches(key, KEYS, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(KEYS)}"
-            raise ScenarioError(f"{path}: sweep.{key}: unknown key; {hint}")
-    scenario = _scenario(path, head, folders)
-    design = _word(path, head, "design", ("grid", "latin-hypercube", "list"), "grid")
-    kind = _word(path, head, "kind", ("compare", "calibrate"), "compare")
-    protocols = head.get("protocols", list(PROTOCOLS) if kind == "compare" else ["ds"])
-    named = isinstance(protocols, list) and all(isinstance(p, str) and p in PROTOCOLS for p in protocols)
-    if not named or not protocols:
-        raise ScenarioError(f"{path}: sweep.protocols: found {protocols!r}, allowed: {', '.join(PROTOCOLS)}")
+    file = validated(SweepFile, parse_toml(text, path), path)
+    settings = file.sweep
+    scenario = _scenario(path, settings.scenario, folders)
     known = read_text(scenario, ScenarioError, "scenario file (.toml)")
-    vary, listed = table.get("vary", {}), table.get("list", [])
-    axes, rows = _points(path, head, design, vary, listed)
+    axes, rows = _points(path, file)
+    seeds = settings.seeds
     plan = SweepDesign(
         path=path,
-        name=str(head.get("name", path.stem)),
+        settings=settings,
+        protocols=settings.protocols or (tuple(PROTOCOLS) if settings.kind == "compare" else ("ds",)),
         scenario=scenario,
-        kind=kind,
-        protocols=tuple(protocols),
-        ranges=_whole(path, head, "ranges", 100_000, 1, 10_000_000),
-        seeds=_seeds(path, head),
+        seeds=tuple(range(1, seeds + 1)) if isinstance(seeds, int) else seeds,
         axes=axes,
         rows=rows,
         # What a result depends on besides its number: the plan's text and the scenario's.
@@ -176,87 +174,49 @@ def load_design(path: str | os.PathLike[str], *, allow_files: Folders = ()) -> S
     return plan
 
 
-def toml_value(value: Any) -> str:
-    """Return a value as TOML has it."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{json.dumps(str(k))} = {toml_value(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(toml_value, value)) + "]"
-    return repr(value) if isinstance(value, float) else json.dumps(value)
-
-
-def _scenario(path: Path, head: Mapping[str, Any], folders: Folders) -> Path:
-    name = head.get("scenario")
-    if not isinstance(name, str):
-        raise ScenarioError(f"{path}: sweep.scenario: missing, expected a scenario file, relative to this one")
-    beside = path.parent / name
-    shipped = shipped_scenarios().get(name.removesuffix(SUFFIX))
+def _scenario(path: Path, name: str, folders: Folders) -> Path:
+    beside, shipped = path.parent / name, shipped_scenarios().get(name.removesuffix(".toml"))
     if shipped is not None and not beside.exists():
         return shipped
     return check_linked(beside, f"{path}: sweep.scenario: found {name!r}", path.parent, folders)
 
 
-def _word(path: Path, head: Mapping[str, Any], key: str, allowed: Sequence[str], default: str) -> str:
-    value = head.get(key, default)
-    if value not in allowed:
-        raise ScenarioError(f"{path}: sweep.{key}: found {value!r}, allowed: {', '.join(allowed)}")
-    return str(value)
-
-
-def _whole(path: Path, head: Mapping[str, Any], key: str, default: int, low: int, high: int) -> int:
-    value = head.get(key, default)
-    if type(value) is not int or not low <= value <= high:
-        raise ScenarioError(f"{path}: sweep.{key}: found {value!r}, expected a whole number {low} to {high}")
-    return value
-
-
-def _seeds(path: Path, head: Mapping[str, Any]) -> tuple[int, ...]:
-    value = head.get("seeds", 1)
-    seeds = list(range(1, value + 1)) if type(value) is int and value <= MOST_RUNS else value
-    if not isinstance(seeds, list) or not seeds or not all(type(s) is int and s >= 0 for s in seeds):
-        raise ScenarioError(f"{path}: sweep.seeds: found {value!r}, expected a number of seeds or a list of them")
-    return tuple(seeds)
-
-
-def _points(
-    path: Path, head: Mapping[str, Any], design: str, vary: Any, listed: Any
-) -> tuple[dict[str, list[Any]], list[dict[str, Any]] | None]:
-    if design == "list":
-        if vary or not isinstance(listed, list) or not listed or not all(isinstance(r, dict) for r in listed):
+def _points(path: Path, file: SweepFile) -> tuple[dict[str, list[Any]], list[dict[str, Any]] | None]:
+    if file.sweep.design == "list":
+        if file.vary or not file.points:
             raise ScenarioError(f"{path}: a list needs tables [[list]], and no [vary]")
-        return {}, listed
-    if listed:
+        return {}, file.points
+    if file.points:
         raise ScenarioError(f'{path}: list: goes with design = "list"')
-    if not isinstance(vary, dict):
-        raise ScenarioError(f"{path}: vary: expected a table")
-    if design == "grid":
-        for key, values in vary.items():
-            if not isinstance(values, list) or not values:
-                raise ScenarioError(f"{path}: vary: {key}: found {values!r}, expected a list of values")
-        return vary, None
-    return {}, _hypercube(path, head, vary)
+    if file.sweep.design == "latin-hypercube":
+        return {}, _hypercube(path, file)
+    for key, values in file.vary.items():
+        if not isinstance(values, list) or not values:
+            raise ScenarioError(f"{path}: vary: {key}: found {values!r}, expected a list of values")
+    return file.vary, None
 
 
-def _hypercube(path: Path, head: Mapping[str, Any], vary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _hypercube(path: Path, file: SweepFile) -> list[dict[str, Any]]:
     """Return points of which every axis has one in each of its equal parts, in an order of its own."""
-    samples = _whole(path, head, "samples", 16, 1, MOST_RUNS)
-    if samples * len(vary) > MOST_RUNS:
+    samples = file.sweep.samples
+    if samples * len(file.vary) > MOST_RUNS:
         raise ScenarioError(
-            f"{path}: sweep.samples: {samples} of {len(vary)} keys, at most {MOST_RUNS} values are made"
+            f"{path}: sweep.samples: {samples} of {len(file.vary)} keys, at most {MOST_RUNS} values are made"
         )
     columns: dict[str, list[Any]] = {}
-    for key, span in vary.items():
-        if not isinstance(span, dict) or not {"low", "high"} <= set(span) <= {"low", "high", "scale", "whole"}:
-            raise ScenarioError(f'{path}: vary: {key}: expected {{ low = ..., high = ..., scale = "log" }}')
-        low, high, scale = span["low"], span["high"], span.get("scale", "linear")
-        numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in (low, high))
-        if not numbers or not low < high or scale not in ("linear", "log") or (scale == "log" and low <= 0):
-            raise ScenarioError(f"{path}: vary: {key}: expected low below high, both above zero where scale is log")
+    for key, table in file.vary.items():
+        where = f"{path}: vary: {key}"
+        if not isinstance(table, Mapping):
+            raise ScenarioError(f'{where}: expected {{ low = ..., high = ..., scale = "log" }}')
+        span = validated(Span, table, where)
+        low, high = table["low"], table["high"]
+        if not low < high or (span.scale == "log" and low <= 0):
+            raise ScenarioError(f"{where}: expected low below high, both above zero where scale is log")
         # A stream a key: another key more changes nothing in this one's values.
         rng = stream(0, "latin hypercube", key)
         share = (rng.permutation(samples) + rng.random(samples)) / samples
-        values = low * (high / low) ** share if scale == "log" else low + (high - low) * share
-        whole = span.get("whole", isinstance(low, int) and isinstance(high, int))
+        values = low * (high / low) ** share if span.scale == "log" else low + (high - low) * share
+        whole = isinstance(low, int) and isinstance(high, int) if span.whole is None else span.whole
         columns[key] = [round(v) if whole else float(v) for v in values.tolist()]
     return [dict(zip(columns, point, strict=True)) for point in zip(*columns.values(), strict=True)] or [{}]
 
@@ -269,7 +229,7 @@ def _check_keys(plan: SweepDesign) -> None:
         first |= row
     for key, value in first.items():
         try:
-            load(plan.scenario, [f"{key}={toml_value(value)}"], allow_files=plan.allow_files)
+            load(plan.scenario, {key: value}, allow_files=plan.allow_files)
         except UnknownKeyError as error:
             raise ScenarioError(f"{plan.path}: vary: {error}") from error
         except ScenarioError:

@@ -76,15 +76,14 @@ def run_sweep(
     folder = Path(folder)
     check_folder(folder)
     _check(plan, folder, resume=resume)
-    if plan.kind == "calibrate":
-        evaluate = evaluate or evaluator(plan.kind)
+    kind = plan.settings.kind
+    if kind == "calibrate":
+        evaluate = evaluate or evaluator(kind)
     elif evaluate is not None:
-        raise ParameterError(
-            f"goes with a sweep of kind 'calibrate', and this one's is {plan.kind!r}", parameter="evaluate"
-        )
+        raise ParameterError(f"goes with a sweep of kind 'calibrate', and this one's is {kind!r}", parameter="evaluate")
     if workers is not None and workers < 1:
         raise ParameterError(f"found {workers}, expected 1 or more", parameter="workers")
-    work = Work.of_here(plan.scenario.stem, plan.protocols, plan.ranges, evaluate)
+    work = Work.of_here(plan.scenario.stem, plan.protocols, plan.settings.ranges, evaluate)
     team = workers_for(workers, scheduler, work)
     try:
         folder.mkdir(exist_ok=True)
@@ -183,7 +182,7 @@ def _task(plan: SweepDesign, number: int) -> Task:
     run = plan.run(number)
     task = Task(number=number, seed=run.seed, values=run.values)
     try:
-        scenario = load(plan.scenario, run.settings(), run.seed, allow_files=plan.allow_files)
+        scenario = load(plan.scenario, run.values, run.seed, allow_files=plan.allow_files)
         return replace(task, scenario=scenario.model_dump_json())
     except ScenarioError as error:
         # Where the file lies is no part of a result.

@@ -30,7 +30,6 @@ from uwblink.twr import Exchanges, intervals, without_stamps
 from uwbsim.errors import ScenarioError, UnanswerableError
 from uwbsim.random_streams import stream
 from uwbsim.simulation.simulated import Simulated
-from uwbsim.units import NS
 
 if TYPE_CHECKING:
     from uwbsim.twins.range_errors import KnownDevices
@@ -294,7 +293,7 @@ class Flight:
             row=row,
             exchanges=exchanges,
             origin_ns=int(exchanges.time_ns[0]),
-            time_s=np.asarray((exchanges.time_ns - exchanges.time_ns[0]) * NS, dtype=np.float64),
+            time_s=np.asarray((exchanges.time_ns - exchanges.time_ns[0]) * 1e-9, dtype=np.float64),
             ends=ends,
             pair=pair.ravel(),
             pairs=tuple((int(a), int(b)) for a, b in names.T),
@@ -329,7 +328,7 @@ def attitude(poses: Poses, body: str, time_ns: Ints) -> Rotation:
     if len(times) == 1:
         return turns[np.zeros(len(time_ns), dtype=np.int64)]
     at = np.clip(time_ns, times[0], times[-1]) - times[0]
-    return Slerp((times - times[0]) * NS, turns)(at * NS)
+    return Slerp((times - times[0]) * 1e-9, turns)(at * 1e-9)
 
 
 def _ratio_ppm(exchanges: Exchanges, row: RangingProtocol) -> Floats:
@@ -409,7 +408,7 @@ def _slots(flight: Flight, faults: list[Fault]) -> tuple[Floats, Ints, Ints, Boo
     place = {tag.tag: k for k, tag in enumerate(flight.tags)}
     end_ns = int(flight.exchanges.time_ns[-1])
     failed = [
-        ((fault.time_ns - flight.origin_ns) * NS, place[fault.initiator], place[fault.target])
+        ((fault.time_ns - flight.origin_ns) * 1e-9, place[fault.initiator], place[fault.target])
         for fault in faults
         if flight.origin_ns <= fault.time_ns <= end_ns and fault.initiator in place and fault.target in place
     ]

@@ -20,7 +20,7 @@ from uwbsim.twins.clocks import ClockFit
 from uwbsim.twins.flight import SHORTEST_LIFE_S, Flight, ScheduleFit, attitude, bulk_spread
 from uwbsim.twins.powers import PowerFit
 from uwbsim.twins.range_errors import KnownDevices, RangeErrors
-from uwbsim.units import NS, NS_PER_S, PS_PER_S
+from uwbsim.world.clocks import NS_PER_S
 from uwbsim.world.radio import lifted
 
 WIDTH: Final = 120
@@ -175,7 +175,7 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
     found["bias"] = known.bias.model_dump(mode="json")
     found["rx_noise_ps"], noise = 0.0, fitted.noise
     if len(noise.std_s) == 1:
-        found["rx_noise_ps"] = float(noise.std_s[0]) * PS_PER_S
+        found["rx_noise_ps"] = float(noise.std_s[0]) * 1e12
     elif len(noise.std_s):
         at = lifted(noise.power_dbm)
         # A range whose reply takes no time has c s / sqrt(2).
@@ -263,7 +263,7 @@ def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[
             "model": "recorded",
             "file": "",
             "body": body,
-            "times_s": ((cut.time_ns - cut.time_ns[0]) * NS).tolist(),
+            "times_s": ((cut.time_ns - cut.time_ns[0]) * 1e-9).tolist(),
             "positions_m": cut.position_m.tolist(),
             "quaternions": cut.quaternion.tolist(),
         }

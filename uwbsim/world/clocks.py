@@ -32,6 +32,8 @@ from uwbsim.scenario.devices import Tag
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.temperature import thermal_rate
 
+NS_PER_S: Final = 1_000_000_000
+
 SUBTICKS: Final = 1024
 """To a device tick, so that rounding instants adds nothing to a stamp."""
 
@@ -121,7 +123,7 @@ class ClockNoise:
     def _trend(self, place: int, tag: Tag, rng: np.random.Generator, time: Ints) -> Floats:
         """Return the random walk of white noise from one of the longest intervals to the next, linear in between."""
         at = (time.astype(np.uint64) + self.shift[place]).astype(np.float64) * 2.0**-LONGEST_OCTAVE
-        step = tag.white_sqrt_s * np.sqrt(2.0**LONGEST_OCTAVE * SUBTICKS_PER_SECOND)
+        step = (tag.white_ppm_sqrt_s * 1e-6) * np.sqrt(2.0**LONGEST_OCTAVE * SUBTICKS_PER_SECOND)
         walk = np.cumsum(rng.normal(0, 1, 1 << (64 - LONGEST_OCTAVE))) * step
         return np.asarray(np.interp(at, np.arange(len(walk)), walk))
 
@@ -129,8 +131,8 @@ class ClockNoise:
 def _peaks(tag: Tag, octaves: Ints) -> Floats:
     """Return the standard deviations of tents' heights by octave, in sub-ticks."""
     length_s = 2.0**octaves / SUBTICKS_PER_SECOND
-    white = tag.white_sqrt_s * np.sqrt(length_s) / 2
-    flicker = tag.flicker / np.sqrt(2) * length_s / 2
+    white = (tag.white_ppm_sqrt_s * 1e-6) * np.sqrt(length_s) / 2
+    flicker = (tag.flicker_ppm * 1e-6) / np.sqrt(2) * length_s / 2
     return np.asarray(np.hypot(white, flicker) * SUBTICKS_PER_SECOND)
 
 
@@ -176,16 +178,16 @@ class Clocks:
             if tag.clock_offset_s is not None:
                 drawn = np.int64(round(tag.clock_offset_s * TICKS_PER_SECOND))
             offsets.append(drawn * SUBTICKS + rng.integers(0, SUBTICKS))
-            sigma = tag.drift_per_sqrt_s * np.sqrt(WALK_STEP_S)
+            sigma = (tag.drift_ppm_per_sqrt_s * 1e-6) * np.sqrt(WALK_STEP_S)
             walk = np.concatenate([[0.0], np.cumsum(rng.normal(0, 1, steps) * sigma)])
-            ramp = tag.ramp_per_s * WALK_STEP_S * np.arange(steps + 1)
+            ramp = (tag.ramp_ppm_per_s * 1e-6) * WALK_STEP_S * np.arange(steps + 1)
             middle_s = np.asarray(WALK_STEP_S * (np.arange(steps + 1) + 0.5), dtype=np.float64)
             rates.append(walk + ramp + thermal_rate(scenario, tag, middle_s))
         rate = np.array(rates)
         step = WALK_STEP_S * SUBTICKS_PER_SECOND
         phase = np.cumsum(rate[:, :-1] * step, axis=1)
         walk = np.concatenate([np.zeros((len(rate), 1)), phase], axis=1)
-        skew = np.array([tag.skew for tag in scenario.tags])
+        skew = np.array([tag.skew_ppm * 1e-6 for tag in scenario.tags])
         noise = ClockNoise.of(seed, scenario.tags, duration)
         return cls(np.array(offsets, dtype=np.int64), skew, rate, walk, noise)
 

@@ -293,8 +293,8 @@ class Mirrors:
         planes = [side[axis] for axis in range(3) for side in (room.min_m, room.max_m)] if room else []
         made_of = [permittivity(m) for m in room.materials()] if room else []
         made_of += [permittivity(box.material) for box in boxes for _ in range(3)]
-        rough = [room.roughness_m] * 6 if room else []
-        rough += [box.roughness_m for box in boxes for _ in range(3)]
+        rough = [(room.roughness_mm * 1e-3)] * 6 if room else []
+        rough += [(box.roughness_mm * 1e-3) for box in boxes for _ in range(3)]
         return cls(
             axis=np.array([*walls, *[0, 1, 2] * len(boxes)], dtype=np.int64),
             permittivity=np.array(made_of, dtype=np.complex128),

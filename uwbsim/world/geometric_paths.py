@@ -117,7 +117,7 @@ class Scatterers:
         places, extra, field = (
             stream(scenario.run.seed, "scatterers", what) for what in ("places", "bounces", "fields")
         )
-        extra_m = extra.exponential(SPEED_OF_LIGHT * model.decay_s, count)
+        extra_m = extra.exponential(SPEED_OF_LIGHT * (model.decay_ns * 1e-9), count)
         parts = field.normal(size=(count, 2)) @ np.array([1, 1j]) / np.sqrt(2)
         return cls(
             place_m=places.uniform(room.min_m, room.max_m, (count, 3)),

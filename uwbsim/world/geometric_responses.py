@@ -96,7 +96,9 @@ class GeometricResponses:
         if len(self.keys) > most_kept:
             self.keys, self.columns = self.keys[:0], self.columns[:, :0]
         steps = first + np.arange(ahead)[:, None]
-        self.prepare((np.tile(origin, ahead), np.tile(here, ahead)), np.repeat(steps * self.model.step_s, len(here)))
+        self.prepare(
+            (np.tile(origin, ahead), np.tile(here, ahead)), np.repeat(steps * (self.model.step_ms * 1e-3), len(here))
+        )
 
     def paths(self, places: tuple[Ints, Ints], time_s: Floats) -> Paths:
         """Return the paths between tags at places (n,) at the steps nearest to true times (n,)."""
@@ -106,7 +108,7 @@ class GeometricResponses:
         return Paths(detour_m=detour_m[rows], amplitude=np.concatenate([part.amplitude for part in parts])[rows])
 
     def _step(self, time_s: Floats) -> Ints:
-        return np.rint(np.maximum(time_s, 0) / self.model.step_s).astype(np.int64)
+        return np.rint(np.maximum(time_s, 0) / (self.model.step_ms * 1e-3)).astype(np.int64)
 
     def _key(self, places: tuple[Ints, Ints], step: Ints) -> Ints:
         """One number for step, sender and receiver, in order of time."""
@@ -134,7 +136,7 @@ class GeometricResponses:
         pair_step, b = np.divmod(keys, count)
         step, a = np.divmod(pair_step, count)
         instants, at = np.unique(step, return_inverse=True)
-        time_s = instants * self.model.step_s
+        time_s = instants * (self.model.step_ms * 1e-3)
         poses = {name: self.trajectories[name].pose(time_s) for name in self.trajectories}
         bodies = [
             PlacedBody(

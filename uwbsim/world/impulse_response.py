@@ -19,7 +19,6 @@ from scipy.sparse import coo_array
 from uwblink.arrays import Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.wire.messages import Cir
-from uwbsim.units import NS
 from uwbsim.world.geometric_paths import Paths
 from uwbsim.world.radio import ALPHA_DBM, FPP_OFFSET_DB
 
@@ -29,7 +28,7 @@ PULSE_TAPS: Final = 1.2
 EDGE_TO_PEAK: Final = 1.5
 """Taps from the leading edge that the chip reports to the peak of the pulse."""
 
-TAP_S: Final = 1.0016 * NS
+TAP_S: Final = 1.0016 * 1e-9
 """Half a period of 499.2 MHz, at which the accumulator is sampled (DW1000 User Manual, 7.2.26)."""
 
 TAP_M: Final = TAP_S * SPEED_OF_LIGHT

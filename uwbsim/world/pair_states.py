@@ -152,7 +152,7 @@ class ReflectedStates:
             excess = draw("excess").gamma(model.excess_shape, mean_m / model.excess_shape, count)
             about = draw("direct").normal(0, 1, count) * model.direct_std_m
             loss_db = draw("loss").normal(model.first_path_loss_db, model.loss_std_db, count)
-            rise_s = draw("rise").exponential(model.rise_s, count)
+            rise_s = draw("rise").exponential((model.rise_ns * 1e-9), count)
             longer = np.where(reflected, excess, about)
             return np.array([reflected, longer, np.maximum(loss_db, model.total_loss_db), rise_s])
 

@@ -181,7 +181,7 @@ def reception_noise_s(radio: Radio, power_dbm: Floats) -> Floats:
     """
     ratio = radio.sigma.reply_ratio if radio.sigma else 0.0
     factor = SPEED_OF_LIGHT * np.sqrt((1 + ratio + ratio**2) / 2)
-    return np.asarray(np.hypot(radio.rx_noise_s, _spline(radio.sigma, power_dbm) / factor))
+    return np.asarray(np.hypot((radio.rx_noise_ps * 1e-12), _spline(radio.sigma, power_dbm) / factor))
 
 
 def printed_power_dbm(radio: Radio, power_dbm: Floats, noise: Floats) -> Floats:

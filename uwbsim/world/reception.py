@@ -14,7 +14,6 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import Radio
-from uwbsim.units import PPM_PER_ONE
 from uwbsim.world.antenna_delays import AntennaDelays
 from uwbsim.world.channel import Link
 from uwbsim.world.clocks import SUBTICKS, SUBTICKS_PER_SECOND, Clocks
@@ -96,7 +95,7 @@ class Medium:
         # When it is, for the temperature, is known well enough without the delay.
         now = self.clocks.when(sender, due) if self.delays.moving else due
         delay = self.delays.transmit_s(sender, now)
-        early = noise * self.scenario.radio.tx_noise_s * SUBTICKS_PER_SECOND - delay * SUBTICKS_PER_SECOND
+        early = noise * (self.scenario.radio.tx_noise_ps * 1e-12) * SUBTICKS_PER_SECOND - delay * SUBTICKS_PER_SECOND
         return self.clocks.when(sender, np.rint(early).astype(np.int64) + due)
 
     def receive(self, frames: Frames, noise: Floats, detour_m: Floats | float = 0.0) -> Reception:
@@ -122,7 +121,7 @@ class Medium:
     ) -> tuple[Floats, Floats]:
         """Return first-path power in dBm and relative skew in ppm as receivers print them; noises standard normal."""
         radio, clocks, time = self.scenario.radio, self.clocks, frames.departure
-        skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * PPM_PER_ONE
+        skew = (clocks.rate(frames.receiver, time) - clocks.rate(frames.sender, time)) * 1e6
         offsets = np.array([tag.power_offset_db for tag in self.scenario.tags])
         read_dbm = power_dbm + offsets[frames.receiver]
         return printed_power_dbm(radio, read_dbm, power_noise), printed_skew_ppm(radio, skew, skew_noise, power_dbm)

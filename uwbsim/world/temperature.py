@@ -9,7 +9,6 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.devices import Devices, Profile, Ramp, Table, Tag, WarmUp
 from uwbsim.scenario.model import Scenario
 from uwbsim.tables import Columns, in_time_order
-from uwbsim.units import CM, MM, NS_PER_S, PPM
 
 
 def profile_at(profile: Profile, time_s: Floats) -> Floats:
@@ -47,8 +46,8 @@ def lengthening_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None
     devices = scenario.devices
     total: Floats | None = None
     for profile, slope, reference in (
-        (temperature_of(scenario, tag), own(tag, devices, "range_mm_per_k") * MM, devices.reference_c),
-        (supply_of(scenario, tag), own(tag, devices, "range_cm_per_v") * CM, devices.reference_v),
+        (temperature_of(scenario, tag), own(tag, devices, "range_mm_per_k") * 1e-3, devices.reference_c),
+        (supply_of(scenario, tag), own(tag, devices, "range_cm_per_v") * 1e-2, devices.reference_v),
     ):
         if profile is not None and slope:
             part = slope * (profile_at(profile, time_s) - reference)
@@ -58,10 +57,10 @@ def lengthening_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None
 
 def thermal_rate(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats:
     """Return what temperature and warm-up add to the rate of a tag's clock at times (n,), as a fraction."""
-    rate = tag.warm_up_ppm * PPM * np.exp(-time_s / tag.warm_up_s)
+    rate = tag.warm_up_ppm * 1e-6 * np.exp(-time_s / tag.warm_up_s)
     profile, slope = temperature_of(scenario, tag), own(tag, scenario.devices, "skew_ppm_per_k")
     if profile is not None and slope:
-        rate = rate + slope * PPM * (profile_at(profile, time_s) - scenario.devices.reference_c)
+        rate = rate + slope * 1e-6 * (profile_at(profile, time_s) - scenario.devices.reference_c)
     return np.asarray(rate)
 
 
@@ -82,7 +81,7 @@ def readings(scenario: Scenario) -> Columns:
                 np.full(len(time_s), np.nan) if profile is None else profile_at(profile, time_s) + noise * scatter
                 for profile, noise, scatter in zip(profiles, noises, drawn, strict=True)
             ]
-            time_ns = np.rint(time_s * NS_PER_S).astype(np.int64)
+            time_ns = np.rint(time_s * 1_000_000_000).astype(np.int64)
             ids = np.full(len(time_s), tag.id, dtype=np.int64)
             parts.append({"time_ns": time_ns, "tag": ids, "temperature_c": read[0], "supply_v": read[1]})
     return in_time_order(parts)

@@ -16,7 +16,7 @@ from uwbsim.scenario.bodies import Carried, Figure, Imu, RandomFlight, Recorded,
 from uwbsim.scenario.devices import Body
 from uwbsim.scenario.model import Scenario
 from uwbsim.tables import Columns, in_time_order
-from uwbsim.units import NS_PER_S
+from uwbsim.world.clocks import NS_PER_S
 
 Draw = Callable[[str], np.random.Generator]
 """Returns the random stream of a body for a purpose."""

@@ -16,9 +16,8 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.units import NS, NS_PER_S
 from uwbsim.world.channel import Ends, Link, PlacedShadow, link_between, paths_heard
-from uwbsim.world.clocks import SUBTICKS_PER_SECOND
+from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
 from uwbsim.world.geometric_responses import GeometricResponses
 from uwbsim.world.impulse_response import PathsHeard, Waves
 from uwbsim.world.pair_states import PairLevels, ReflectedStates
@@ -155,7 +154,7 @@ class World:
             for rows in [self._gaps(name, time_ns)]
         ]
         names = np.concatenate([np.full(np.count_nonzero(rows), name) for name, rows, _, _ in parts])
-        times = np.concatenate([time_ns[rows] for _, rows, _, _ in parts]) + round(mocap.latency_s * NS_PER_S)
+        times = np.concatenate([time_ns[rows] for _, rows, _, _ in parts]) + round((mocap.latency_ms * 1e-3) * NS_PER_S)
         position = np.concatenate([p[rows] for _, rows, p, _ in parts])
         quaternion = np.concatenate([q[rows] for _, rows, _, q in parts])
         order = np.argsort(times, kind="stable")
@@ -167,7 +166,7 @@ class World:
         seen = np.ones(len(time_ns), dtype=bool)
         if mocap.gaps_per_min:
             rng = stream(self.scenario.run.seed, "motion capture gaps", name)
-            duration = float(time_ns[-1]) * NS
+            duration = float(time_ns[-1]) * 1e-9
             for begin in rng.uniform(0, duration, rng.poisson(mocap.gaps_per_min * duration / 60)):
                 seen &= (time_ns < begin * NS_PER_S) | (time_ns > (begin + mocap.gap_s) * NS_PER_S)
         return seen
@@ -175,7 +174,7 @@ class World:
     def _seen(self, name: str, time_ns: Ints) -> tuple[Floats, Floats]:
         mocap, body = self.scenario.mocap, self.trajectories[name]
         rng = stream(self.scenario.run.seed, "motion capture", name)
-        time_s = np.asarray(time_ns * NS, dtype=np.float64)
+        time_s = np.asarray(time_ns * 1e-9, dtype=np.float64)
         position = body.position_m(time_s) + rng.normal(0, 1, (len(time_s), 3)) * mocap.position_noise_m
         wobble = Rotation.from_rotvec(rng.normal(0, 1, (len(time_s), 3)) * mocap.attitude_noise_rad)
         return position, (Rotation.from_quat(body.quaternion(time_s)) * wobble).as_quat()
