@@ -23,11 +23,12 @@ from uwbsim.scenario.ranging import (
     FINAL_BYTES,
     POLL_BYTES,
     PREAMBLE_SYMBOL_S,
+    PREAMBLE_TIMEOUT_S,
     RESPONSE_BYTES,
     after_marker_s,
     before_marker_s,
 )
-from uwbsim.simulation.timestamps import draw_reply_s
+from uwbsim.simulation.timestamps import draw_reply_s, next_grid
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS, SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.reception import Frames, Medium
@@ -140,12 +141,12 @@ class Radios:
         """Return the first transmit stamp that a board's clock allows at or after a true time (sub-ticks)."""
         me = self._one(board)
         ready = -(-int(self.medium.clocks.read(me, np.array([time]))[0]) // SUBTICKS)
-        return _on_grid(ready) + self.tx_register(board)
+        return next_grid(ready) + self.tx_register(board)
 
     def reply_stamp(self, board: int, received: int) -> int:
         """Return the transmit stamp of a reply sent at once to what was received at a stamp; its latency is drawn."""
         latency = round(float(draw_reply_s(self.scenario, self._chance, 1)[0]) / TICK_S)
-        return _on_grid(received + latency - ANTENNA_DELAY_TICKS) + self.tx_register(board)
+        return next_grid(received + latency - ANTENNA_DELAY_TICKS) + self.tx_register(board)
 
     def scheduled_stamps(self, board: int, reference: int, delay_uus: int) -> tuple[int, int]:
         """Return the transmit stamps of a frame that is to leave some time after the stamp `reference`.
@@ -209,16 +210,8 @@ class Radios:
         return np.array([self.place[board]])
 
 
-def _on_grid(ticks: int) -> int:
-    return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID
-
-
 NS_PER_US: Final = 1_000
 NS_PER_MS: Final = 1_000_000
-PREAMBLE_TIMEOUT: Final = 6_521 * NS_PER_US
-"""How long a board waits for a preamble (firmware wire format, 3.1)."""
-
-
 Wait = Generator[simpy.Event, Any, "Received | None"]
 
 
@@ -334,7 +327,7 @@ class Radio:
         """Return the event of a frame's end."""
         return self._air.env.timeout(max(frame.end - int(self._air.env.now), 0))
 
-    def wait(self, timeout: int | None = PREAMBLE_TIMEOUT) -> Wait:
+    def wait(self, timeout: int | None = round(PREAMBLE_TIMEOUT_S * NS_PER_S)) -> Wait:
         """Wait for a frame; None when it comes damaged, or when no preamble comes in time (None: wait for ever)."""
         env = self._air.env
         if self.since is None:

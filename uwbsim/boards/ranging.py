@@ -8,7 +8,7 @@ ever for the initiator's final: a passive board is deaf to USB meanwhile (firmwa
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import simpy
@@ -20,7 +20,6 @@ from uwblink.wire.messages import BroadcastReceived, Cir, Overheard, OverheardNo
 from uwbsim.boards.frames import (
     NS_PER_MS,
     NS_PER_US,
-    PREAMBLE_TIMEOUT,
     DataPayload,
     FinalPayload,
     Frame,
@@ -29,7 +28,9 @@ from uwbsim.boards.frames import (
     Received,
     ResponsePayload,
 )
+from uwbsim.scenario.ranging import PREAMBLE_TIMEOUT_S
 from uwbsim.simulation.reporting import MASK
+from uwbsim.world.clocks import NS_PER_S
 from uwbsim.world.impulse_response import impulse_response, in_transfers
 
 if TYPE_CHECKING:
@@ -39,10 +40,7 @@ if TYPE_CHECKING:
 TO_AIR: Final = 330 * NS_PER_US
 """From the poll of the USB buffer that found a command to the time stamp of its frame: set-up and half a preamble."""
 
-TO_REPORT: Final = 474 * NS_PER_US
-"""From the end of the last frame to the report on the bus: read-out, arithmetic, printing."""
-
-
+Content = TypeVar("Content", PollPayload, FinalPayload)
 Steps = Generator[simpy.Event, Any, None]
 Attempt = Generator[simpy.Event, Any, bool]
 Answers = Generator[simpy.Event, Any, "tuple[Received, Received] | None"]
@@ -54,6 +52,14 @@ def is_expected(received: Received | None, payload: type[Payload], sender: int, 
         return False
     frame = received.frame
     return isinstance(frame.payload, payload) and (frame.sender, frame.receiver) == (sender, receiver)
+
+
+def payload_of(received: Received, kind: type[Content]) -> Content:
+    """Return what a frame carries; raises `TypeError` where it is of another kind."""
+    payload = received.frame.payload
+    if not isinstance(payload, kind):
+        raise TypeError(f"found {payload!r:.60}, expected a {kind.__name__}")
+    return payload
 
 
 def initiate(board: VirtualBoard, target: int, target_reports: bool, double_sided: bool, get_cir: bool) -> Attempt:
@@ -89,16 +95,16 @@ def _answers(board: VirtualBoard, poll: Frame, double_sided: bool) -> Answers:
 
 def _report(board: VirtualBoard, poll: Frame, wish: PollPayload, first: Received, last: Received) -> Steps:
     """Print the report; before it send the final if the target reports too, after it print the impulse response."""
-    came, target = last.frame.payload, poll.receiver or 0
-    if not isinstance(came, FinalPayload):
-        raise TypeError("the last frame of a target is its final")
+    came, target = payload_of(last, FinalPayload), poll.receiver or 0
     mine = poll.stamp & MASK, first.stamp & MASK, last.stamp & MASK if wish.double_sided else 0
     to_final = 136 * NS_PER_US  # from the end of the target's last frame to the start of the final
     if wish.target_reports:
         yield board.sleep(to_final)
         final = FinalPayload(mine, first.power_dbm, first.skew_ppm)
         board.radio.send(target, final, board.radio.first_stamp(), poll.excess_m)
-    yield board.sleep(TO_REPORT - (to_final if wish.target_reports else 0))
+    # From the end of the last frame to the report on the bus: read-out, arithmetic, printing.
+    to_report = 474 * NS_PER_US
+    yield board.sleep(to_report - (to_final if wish.target_reports else 0))
     powers = came.power_dbm, first.power_dbm, came.skew_ppm, first.skew_ppm
     board.say(range_report(target, _in_order(mine, came.stamps), powers))
     if wish.get_cir:
@@ -107,9 +113,7 @@ def _report(board: VirtualBoard, poll: Frame, wish: PollPayload, first: Received
 
 def answer(board: VirtualBoard, received: Received) -> Steps:
     """Answer a poll: response and delayed final, or the final alone; report if the initiator's final comes."""
-    wish, initiator, radio = received.frame.payload, received.frame.sender, board.radio
-    if not isinstance(wish, PollPayload):
-        raise TypeError("only a poll is answered")
+    wish, initiator, radio = payload_of(received, PollPayload), received.frame.sender, board.radio
     excess, radios = received.frame.excess_m, board.bench.radios
     if wish.double_sided:
         first = radios.reply_stamp(board.id, received.stamp)
@@ -143,10 +147,8 @@ def _of_target(received: int, first: int, last: int, wish: PollPayload) -> tuple
 def _target_report(
     board: VirtualBoard, mine: tuple[int, int, int], poll: Received, came: Received, *, get_cir: bool
 ) -> Steps:
-    theirs, initiator = came.frame.payload, poll.frame.sender
-    if not isinstance(theirs, FinalPayload):
-        raise TypeError("a target reports after a final")
-    yield board.sleep(TO_REPORT)
+    theirs, initiator = payload_of(came, FinalPayload), poll.frame.sender
+    yield board.sleep(474 * NS_PER_US)
     if get_cir:
         yield from print_cir(board, initiator, board.id, came)
     powers = poll.power_dbm, theirs.power_dbm, poll.skew_ppm, theirs.skew_ppm
@@ -204,10 +206,6 @@ def print_cir(board: VirtualBoard, initiator: int, target: int, last: Received) 
         yield board.sleep(NS_PER_MS + int(board.chance.integers(0, 120 * NS_PER_US)))
 
 
-TO_LINE: Final = 90 * NS_PER_US
-"""From the end of a frame to a line that needs no arithmetic."""
-
-
 Expected = tuple[type[Payload], int, int, int | None]
 """A frame that a listener waits for: its payload, its two boards, and for how long."""
 
@@ -217,16 +215,17 @@ def received_by(board: VirtualBoard, received: Received | None) -> Steps | None:
     if received is None:
         return _recover(board)
     payload = received.frame.payload
+    to_line = 90 * NS_PER_US  # from the end of a frame to a line that needs no arithmetic
     if isinstance(payload, PollPayload):
         if received.frame.receiver == board.id:
             return answer(board, received)
         if board.passive:
             return overhear(board, received)
     elif isinstance(payload, DataPayload):
-        board.say(BroadcastReceived(payload.data), TO_LINE)
+        board.say(BroadcastReceived(payload.data), to_line)
     else:
         number = b"B" if isinstance(payload, ResponsePayload) else b"C"
-        board.say(b"WARNING 0x" + number + b": TWR message is firing an interrupt when it shouldn't be.\r\n", TO_LINE)
+        board.say(b"WARNING 0x" + number + b": TWR message is firing an interrupt when it shouldn't be.\r\n", to_line)
     board.radio.listen()
     return None
 
@@ -239,15 +238,13 @@ def _recover(board: VirtualBoard) -> Steps:
 
 def overhear(board: VirtualBoard, poll: Received) -> Steps:
     """Follow the exchange that a poll begins, and print it; nothing, or zeros, where a frame does not come."""
-    wish, initiator, target = poll.frame.payload, poll.frame.sender, poll.frame.receiver
-    if not isinstance(wish, PollPayload) or target is None:
-        raise TypeError("an exchange begins with a poll for a board")
+    wish, initiator, target = payload_of(poll, PollPayload), poll.frame.sender, poll.frame.receiver or 0
     heard = [poll]
     for payload, sender, receiver, patience in _sequence(wish, initiator, target):
         came = yield from board.radio.wait(patience)
         if came is None or not is_expected(came, payload, sender, receiver):
             if wish.double_sided and len(heard) == 1:
-                board.say(OverheardNothing(initiator, target), TO_LINE)
+                board.say(OverheardNothing(initiator, target), 90 * NS_PER_US)
             return
         heard.append(came)
     yield board.sleep(525 * NS_PER_US)
@@ -258,9 +255,10 @@ def overhear(board: VirtualBoard, poll: Received) -> Steps:
 
 def _sequence(wish: PollPayload, initiator: int, target: int) -> list[Expected]:
     """Return the frames that follow a poll; the firmware sets no time-out for the last one."""
-    frames: list[Expected] = [(FinalPayload, target, initiator, PREAMBLE_TIMEOUT)]
+    patience = round(PREAMBLE_TIMEOUT_S * NS_PER_S)
+    frames: list[Expected] = [(FinalPayload, target, initiator, patience)]
     if wish.double_sided:
-        frames.insert(0, (ResponsePayload, target, initiator, PREAMBLE_TIMEOUT))
+        frames.insert(0, (ResponsePayload, target, initiator, patience))
     if wish.target_reports:
         frames.append((FinalPayload, initiator, target, None))
     return frames
@@ -272,8 +270,8 @@ def _overheard(initiator: int, target: int, wish: PollPayload, heard: list[Recei
     rx = [*(r.stamp & MASK for r in signals), 0]
     power: list[float | None] = [*(r.power_dbm for r in signals), None]
     skew: list[float | None] = [*(r.skew_ppm for r in signals), None]
-    theirs = _readings(signals[-1])
-    mine = _readings(heard[-1]) if wish.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
+    theirs = payload_of(signals[-1], FinalPayload)
+    mine = payload_of(heard[-1], FinalPayload) if wish.target_reports else FinalPayload((0, 0, 0), 0.0, 0.0)
     (tx1, rx2, rx3), (rx1, tx2, tx3) = mine.stamps, theirs.stamps
     return Overheard(
         initiator,
@@ -298,10 +296,3 @@ def _overheard(initiator: int, target: int, wish: PollPayload, heard: list[Recei
         skew1_n_ppm=theirs.skew_ppm,
         skew2_n_ppm=mine.skew_ppm,
     )
-
-
-def _readings(received: Received) -> FinalPayload:
-    payload = received.frame.payload
-    if not isinstance(payload, FinalPayload):
-        raise TypeError("readings travel in finals")
-    return payload

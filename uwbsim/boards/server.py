@@ -170,7 +170,7 @@ class Server:
         self._chance = stream(scenario.run.seed, "serial faults")
         self._terminals: dict[int, Terminal] = {}
         self._selector = selectors.SelectSelector()
-        self._timed: list[tuple[int, int, Callable[[], None]]] = []
+        self._timed: list[tuple[int, int, Callable[[], object]]] = []
         self._count = 0
         try:
             for tag in scenario.tags:
@@ -229,7 +229,7 @@ class Server:
         for number, (begin_s, end_s) in enumerate(stays, start=1):
             until = "stay there" if math.isinf(end_s) else f"stand until {end_s:g} s"
             text = f"{begin_s:5g} s  place {number} of {len(stays)}: boards {until}"
-            self._at(int(begin_s * NS_PER_S), partial(_told, tell, text))
+            self._at(int(begin_s * NS_PER_S), partial(tell, text))
 
     def write_poses(self, path: Path) -> None:
         """Write motion capture to a file from now on, in host time, as `uwblink poses` reads it."""
@@ -289,7 +289,7 @@ class Server:
     def _now_ns(self) -> int:
         return round((time.monotonic_ns() - self._start_ns) * self._speed)
 
-    def _at(self, time_ns: int, what: Callable[[], None]) -> None:
+    def _at(self, time_ns: int, what: Callable[[], object]) -> None:
         self._count += 1
         heapq.heappush(self._timed, (time_ns, self._count, what))
 
@@ -324,7 +324,3 @@ class Server:
         if fault.kind == "drop-bytes":
             return values[~hit].tobytes()
         return np.where(hit, self._chance.integers(0, 256, len(values)), values).astype(np.uint8).tobytes()
-
-
-def _told(tell: Callable[[str], object], text: str) -> None:
-    tell(text)

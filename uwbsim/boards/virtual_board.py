@@ -95,9 +95,6 @@ class UsbLink:
         self._send(data)
 
 
-POLL_PERIOD: Final = NS_PER_MS
-"""How often the firmware looks at its USB buffer (firmware wire format, 1.3)."""
-
 Steps = Generator[simpy.Event, Any, None]
 Sender = Callable[[int, int, bytes], None]
 """Called with time (ns), board and the bytes of one USB transfer."""
@@ -148,7 +145,7 @@ class VirtualBoard:
         """Power the board on."""
         self.bench, self.id = bench, board
         self.chance = stream(bench.scenario.run.seed, "board", board)
-        self._phase = int(self.chance.integers(0, POLL_PERIOD))
+        self._phase = int(self.chance.integers(0, NS_PER_MS))
         self._power_on()
 
     def _power_on(self) -> None:
@@ -204,9 +201,9 @@ class VirtualBoard:
         return self.bench.env.timeout(delay)
 
     def until_next_poll(self) -> simpy.Event:
-        """Return the event of the next look at the USB buffer."""
+        """Return the event of the next look at the USB buffer, one a millisecond (firmware wire format, 1.3)."""
         now = int(self.bench.env.now)
-        return self.bench.env.timeout(POLL_PERIOD - (now - self._phase) % POLL_PERIOD)
+        return self.bench.env.timeout(NS_PER_MS - (now - self._phase) % NS_PER_MS)
 
     def release(self) -> None:
         """Give the processor back to the task that reads the USB buffer, which an interrupt had taken it from."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
 
 from uwblink.boards.ports import Transport
 from uwblink.errors import PortLostError, PortMissingError
@@ -25,9 +24,6 @@ from uwbsim.errors import ParameterError
 from uwbsim.scenario.loading import Source, as_scenario
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.clocks import NS_PER_S
-
-MOST_TRANSFERS: Final = 20_000
-"""Of what boards sent so much is kept for a look at it: some MB, however long a recording is."""
 
 
 class VirtualPorts:
@@ -67,8 +63,8 @@ class VirtualPorts:
         self._ports: dict[int, VirtualPort] = {}
         self._opened: list[VirtualPort] = []
         self.names = {tag.id: f"virtual board {tag.id}" for tag in scenario.tags}
-        self.transfers: deque[tuple[int, int, bytes]] = deque(maxlen=MOST_TRANSFERS)
-        """The last `MOST_TRANSFERS` that boards sent: time (ns), board, bytes of one USB transfer."""
+        self.transfers: deque[tuple[int, int, bytes]] = deque(maxlen=20_000)
+        """The last 20,000, some MB, that boards sent: time (ns), board, bytes of one USB transfer."""
 
     def port(self, tag: int) -> VirtualPort:
         """Return the port of a board; raises `PortMissingError` where the scenario has no such tag."""

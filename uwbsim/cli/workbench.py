@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,13 +17,11 @@ from uwbsim.cli.arguments import AllowFiles, AsJson, Force, Overrides, ScenarioF
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rich.console import Console
+    from rich.table import Table
+
     import uwbsim
     from uwbsim.twins import Compared
-
-
-TIMING: Final = "Timing"
-TRUTH: Final = "Tags"
-NOISE: Final = "Noise of stamps"
 
 
 def _protocols() -> list[str]:
@@ -85,25 +83,36 @@ def _names(protocols: str) -> list[str]:
 
 
 def _print_outcomes(found: uwbsim.Comparison) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-
     from uwbsim.pages import COLUMNS
 
-    console = Console(width=None if sys.stdout.isatty() else 140)
     cells = [[show(outcome) for show in COLUMNS.values()] for outcome in found.outcomes]
     heads = [name.strip().replace(" (", "\n(").replace("95 % of errors", "95 % of\nerrors") for name in COLUMNS]
+    console = _console(140)
     narrow = console.width < 116  # what all columns of the table take
     if narrow:
         # A narrow terminal has no room for all columns: then each protocol is one.
         heads, *cells = ([name, *row] for name, row in zip(COLUMNS, zip(*cells, strict=True), strict=True))
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    console.print(_table(heads, cells, 1))
+
+
+def _console(width: int) -> Console:
+    """Return a console as wide as the terminal, or of a width elsewhere."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else width)
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], gap: int, title: str | None = None) -> Table:
+    """Return a table of texts, the first column left-aligned; cells that are too wide go on in a second line."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), title=title, title_justify="left")
     for k, head in enumerate(heads):
-        table.add_column(head, justify="left" if k == 0 else "right", no_wrap=k == 0 or not narrow)
-    for row in cells:
+        table.add_column(head, justify="right" if k else "left", overflow="fold")
+    for row in rows:
         table.add_row(*row)
-    console.print(table)
+    return table
 
 
 def predict(
@@ -114,34 +123,39 @@ def predict(
         ),
     ] = "ds",
     skew_ppm: Annotated[
-        float, typer.Option(rich_help_panel=TRUTH, help="How much faster the initiator's clock runs.")
+        float, typer.Option(rich_help_panel="Tags", help="How much faster the initiator's clock runs.")
     ] = 0.0,
     reply_delay_us: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel=TIMING, help="The target's reply, dt32.")
+        float, typer.Option(min=0.0, rich_help_panel="Timing", help="The target's reply, dt32.")
     ] = 300.0,
     final_delay_us: Annotated[
         float | None,
         typer.Option(
-            min=0.0, rich_help_panel=TIMING, help="The third message's delay, dt53 (of ds, ds-alt); 1538.7 by default."
+            min=0.0,
+            rich_help_panel="Timing",
+            help="The third message's delay, dt53 (of ds, ds-alt): else 1538.7.",
         ),
     ] = None,
-    distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel=TRUTH, help="Distance.")] = 5.0,
-    speed_mps: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Speed apart.")] = 0.0,
-    drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Change of the relative skew.")] = 0.0,
-    tx_noise_ps: Annotated[float, typer.Option(min=0.0, rich_help_panel=NOISE, help="Noise of transmit stamps.")] = 0.0,
+    distance_m: Annotated[float, typer.Option(min=0.0, rich_help_panel="Tags", help="Distance.")] = 5.0,
+    speed_mps: Annotated[float, typer.Option(rich_help_panel="Tags", help="Speed apart.")] = 0.0,
+    drift_ppm_per_s: Annotated[float, typer.Option(rich_help_panel="Tags", help="Change of the relative skew.")] = 0.0,
+    tx_noise_ps: Annotated[
+        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Noise of transmit stamps.")
+    ] = 0.0,
     rx_noise_ps: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel=NOISE, help="Noise of receive stamps.")
+        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Noise of receive stamps.")
     ] = 150.0,
     carrier_noise_ppm: Annotated[
-        float, typer.Option(min=0.0, rich_help_panel=NOISE, help="Noise of the carrier integrator.")
+        float, typer.Option(min=0.0, rich_help_panel="Noise", help="Noise of the carrier integrator.")
     ] = 0.2,
-    carrier_bias_ppm: Annotated[float, typer.Option(rich_help_panel=NOISE, help="Its bias.")] = 0.0,
+    carrier_bias_ppm: Annotated[float, typer.Option(rich_help_panel="Noise", help="Its bias.")] = 0.0,
     delay_initiator_ns: Annotated[
-        float, typer.Option(rich_help_panel=TRUTH, help="Antenna delay of the initiator.")
+        float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the initiator.")
     ] = 0.0,
-    delay_target_ns: Annotated[float, typer.Option(rich_help_panel=TRUTH, help="Antenna delay of the target.")] = 0.0,
+    delay_target_ns: Annotated[float, typer.Option(rich_help_panel="Tags", help="Antenna delay of the target.")] = 0.0,
     whole_ticks: Annotated[
-        bool, typer.Option("--whole-ticks", rich_help_panel=NOISE, help="Stamps are whole ticks of 15.65 ps.")
+        bool,
+        typer.Option("--whole-ticks", rich_help_panel="Noise", help="Stamps are whole ticks of 15.65 ps."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -274,25 +288,12 @@ def twin(
         rows = [one.to_dict() for one in compared]
         typer.echo(json.dumps({"found": found.found, "unknown": found.unknown, "compared": rows}, indent=1))
         return
-    _print(compared)
+    _print(compared, _console(150))
     typer.echo(", ".join(map(str, (*files, page))))
 
 
-def _print(compared: Sequence[Compared], width: int | None = None) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-
+def _print(compared: Sequence[Compared], console: Console) -> None:
     from uwbsim.pages import TWIN_COLUMNS
 
-    console = Console(width=width or (None if sys.stdout.isatty() else 150))
-    gap = 1 if console.width > 80 else 0
-    table = Table(
-        box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), title="measured / simulated", title_justify="left"
-    )
-    for k, name in enumerate(TWIN_COLUMNS):
-        # In a narrow terminal cells go on in a second line: cut off, they would lose what was simulated.
-        table.add_column(name, justify="left" if k == 0 else "right", overflow="fold")
-    for one in compared:
-        table.add_row(*(show(one) for show in TWIN_COLUMNS.values()))
-    console.print(table)
+    rows = [[show(one) for show in TWIN_COLUMNS.values()] for one in compared]
+    console.print(_table(list(TWIN_COLUMNS), rows, 1 if console.width > 80 else 0, "measured / simulated"))

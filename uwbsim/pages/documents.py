@@ -193,7 +193,7 @@ def comparison(found: Comparison) -> Document:
         Text(
             "Points are simulated, lines predicted; the first two without delays, power bias and reflections. Axes "
             "that cover decades are logarithmic, and say so; biases have a sign, so theirs is to scale up to ± "
-            f"{figures.LINEAR_CM:g} cm and logarithmic beyond."
+            "1 cm and logarithmic beyond."
         ),
     ]
     for curves, x, caption in over:

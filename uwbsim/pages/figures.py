@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,22 +28,20 @@ from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
 from uwbsim.world.reception import Medium
 from uwbsim.world.world import World
 
-LETTER_IN: Final = 0.062
-"""Width of a letter of 8 pt, about."""
 
-LINEAR_CM: Final = 1.0
-"""Biases below are drawn to scale, larger ones by their logarithm."""
+def _plain_ticks(axis: Axis, least: float = 0.0) -> None:
+    """Put plain numbers at 1, 2 and 5 of each decade within view, at fewer where they are many; `least` is the lowest.
 
-
-def _plain_ticks(axis: Axis, values: Sequence[float]) -> None:
-    """Put plain numbers at these places of an axis, and nothing between them."""
-    axis.set_ticks(values, labels=[f"{value:g}".replace("-", "−") for value in values])
+    Negative numbers stand as those above zero.
+    """
+    low, high = sorted(axis.get_view_interval())
+    for parts in ((1, 2, 5), (1, 3), (1,)):
+        above = [t for k in range(-2, 7) for part in parts if (t := part * 10.0**k) >= least]
+        ticks = [t for t in (*(-t for t in above), 0.0, *above) if low <= t <= high]
+        if len(ticks) < 9:
+            break
+    axis.set_ticks(ticks, labels=[f"{value:g}".replace("-", "−") for value in ticks])
     axis.set_ticks([], minor=True)
-
-
-def _logarithmic_delays(axes: Axes) -> None:
-    axes.set_xscale("log")
-    _plain_ticks(axes.xaxis, [300, 600, 1000, 2000, 4000])
 
 
 def histograms(width_in: float, samples: Mapping[str, Floats]) -> Figure:
@@ -76,29 +74,21 @@ def error_over(width_in: float, curves: Mapping[str, ErrorCurve], x: str, *, log
     spreads = 100 * np.concatenate([c.std_m for c in curves.values()])
     label(left, x, "bias (cm)")
     label(right, x, "standard deviation (cm)")
-    if most > 20 * LINEAR_CM:
-        # Biases have a sign: to scale about zero, logarithmic beyond.
+    if most > 20:
+        # Biases have a sign: to scale about zero, logarithmic beyond a centimetre.
         left.set_ylabel("bias (cm), log axis")
-        left.set_yscale("symlog", linthresh=LINEAR_CM)
-        low, high = left.get_ylim()
-        decades = [10.0**k for k in range(int(np.ceil(np.log10(most))) + 1)]
-        for finer in ((1,), (1, 2, 5)):
-            above = [m * t for t in decades for m in finer]
-            kept = [t for t in [*(-t for t in above), 0.0, *above] if low <= t <= high]
-            if len(kept) >= 4:
-                break
-        _plain_ticks(left.yaxis, kept)
+        left.set_yscale("symlog", linthresh=1.0)
+        _plain_ticks(left.yaxis, 1.0)
     if spreads.max() > 10 * spreads.min():
         right.set_ylabel("std (cm), log axis")
         right.set_yscale("log")
-        ticks = [m * 10.0**k for k in range(-2, 6) for m in (1, 2, 5)]
-        ticks = [t for t in ticks if 0.8 * spreads.min() <= t <= 1.25 * spreads.max()]
-        _plain_ticks(right.yaxis, ticks if len(ticks) < 8 else ticks[::3])
+        _plain_ticks(right.yaxis)
     else:
         right.set_ylim(bottom=0)
     for axes in (left, right):
         if logarithmic:
-            _logarithmic_delays(axes)
+            axes.set_xscale("log")
+            _plain_ticks(axes.xaxis)
         else:
             axes.locator_params(axis="x", nbins=6)  # nine of powers cover each other
     legend(figure, left)
@@ -118,7 +108,8 @@ def optimum_curve(width_in: float, found: Optimum) -> Figure:
         axes.plot(delays, curve, color=BLUE)
         axes.plot([best], [y], "o", color=VERMILION)
         axes.annotate(f"{best:.0f} µs", (best, y), (6, 8), textcoords="offset points")
-        _logarithmic_delays(axes)
+        axes.set_xscale("log")
+        _plain_ticks(axes.xaxis)
         label(axes, "delay of the scheduled message (µs)", name)
     return figure
 
@@ -178,7 +169,7 @@ def _draw_walls(axes: Axes, scenario: Scenario, x: int, y: int, scale: float) ->
         width, height = (high - low)[[x, y]]
         axes.add_patch(Rectangle((low[x], low[y]), width, height, fc=GRID, ec=MUTED, lw=0.6))
         # A name is written into what it names, along or up, or not at all.
-        length = LETTER_IN * len(box.name) + 0.05
+        length = 0.062 * len(box.name) + 0.05  # inches of letters of 8 pt
         for angle, along, aside in ((0, width, height), (90, height, width)):
             if along * scale > length and aside * scale > 0.13:
                 place = (float((low + high)[x] / 2), float((low + high)[y] / 2))
@@ -199,7 +190,7 @@ def _name_tags(axes: Axes, spots: dict[int, Floats], scale: float, right: float)
     for spot, names in groups:
         text = ", ".join(map(str, names)) if len(names) < 5 else f"{names[0]} … {names[-1]}"
         # Beside the edge to the left, so that no name runs out of the picture.
-        left = (right - spot[0]) * scale < LETTER_IN * len(text) + 0.1
+        left = (right - spot[0]) * scale < 0.062 * len(text) + 0.1
         place, side = (float(spot[0]), float(spot[1])), "right" if left else "left"
         axes.annotate(text, place, (-4 if left else 4, 4), textcoords="offset points", color=INK, ha=side)
 
@@ -268,7 +259,7 @@ def _draw_spans(
         level = 0.62 if above else 0.38
         axes.annotate("", (right, level), (left, level), arrowprops={"arrowstyle": "<->", "color": MUTED, "lw": 0.7})
         text = f"{name} = {length_us:.1f} µs"
-        if (right - left) / (max(times_us) - min(times_us)) * (width_in - 1.2) < 1.2 * LETTER_IN * len(text):
+        if (right - left) / (max(times_us) - min(times_us)) * (width_in - 1.2) < 0.074 * len(text):
             text = name
         place, away = ((left + right) / 2, level), (0, 1.5 if above else -1.5)
         upright: dict[str, Any] = {"ha": "center", "va": "bottom" if above else "top", "color": INK}

@@ -12,7 +12,6 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import RangingProtocol
-from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError
 from uwbsim.protocols.conditions import Conditions, Protocols, calibrated, chosen, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
@@ -282,11 +281,6 @@ def over_state(
     spreads = np.array([prediction.variance_m2[rows].mean() + prediction.mean_m[rows].var() for rows in parts])
     middles = np.array([np.median(values[rows]) for rows in parts])
     return ErrorCurve(middles, mean, std, means, np.sqrt(spreads))
-
-
-def paper_bias_m(skew_ppm: float, reply_s: float) -> float:
-    """Return the bias of SS-TWR, c/2 times relative skew times reply (ICRA 2023, section II)."""
-    return 0.5 * SPEED_OF_LIGHT * skew_ppm * 1e-6 * reply_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -23,9 +23,6 @@ from uwbsim.errors import ScenarioError
 
 MOST_POSES: Final = 200_000
 
-MOST_ROWS: Final = 1_000_000
-"""Of a linked table: nearly three hours of slots at 100 Hz; in memory they take 0.2 GB."""
-
 MODELS: Final = {
     "antenna": None,
     "plan": None,
@@ -110,9 +107,10 @@ def _rows(path: Path, columns: tuple[str, ...]) -> list[list[float]]:
             missing = [c for c in columns if c not in (reader.fieldnames or [])]
             if missing:
                 raise ScenarioError(f"{path}: column {missing[0]!r} is missing; expected {', '.join(columns)}")
-            rows = [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in islice(reader, MOST_ROWS)]
+            most = 1_000_000  # nearly three hours of slots at 100 Hz; in memory they take 0.2 GB
+            rows = [[_number(path, reader.line_num, c, row[c]) for c in columns] for row in islice(reader, most)]
             if next(reader, None) is not None:
-                raise ScenarioError(f"{path}: more than {MOST_ROWS} rows, which is the most that is read")
+                raise ScenarioError(f"{path}: more than {most} rows, which is the most that is read")
             return rows
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ScenarioError(f"{path}: cannot be read as a table ({error})") from error

@@ -28,6 +28,9 @@ Boards report 2.5 to 3.6 ms after the command of a double-sided exchange of 2.0 
 RECEIVER_ON_S: Final = 40e-6
 """From the end of a frame until the receiver is on again (firmware wire format, 3.1)."""
 
+PREAMBLE_TIMEOUT_S: Final = 6.521e-3
+"""How long a board waits for a preamble (firmware wire format, 3.1)."""
+
 POLL_BYTES: Final = 11
 RESPONSE_BYTES: Final = 8
 FINAL_BYTES: Final = 28

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import simpy
@@ -24,7 +24,15 @@ from uwblink.arrays import Bools, Floats, Ints
 from uwblink.protocols.rows import RangingProtocol
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.scenario.ranging import RECEIVER_ON_S, TURNAROUND_S, after_marker_s, before_marker_s, message_bytes
+from uwbsim.scenario.radio import Radio
+from uwbsim.scenario.ranging import (
+    PREAMBLE_TIMEOUT_S,
+    RECEIVER_ON_S,
+    TURNAROUND_S,
+    after_marker_s,
+    before_marker_s,
+    message_bytes,
+)
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND
 
 
@@ -86,18 +94,11 @@ def _schedule(start_s: Floats, pairs: Ints, host: Ints) -> Schedule:
     return Schedule(start, pairs[order, 0], pairs[order, 1], host[order])
 
 
-PREAMBLE_TIMEOUT_S: Final = 6.521e-3
-"""How long a board waits for a preamble (firmware wire format, 3.1)."""
-
 WEAK, COLLIDED, BUSY, FOREIGN, LATE = "below sensitivity", "collision", "receiver busy", "another's frame", "too late"
 
 Steps = Generator[simpy.Event, Any, None]
 Powers = Callable[[int, int], Floats]
 """Returns the power (dBm) at every tag from a sender, at a true time in sub-ticks."""
-
-
-FOREVER: Final = 1 << 62
-"""Later than any instant of a run, in sub-ticks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,20 +158,11 @@ class _Frame:
     exchange: int
 
 
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """What decides a reception besides its own power."""
-
-    sensitivity_dbm: float
-    capture_db: float
-    preamble_symbols: int
-
-
 class Air:
     """The medium and the radios on it, while the slots of a plan are played."""
 
     def __init__(
-        self, protocol: RangingProtocol, slots: Slots, tags: int, hosts: int, powers: Powers, rules: Rules
+        self, protocol: RangingProtocol, slots: Slots, tags: int, hosts: int, powers: Powers, radio: Radio
     ) -> None:
         """Begin at time zero with no frame on the air.
 
@@ -179,8 +171,8 @@ class Air:
         """
         self.env = simpy.Environment()
         self._messages, self._slots = protocol.messages, slots
-        self._powers, self._rules = powers, rules
-        self._before = _subticks(before_marker_s(rules.preamble_symbols))
+        self._powers, self._radio = powers, radio
+        self._before = _subticks(before_marker_s(radio.preamble_symbols))
         self._after = [_subticks(after_marker_s(n)) for n in message_bytes(protocol)]
         self._patience = _subticks(PREAMBLE_TIMEOUT_S + RECEIVER_ON_S)
         self._turnaround = _subticks(TURNAROUND_S)
@@ -192,13 +184,13 @@ class Air:
 
     def play(self, host: int, numbers: Sequence[int], report: Callable[[int], None] | None = None) -> Steps:
         """Play the slots of one host, one after the other."""
-        env, slots, soonest = self.env, self._slots, self._soonest
+        env, slots, soonest, never = self.env, self._slots, self._soonest, 1 << 62
         for count, number in enumerate(numbers):
             begin = max(soonest[host], slots.start[number])
             soonest[host] = begin
             if begin > env.now:
                 yield env.timeout(begin - int(env.now))
-            soonest[host] = FOREVER
+            soonest[host] = never
             if self._alone(number, begin):
                 end = self._succeed(number, begin)
             else:
@@ -210,7 +202,7 @@ class Air:
             soonest[host] = end + self._turnaround
             if report and not count % 500:
                 report(count)
-        soonest[host] = FOREVER
+        soonest[host] = never
 
     def _undisturbed(self) -> list[int]:
         """Return how long each exchange takes if nothing disturbs it, n; -1 for those that are to be looked at."""
@@ -294,13 +286,13 @@ class Air:
             if f.sender == receiver:
                 return BUSY
             power = float(self._powers(f.sender, f.start)[receiver])
-            if power < self._rules.sensitivity_dbm:
+            if power < self._radio.sensitivity_dbm:
                 continue
             if f.end <= frame.start:
                 if k and f.start >= since:
                     return FOREIGN  # a board that waits for an answer takes the first frame that comes
                 continue
-            captured = signal >= power + self._rules.capture_db and frame.start <= f.start
+            captured = signal >= power + self._radio.capture_db and frame.start <= f.start
             if not captured:
                 return COLLIDED
         return ""
@@ -312,12 +304,12 @@ def run(
     hosts: Sequence[Sequence[int]],
     tags: int,
     powers: Powers,
-    rules: Rules,
+    radio: Radio,
     progress: Callable[[float], None] | None = None,
 ) -> Outcomes:
     """Play a plan, whose slots by their numbers are each host's in order; returns what became of every slot."""
     total = len(slots.start)
-    air = Air(protocol, slots, tags, len(hosts), powers, rules)
+    air = Air(protocol, slots, tags, len(hosts), powers, radio)
     counts = [0] * len(hosts)
 
     def reporter(host: int) -> Callable[[int], None] | None:

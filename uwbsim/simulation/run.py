@@ -62,13 +62,12 @@ def simulate(
     draws = draw(scenario, len(plan.start), len(protocol.messages))
     if contention:
         ahead, radio = SampledWorld(world), scenario.radio
-        rules = air.Rules(radio.sensitivity_dbm, radio.capture_db, radio.preamble_symbols)
 
         def powers(sender: int, time: int) -> Floats:
             return ahead.from_sender(sender, max(time, 0)).power_dbm
 
         slots = _slots(medium, world, plan, draws)
-        outcomes = air.run(protocol, slots, plan.hosts(), len(scenario.tags), powers, rules, progress)
+        outcomes = air.run(protocol, slots, plan.hosts(), len(scenario.tags), powers, radio, progress)
     else:
         outcomes = _undisturbed(medium, world, plan, draws)
     lost, begun = np.array(outcomes.lost), np.array(outcomes.start, dtype=np.int64)

@@ -7,6 +7,7 @@ arrive, and which integers do the two boards write down.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.world.clocks import SUBTICKS
 from uwbsim.world.reception import Frames, Medium
+
+Ticks = TypeVar("Ticks", Ints, int)
 
 
 @dataclass(slots=True)
@@ -118,7 +121,7 @@ def stamp(
             reference = result.stamps[message.after]
             counter = _transmission(message, reference, draws.reply_s, delay_uus)
         else:
-            counter = _next_grid(-(-ready // SUBTICKS))
+            counter = next_grid(-(-ready // SUBTICKS))
         left = medium.leave(sender, counter + medium.tx_register[sender], draws.transmit[k])
         frames = Frames(sender=sender, receiver=receiver, departure=left)
         received = medium.receive(frames, draws.receive[k], draws.excess_m)
@@ -138,8 +141,9 @@ def _transmission(message: ProtocolMessage, reference: Ints, reply_s: Floats, de
         # The chip ignores the low nine bits of the time at which it is told to send.
         return due // DELAYED_TX_GRID * DELAYED_TX_GRID
     latency = np.rint(reply_s / TICK_S).astype(np.int64)
-    return _next_grid(reference + latency - ANTENNA_DELAY_TICKS)
+    return next_grid(reference + latency - ANTENNA_DELAY_TICKS)
 
 
-def _next_grid(ticks: Ints) -> Ints:
+def next_grid(ticks: Ticks) -> Ticks:
+    """Return the first instants in ticks, at or after some, at which the chip sends."""
     return -(-ticks // DELAYED_TX_GRID) * DELAYED_TX_GRID

@@ -23,7 +23,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from multiprocessing.connection import Connection
 from threading import Thread
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -40,12 +40,6 @@ from uwbsim.world.channel import CHANNEL_EFFECTS, OWN_EFFECTS, ChannelEffect
 
 Evaluate = Callable[[Simulated], Mapping[str, Any]]
 """Returns the figures of a flight as columns of one row: numbers, texts or None."""
-
-GROUP: Final = "uwbcal.evaluators"
-"""Entry points of this group offer functions of kind `Evaluate`, by the name of a sweep's kind."""
-
-CONNECT_S: Final = 10
-"""How long a cluster may take to answer: chosen, some round trips to a busy scheduler."""
 
 Row = dict[str, Any]
 Result = tuple[int, list[Row]]
@@ -159,17 +153,18 @@ def run_chunk(tasks: Sequence[Task], work: Work) -> tuple[list[Result], float]:
 
 def evaluator(kind: str) -> Evaluate:
     """Return the function that installed distributions offer for a kind of sweep; raises `ParameterError`."""
-    for entry in entry_points(group=GROUP, name=kind):
+    group = "uwbcal.evaluators"
+    for entry in entry_points(group=group, name=kind):
         try:
             found: Evaluate = entry.load()
         except (ImportError, AttributeError) as error:
             raise ParameterError(
-                f"{entry.value}, which {GROUP} names, cannot be imported: {error}", parameter="evaluate"
+                f"{entry.value}, which {group} names, cannot be imported: {error}", parameter="evaluate"
             ) from error
         return found
     raise ParameterError(
         f"a sweep of kind {kind!r} needs a function that evaluates a flight, and no installed distribution offers one "
-        f"(entry point {kind!r} of the group {GROUP})",
+        f"(entry point {kind!r} of the group {group})",
         parameter="evaluate",
     )
 
@@ -268,8 +263,11 @@ class Processes(Workers):
 class Cluster(Workers):
     """A Dask cluster by the address of its scheduler; `distributed` moves the work of a dead worker to another."""
 
+    connect_s = 10
+    """How long a cluster may take to answer: chosen, some round trips to a busy scheduler."""
+
     def __init__(self, address: str, work: Work) -> None:
-        """Connect; raises `ParameterError` where no scheduler answers within ten seconds."""
+        """Connect; raises `ParameterError` where no scheduler answers in time."""
         work.check()
         self._address = address
         try:
@@ -281,9 +279,11 @@ class Cluster(Workers):
         self.died = self._dask.KilledWorker
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         try:
-            self._client = self._dask.Client(address, timeout=CONNECT_S, set_as_default=False)
+            self._client = self._dask.Client(address, timeout=self.connect_s, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
-            raise ParameterError(f"{address} does not answer within {CONNECT_S} s", parameter="scheduler") from error
+            raise ParameterError(
+                f"{address} does not answer within {self.connect_s} s", parameter="scheduler"
+            ) from error
         super().__init__(max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1), work)
 
     def finished(self) -> Sequence[Done]:

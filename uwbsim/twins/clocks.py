@@ -22,10 +22,6 @@ SAMPLED: Final = 10_000
 """Readings of which the noise is taken in each round, at most: known to 1 % then."""
 
 
-KINDS: Final = 2
-"""Of readings, each with a bias of its own: ratios and carriers."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockFit:
     """What clocks did: rates in ppm at the start by tag's place, their walks in ppm a root of a second, (tags,) each.
@@ -110,7 +106,7 @@ class _Search:
             values.append(value[rows])
         self.value = np.concatenate(values)
         self.kind = np.minimum(np.repeat(np.arange(3), [len(part) for part in values]), 1)
-        self.design = csr_array(hstack([vstack(designs), csr_array(np.eye(KINDS)[self.kind])]))
+        self.design = csr_array(hstack([vstack(designs), csr_array(np.eye(2)[self.kind])]))
 
     def run(self) -> Self:
         """Go on until nothing changes any more."""
@@ -140,7 +136,7 @@ class _Search:
         normal[np.ix_(start, start)] += 1e6
         warm = np.arange(tags * knots, tags * (knots + 1))
         normal[warm, warm] += 1e12 if self.decay_s is None else 5.0**-2
-        normal[range(-KINDS, 0), range(-KINDS, 0)] += 1e-6
+        normal[range(-2, 0), range(-2, 0)] += 1e-6
         self.covariance = np.linalg.inv(normal)
         self.found = self.covariance @ towards
         self.left = self.value - self.design @ self.found
@@ -151,7 +147,7 @@ class _Search:
         parts = [self.design[piece] for piece in pieces]
         own = [np.asarray(part.multiply(part @ self.covariance).sum(axis=1)).ravel() for part in parts]
         scatter, weight, kind = self.left[rows] ** 2 + np.concatenate(own), self.weight[rows], self.kind[rows]
-        total, count = (np.bincount(kind, v, minlength=KINDS) for v in (weight * scatter, weight))
+        total, count = (np.bincount(kind, v, minlength=2) for v in (weight * scatter, weight))
         self.noise = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), self.noise)
 
     def _walks(self) -> Floats:
@@ -167,7 +163,7 @@ class _Search:
 
     def warmed_up(self) -> float:
         """Return how much more than its walk does meanwhile the clock that warms up most does, from all others."""
-        warm = self.found[self.tags * self.knots : -KINDS]
+        warm = self.found[self.tags * self.knots : -2]
         return float(np.max(np.abs(warm - np.median(warm)) / (self.walk * np.sqrt(self.decay_s or 1.0))))
 
     def result(self) -> ClockFit:

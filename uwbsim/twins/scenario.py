@@ -26,9 +26,6 @@ from uwbsim.world.radio import lifted
 WIDTH: Final = 120
 """Columns of a line of a scenario file."""
 
-MIN_FADING_DB: Final = 0.1
-"""Less fading than this counts as none: chosen, as it moves no first path and hardly a bias."""
-
 AFTER_S: Final = 0.2
 """How long a scenario goes on after its last exchange, which may take so long."""
 
@@ -184,7 +181,7 @@ def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any
     multipath = _multipath(flight, fitted)
     if multipath:
         found["multipath"] = multipath
-    if powers.fading_db >= MIN_FADING_DB:
+    if powers.fading_db >= 0.1:
         found["fading"] = {"levels_db": [float(level) for level in powers.fading_levels_db]}
         if powers.fading_life_s is not None:
             found["fading"]["life_s"] = max(powers.fading_life_s, SHORTEST_LIFE_S)
@@ -337,7 +334,7 @@ SOMETIMES: Final[tuple[tuple[Callable[[Flight, Fitted], bool], str], ...]] = (
         "The path-loss exponent: all distances are much the same.",
     ),
     (
-        lambda flight, fitted: fitted.powers.fading_db >= MIN_FADING_DB and fitted.powers.fading_life_s is None,
+        lambda flight, fitted: fitted.powers.fading_db >= 0.1 and fitted.powers.fading_life_s is None,
         "How long fading lasts (radio.fading.life_s): a pair ranges again after {interval:.2g} s.",
     ),
     (

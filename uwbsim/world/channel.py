@@ -25,9 +25,6 @@ from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.pair_states import PairLevels, ReflectedStates
 from uwbsim.world.radio import antenna_gain_db, group_delay_m, has_group_delays, path_gain_db
 
-COINCIDENT_M: Final = 1e-10
-"""Nearer than this two antennas have no direction; it only keeps divisions defined."""
-
 
 @dataclass(frozen=True, slots=True)
 class Link:
@@ -107,7 +104,7 @@ class Ends:
     @property
     def towards(self) -> Floats:
         """Return unit vectors from the sender to the receiver, (n, 3)."""
-        return (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(self.distance_m, COINCIDENT_M)[:, None]
+        return (self.antennas_m[1] - self.antennas_m[0]) / np.maximum(self.distance_m, 1e-10)[:, None]
 
     @property
     def gain_db(self) -> Floats:
@@ -209,10 +206,10 @@ def _reflections(link: Link, ends: Ends) -> Link:
     images = [_images(room, end) for end in spots]
     way, back = images[1] - spots[0], images[0] - spots[1]
     length = np.linalg.norm(way, axis=2)
-    scale = np.maximum(length, COINCIDENT_M)[:, :, None]
+    scale = np.maximum(length, 1e-10)[:, :, None]
     # How far in front of the surface the two ends are decides where the path meets it.
     near, far = (np.linalg.norm(image - end, axis=2) for image, end in zip(images, spots, strict=True))
-    point = spots[0] + (near / np.maximum(near + far, COINCIDENT_M))[:, :, None] * way
+    point = spots[0] + (near / np.maximum(near + far, 1e-10))[:, :, None] * way
     leaving, arriving = way / scale, back / scale
     gain = np.stack([ends.gain_towards_db(leaving[:, k], arriving[:, k]) for k in range(surfaces)], axis=1)
     loss, excess = np.zeros(length.shape), np.zeros(length.shape)

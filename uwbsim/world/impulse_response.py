@@ -57,9 +57,6 @@ FRACTIONS: Final = 128
 CURVATURE: Final = 1 / PULSE_TAPS**2
 """The logarithm of a pulse is a parabola; this is its coefficient, turned round."""
 
-NOTHING: Final = 1e-20
-"""Amplitude in roots of mW whose logarithm is still taken."""
-
 OWN_TAPS: Final = np.arange(1, 4)
 """Taps after the edge whose squares are the first path's power (DW1000 User Manual, 4.7.1)."""
 
@@ -221,8 +218,8 @@ def detect(paths: Paths, sensing: Sensing) -> Detected:
     # On a flatter edge than 0.2, of the logarithm over a tap, noise does not count for more.
     return Detected(
         excess_m=(arrival - BEFORE - EDGE_TO_PEAK) * TAP_M,
-        power_dbm=10 * np.log10(np.maximum(own, NOTHING)),
-        total_dbm=10 * np.log10(np.maximum(total, NOTHING)),
+        power_dbm=10 * np.log10(np.maximum(own, 1e-20)),
+        total_dbm=10 * np.log10(np.maximum(total, 1e-20)),
         noise_s=noise / np.maximum(slope, 0.2) * TAP_S,
     )
 
@@ -270,8 +267,8 @@ def _pulses() -> Floats:
 
 
 def _height(squares: Floats) -> Floats:
-    """The logarithm of an amplitude, of its square."""
-    return np.asarray(np.log(np.maximum(squares, NOTHING**2)) / 2)
+    """The logarithm of an amplitude, of its square; of 1e-20 roots of mW at least."""
+    return np.asarray(np.log(np.maximum(squares, 1e-20**2)) / 2)
 
 
 def _first_peak(squares: Floats, begin: Ints) -> tuple[Ints, Floats]:

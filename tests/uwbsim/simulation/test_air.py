@@ -11,6 +11,7 @@ from uwblink.ticks import TICK_S, elapsed
 from uwbsim.random_streams import stream
 from uwbsim.scenario.loading import load
 from uwbsim.scenario.model import Scenario
+from uwbsim.scenario.radio import Radio
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, exchange_air_s, frame_s
 from uwbsim.simulation import air
 from uwbsim.simulation.run import simulate
@@ -47,7 +48,7 @@ def columns(hosts):
 
 def played(hosts, powers=None, capture_db=6.0):
     table = np.full((8, 8), -80.0) if powers is None else powers
-    rules = air.Rules(sensitivity_dbm=-100.0, capture_db=capture_db, preamble_symbols=128)
+    rules = Radio(sensitivity_dbm=-100.0, capture_db=capture_db, preamble_symbols=128)
     slots, numbers = columns(hosts)
     return air.run(DS, slots, numbers, 8, lambda sender, _time: table[sender], rules)
 
@@ -147,7 +148,7 @@ def test_progress_is_told_for_every_500th_slot_as_a_share_of_all_hosts():
     hosts = [[slot(k, 3000 * k, 0, 1) for k in range(501)], [slot(501, 0, 4, 5)]]
     powers = np.full((8, 8), -120.0)
     powers[:2, :2] = powers[4:6, 4:6] = -80.0
-    rules = air.Rules(sensitivity_dbm=-100.0, capture_db=6.0, preamble_symbols=128)
+    rules = Radio(sensitivity_dbm=-100.0, capture_db=6.0, preamble_symbols=128)
     slots, numbers = columns(hosts)
     outcome = air.run(DS, slots, numbers, 8, lambda sender, _: powers[sender], rules, told.append)
     assert set(outcome.lost) == {-1}

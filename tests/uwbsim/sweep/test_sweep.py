@@ -18,7 +18,7 @@ import pytest
 from uwblink.protocols.table import PROTOCOLS, register_protocol
 from uwbsim.errors import ParameterError, ScenarioError, UwbsimError
 from uwbsim.sweep.design import load_design
-from uwbsim.sweep.executors import Processes
+from uwbsim.sweep.executors import Cluster, Processes
 from uwbsim.sweep.results import Store
 from uwbsim.sweep.runner import run_sweep
 from uwbsim.world.channel import CHANNEL_EFFECTS, register_channel_effect
@@ -313,7 +313,7 @@ def test_folders_and_files_that_do_not_fit_are_refused(alone, tmp_path):
 
 def test_a_scheduler_that_does_not_answer_is_named(alone, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    monkeypatch.setattr("uwbsim.sweep.executors.CONNECT_S", 1)
+    monkeypatch.setattr(Cluster, "connect_s", 1)
     with pytest.raises(UwbsimError, match=r"tcp://127.0.0.1:9 does not answer within 1 s"):
         run_sweep(alone[0], tmp_path / "out", scheduler="tcp://127.0.0.1:9")
     assert not (tmp_path / "out").exists()

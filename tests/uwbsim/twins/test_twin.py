@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 import uwbsim
@@ -187,7 +188,7 @@ def test_a_terminal_of_80_columns_loses_no_figure(found, capsys):
     compared = found.compare(1)
     said = []
     for width in (80, 150):
-        _print(compared, width=width)
+        _print(compared, Console(width=width))
         said.append(capsys.readouterr().out.split())
     narrow, wide = ({word for word in words if word[-1].isdigit() and "/" not in word} for words in said)
     assert wide <= narrow, wide - narrow
