@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Final, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from uwbsim.scenario.base import NotNegative, Positive, Section, Vector
 
 
-class RandomFlight(Section):
+class Box(Section):
+    """A table with two corners of a box."""
+
+    corner: ClassVar[str] = ""
+
+    @model_validator(mode="after")
+    def _check_corners(self) -> Self:
+        low, high = (f"{self.corner}{end}_m" for end in ("min", "max"))
+        if any(lo >= hi for lo, hi in zip(getattr(self, low), getattr(self, high), strict=True)):
+            raise ValueError(f"{low}: must be below {high} in every direction")
+        return self
+
+
+class RandomFlight(Box):
     """Smooth flight through random points of a box."""
+
+    corner = "box_"
 
     model: Literal["random-flight"] = Field(description="Smoothly through random points of a box.")
     box_min_m: Vector = Field(description="Lowest corner of the box.")
@@ -20,12 +35,6 @@ class RandomFlight(Section):
         1.0,
         description="Speed, roughly: that at which it would go straight from each point to the next.",
     )
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(lo >= hi for lo, hi in zip(self.box_min_m, self.box_max_m, strict=True)):
-            raise ValueError("box_min_m: must be below box_max_m in every direction")
-        return self
 
 
 class Waypoints(Section):
@@ -209,7 +218,7 @@ def _known(material: Any) -> Any:
 KnownMaterial = Annotated[str | Material, AfterValidator(_known)]
 
 
-class Obstacle(Section):
+class Obstacle(Box):
     """A box that waves go through, at a loss and late. `material` is a name or a table of its own.
 
     In the geometric model its faces reflect; `roughness_mm` is the standard deviation of their heights.
@@ -224,16 +233,6 @@ class Obstacle(Section):
         description="Standard deviation of its faces' heights, in the geometric model.",
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
-            raise ValueError("min_m: must be below max_m in every direction")
-        return self
-
-    def properties(self) -> tuple[float, float]:
-        """Return loss in dB a metre, and refractive index."""
-        return properties(self.material)
-
 
 def properties(material: str | Material) -> tuple[float, float]:
     """Return loss in dB a metre and refractive index of a material, by its name or as given."""
@@ -242,7 +241,7 @@ def properties(material: str | Material) -> tuple[float, float]:
     return material.loss_db_per_m, material.index
 
 
-class Room(Section):
+class Room(Box):
     """The room: a box, whose six surfaces reflect with `reflection_loss_db` where it is given.
 
     In the geometric model they reflect as their `material` does, or `floor` and `ceiling` where these are given;
@@ -263,12 +262,6 @@ class Room(Section):
         3.0,
         description="Standard deviation of surfaces' heights, in the geometric model.",
     )
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(lo >= hi for lo, hi in zip(self.min_m, self.max_m, strict=True)):
-            raise ValueError("min_m: must be below max_m in every direction")
-        return self
 
     def materials(self) -> tuple[str | Material, ...]:
         """Return those of the six surfaces: two walls across x, two across y, floor and ceiling."""

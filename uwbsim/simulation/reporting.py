@@ -141,10 +141,8 @@ def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: 
     for k in range(3):
         name = str(k + 1)
         if k >= len(stamped.frames):
-            columns |= {f"rx{name}": np.zeros(count, dtype=np.int64)}
-            columns |= {
-                f"{what}{name}_{unit}": np.full(count, np.nan) for what, unit in (("fpp", "dbm"), ("skew", "ppm"))
-            }
+            nothing = np.full(count, np.nan)
+            columns |= {f"rx{name}": np.zeros(count, np.int64), f"fpp{name}_dbm": nothing, f"skew{name}_ppm": nothing}
             continue
         sent = stamped.frames[k]
         frames = Frames(sender=sent.sender[rows], receiver=np.full(count, me), departure=sent.departure[rows])
@@ -158,10 +156,8 @@ def _heard_by(medium: Medium, me: int, rows: Ints, stamped: Stamped, exchanges: 
     columns |= {"time_ns": exchanges.time_ns[rows], "listener": np.full(count, tag.id)}
     columns |= {name: getattr(exchanges, name)[rows] for name in ("initiator", "target")}
     columns |= {f"{name}_n": getattr(exchanges, name)[rows] for name in STAMPS}
-    for name in ("fpp1", "fpp2"):
-        columns[f"{name}_n_dbm"] = getattr(exchanges, f"{name}_dbm")[rows]
-    for name in ("skew1", "skew2"):
-        columns[f"{name}_n_ppm"] = getattr(exchanges, f"{name}_ppm")[rows]
+    for name in ("fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm"):
+        columns[name.replace("_", "_n_")] = getattr(exchanges, name)[rows]
     return {name: column[heard] for name, column in columns.items()}
 
 

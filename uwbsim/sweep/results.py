@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Final, Self
 
 from uwblink.database import connect
-from uwblink.errors import UwblinkError
+from uwblink.errors import UwblinkError, first_line
 from uwblink.output import is_utf8, whole
 from uwblink.recording.intake import check_tables, interrupted_after, longest_read_s
 from uwbsim.tables import fill_csv, fill_parquet
@@ -140,31 +140,25 @@ def _connect(path: Path) -> Any:
         raise TableError(f"{path}: cannot be opened ({reason[:120]})") from error
 
 
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _reading(path: Path) -> AbstractContextManager[None]:
     """Turn an error of reading into one that names the store."""
-    import duckdb
+    kinds = ValueError, TypeError, KeyError, RecursionError
+    return _naming(path, "its results are damaged ({}); begin in another folder", kinds)
 
-    try:
-        yield
-    except (duckdb.Error, ValueError, TypeError, KeyError, RecursionError) as error:
-        if isinstance(error, UwblinkError):
-            raise
-        raise TableError(f"{path}: its results are damaged ({_first_line(error)}); begin in another folder") from error
+
+def _writing(path: Path) -> AbstractContextManager[None]:
+    """Turn an error of writing into one that names the store."""
+    return _naming(path, "cannot be written ({}); is the disk full? Results so far are kept")
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn an error of writing into one that names the store."""
+def _naming(path: Path, text: str, kinds: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     import duckdb
 
+    wrong: tuple[type[Exception], ...] = (duckdb.Error, *kinds)
     try:
         yield
-    except duckdb.Error as error:
-        raise TableError(
-            f"{path}: cannot be written ({_first_line(error)}); is the disk full? Results so far are kept"
-        ) from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+    except UwblinkError:
+        raise
+    except wrong as error:
+        raise TableError(f"{path}: {text.format(first_line(error))}") from error

@@ -111,17 +111,14 @@ def _check(plan: SweepDesign, folder: Path, *, resume: bool) -> None:
         return
     with Store.open(path) as store:
         known = store.identity()
-    if known.get("plan") != plan.path.name:
-        raise ScenarioError(f"{folder}: holds the results of another sweep, {known.get('plan')}; give another folder")
-    if known.get("fingerprint") != plan.fingerprint:
-        raise ScenarioError(
-            f"{folder}: {plan.path.name} or its scenario has changed since its results were made; give another folder"
-        )
-    if known.get("uwbcal") != uwblink.__version__:
-        raise ScenarioError(
-            f"{folder}: its results are of uwbcal {known.get('uwbcal')}, this is {uwblink.__version__}; "
-            "give another folder"
-        )
+    told = {
+        "plan": f"holds the results of another sweep, {known.get('plan')}",
+        "fingerprint": f"{plan.path.name} or its scenario has changed since its results were made",
+        "uwbcal": f"its results are of uwbcal {known.get('uwbcal')}, this is {uwblink.__version__}",
+    }
+    for key, text in told.items():
+        if known.get(key) != _identity(plan)[key]:
+            raise ScenarioError(f"{folder}: {text}; give another folder")
     if not resume:
         raise ParameterError(
             f"{folder} holds results of this sweep; go on with it, or give another folder", parameter="resume"

@@ -138,111 +138,108 @@ def tables(
     return table, paths
 
 
+def _given(**table: Any) -> dict[str, Any]:
+    """Return a table without what is None: it keeps its default."""
+    return {key: value for key, value in table.items() if value is not None}
+
+
 def _ranging(flight: Flight, schedule: ScheduleFit) -> dict[str, Any]:
-    ids = [tag.tag for tag in flight.tags]
-    found: dict[str, Any] = {
-        "protocol": flight.row.name,
-        "rate_hz": schedule.rate_hz,
-        "pairs": [[ids[i], ids[j]] for i, j in schedule.turns],
-    }
-    if schedule.delay_uus is not None:
-        found["response_delay_uus"] = schedule.delay_uus
-    if schedule.replies_us is not None:
-        found["reply"] = {"model": "quantiles", "delays_us": list(schedule.replies_us)}
+    ids, plan = [tag.tag for tag in flight.tags], None
     if not schedule.regular:
         columns = zip(schedule.time_s.tolist(), schedule.initiator.tolist(), schedule.target.tolist(), strict=True)
-        found["plan"] = {"file": "", "slots": [(round(t, 6), ids[i], ids[j]) for t, i, j in columns]}
-    return found
+        plan = {"file": "", "slots": [(round(t, 6), ids[i], ids[j]) for t, i, j in columns]}
+    replies = schedule.replies_us
+    return _given(
+        protocol=flight.row.name,
+        rate_hz=schedule.rate_hz,
+        pairs=[[ids[i], ids[j]] for i, j in schedule.turns],
+        response_delay_uus=schedule.delay_uus,
+        reply=None if replies is None else {"model": "quantiles", "delays_us": list(replies)},
+        plan=plan,
+    )
 
 
 def _radio(flight: Flight, known: KnownDevices, fitted: Fitted) -> dict[str, Any]:
-    powers, clocks, schedule = fitted.powers, fitted.clocks, fitted.schedule
-    found: dict[str, Any] = {
-        "first_path_at_1m_dbm": powers.at_1m_dbm,
-        "antenna": powers.antenna,
-        "power_noise_db": powers.noise_db,
-        "sensitivity_dbm": min(Radio().sensitivity_dbm, float(flight.power_dbm.min()) - 1),
-        "skew_noise_ppm": clocks.carrier_std_ppm,
-        "skew_bias_ppm": clocks.carrier_bias_ppm,
-    }
-    if powers.exponent is not None:
-        found["path_loss_exponent"] = max(powers.exponent, 0.0)
-    if powers.saturation_dbm is not None:
-        found["saturation_dbm"] = powers.saturation_dbm
-    found["bias"] = known.bias.model_dump(mode="json")
-    found["rx_noise_ps"], noise = 0.0, fitted.noise
-    if len(noise.std_s) == 1:
-        found["rx_noise_ps"] = float(noise.std_s[0]) * 1e12
-    elif len(noise.std_s):
+    powers, clocks, schedule, noise = fitted.powers, fitted.clocks, fitted.schedule, fitted.noise
+    sigma, fading, outages = None, None, None
+    if len(noise.std_s) > 1:
         at = lifted(noise.power_dbm)
         # A range whose reply takes no time has c s / sqrt(2).
         spread = SPEED_OF_LIGHT * noise.std_s / np.sqrt(2)
-        found["sigma"] = {"knots": [at[0], *at.tolist(), at[-1]], "coefficients": spread.tolist(), "degree": 1}
-    multipath = _multipath(flight, fitted)
-    if multipath:
-        found["multipath"] = multipath
+        sigma = {"knots": [at[0], *at.tolist(), at[-1]], "coefficients": spread.tolist(), "degree": 1}
+    # Less fading moves no first path and hardly a bias.
     if powers.fading_db >= 0.1:
-        found["fading"] = {"levels_db": [float(level) for level in powers.fading_levels_db]}
-        if powers.fading_life_s is not None:
-            found["fading"]["life_s"] = max(powers.fading_life_s, SHORTEST_LIFE_S)
+        life_s = None if powers.fading_life_s is None else max(powers.fading_life_s, SHORTEST_LIFE_S)
+        fading = _given(levels_db=powers.fading_levels_db.tolist(), life_s=life_s)
     if schedule.lost_share > 0:
-        found["outages"] = {"share": schedule.lost_share, "life_s": schedule.outage_life_s()}
-    return found
+        outages = {"share": schedule.lost_share, "life_s": schedule.outage_life_s()}
+    return _given(
+        first_path_at_1m_dbm=powers.at_1m_dbm,
+        path_loss_exponent=None if powers.exponent is None else max(powers.exponent, 0.0),
+        antenna=powers.antenna,
+        power_noise_db=powers.noise_db,
+        saturation_dbm=powers.saturation_dbm,
+        sensitivity_dbm=min(Radio().sensitivity_dbm, float(flight.power_dbm.min()) - 1),
+        skew_noise_ppm=clocks.carrier_std_ppm,
+        skew_bias_ppm=clocks.carrier_bias_ppm,
+        bias=known.bias.model_dump(mode="json"),
+        rx_noise_ps=float(noise.std_s[0]) * 1e12 if len(noise.std_s) == 1 else 0.0,
+        sigma=sigma,
+        multipath=_multipath(flight, fitted),
+        fading=fading,
+        outages=outages,
+    )
 
 
-def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any]:
-    found, powers = fitted.errors, fitted.powers
+def _multipath(flight: Flight, fitted: Fitted) -> dict[str, Any] | None:
+    found, loss = fitted.errors, fitted.powers.reflection_loss_db
     if found.share < 0.002 and found.direct_std_m == 0:
-        return {}
-    loss = powers.reflection_loss_db
+        return None
     default = TwoStateMultipath(model="two-state")
-    table: dict[str, Any] = {
-        "model": "two-state",
-        "share": found.share,
-        "share_std": min(found.share_std, 0.9 * float(np.sqrt(found.share * (1 - found.share)))),
-        "mean_excess_m": found.mean_excess_m,
-        "excess_shape": found.excess_shape,
-        "direct_std_m": found.direct_std_m,
-        "life_s": default.life_s if found.life_s is None else max(found.life_s, SHORTEST_LIFE_S),
-        "life_spread": min(found.life_spread, 2.0),
-    }
-    shortest = flight.interval_s
-    if found.life_s is None and shortest < default.life_s:
-        table["life_s"] = max(shortest / 3, SHORTEST_LIFE_S)
-    if loss is not None:
-        table["first_path_loss_db"] = loss
-        table["loss_std_db"] = powers.reflection_loss_std_db
-        table["total_loss_db"] = min(default.total_loss_db, loss)
-    pairs = []
-    for k, pair in enumerate(flight.pairs):
-        own: dict[str, Any] = {}
-        if found.share_std > 0:
-            own["share"] = float(np.clip(found.pair_share[k], 0, 1))
-        if found.life_s is not None and found.life_spread > 0.1:
-            own["life_s"] = max(float(found.pair_life_s[k]), SHORTEST_LIFE_S)
-        if np.ptp(found.pair_excess_m) > 0:
-            own["mean_excess_m"] = float(found.pair_excess_m[k])
-        if own:
-            pairs.append({"tags": list(pair)} | own)
-    return table | ({"pairs": pairs} if pairs else {})
+    life_s, shortest = found.life_s, flight.interval_s
+    if life_s is None:
+        life_s = min(shortest / 3, default.life_s) if shortest < default.life_s else default.life_s
+    pairs = [
+        {"tags": list(pair)}
+        | _given(
+            share=float(np.clip(found.pair_share[k], 0, 1)) if found.share_std > 0 else None,
+            life_s=max(float(found.pair_life_s[k]), SHORTEST_LIFE_S) if found.life_spread > 0.1 else None,
+            mean_excess_m=float(found.pair_excess_m[k]) if np.ptp(found.pair_excess_m) > 0 else None,
+        )
+        for k, pair in enumerate(flight.pairs)
+    ]
+    return _given(
+        model="two-state",
+        share=found.share,
+        share_std=min(found.share_std, 0.9 * float(np.sqrt(found.share * (1 - found.share)))),
+        mean_excess_m=found.mean_excess_m,
+        excess_shape=found.excess_shape,
+        direct_std_m=found.direct_std_m,
+        life_s=max(life_s, SHORTEST_LIFE_S),
+        life_spread=min(found.life_spread, 2.0),
+        first_path_loss_db=loss,
+        loss_std_db=None if loss is None else fitted.powers.reflection_loss_std_db,
+        total_loss_db=None if loss is None else min(default.total_loss_db, loss),
+        pairs=[pair for pair in pairs if len(pair) > 1] or None,
+    )
 
 
 def _tag(flight: Flight, known: KnownDevices, fitted: Fitted, k: int) -> dict[str, Any]:
     tag, clocks, powers = flight.tags[k], fitted.clocks, fitted.powers
-    found: dict[str, Any] = {
-        "id": tag.tag,
-        "body": tag.body,
-        "lever_arm_m": list(tag.lever_arm_m),
-        "delay_ns": known.calibration.delays_ns[tag.tag] + fitted.errors.delays_ns[tag.tag],
-        "skew_ppm": float(np.clip(clocks.skew_ppm[k], -100, 100)),
-        "drift_ppm_per_sqrt_s": float(clocks.walk_ppm_per_sqrt_s[k]),
-        "tx_power_db": float(powers.tx_db[k]),
-        "power_offset_db": float(powers.offset_db[k]),
-    }
-    if clocks.warm_up_s is not None:
-        found |= {"warm_up_ppm": float(clocks.warm_up_ppm[k]), "warm_up_s": clocks.warm_up_s}
     pattern = powers.pattern_db[k]
-    return found | ({"pattern_db": [float(value) for value in pattern]} if np.any(pattern) else {})
+    return _given(
+        id=tag.tag,
+        body=tag.body,
+        lever_arm_m=list(tag.lever_arm_m),
+        delay_ns=known.calibration.delays_ns[tag.tag] + fitted.errors.delays_ns[tag.tag],
+        skew_ppm=float(np.clip(clocks.skew_ppm[k], -100, 100)),
+        drift_ppm_per_sqrt_s=float(clocks.walk_ppm_per_sqrt_s[k]),
+        tx_power_db=float(powers.tx_db[k]),
+        power_offset_db=float(powers.offset_db[k]),
+        warm_up_ppm=None if clocks.warm_up_s is None else float(clocks.warm_up_ppm[k]),
+        warm_up_s=clocks.warm_up_s,
+        pattern_db=pattern.tolist() if np.any(pattern) else None,
+    )
 
 
 def _bodies(flight: Flight, poses: Poses, duration_s: float) -> tuple[list[dict[str, Any]], dict[str, Any]]:

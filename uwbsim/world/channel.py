@@ -16,10 +16,10 @@ import numpy as np
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ParameterError, ScenarioError
-from uwbsim.scenario.bodies import Room, Shadow
+from uwbsim.scenario.bodies import Room
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.radio import TwoStateMultipath
-from uwbsim.world.diffraction import box_loss, ellipsoid_chord_m
+from uwbsim.world.diffraction import PlacedShadow, box_loss
 from uwbsim.world.geometric_responses import GeometricResponses
 from uwbsim.world.impulse_response import PathsHeard
 from uwbsim.world.pair_states import PairLevels, ReflectedStates
@@ -55,20 +55,6 @@ class Link:
         """Return the link with all of its paths weaker by a loss (n,)."""
         paths = None if self.paths_dbm is None else self.paths_dbm - loss_db[:, None]
         return replace(self, power_dbm=self.power_dbm - loss_db, total_dbm=self.total_dbm - loss_db, paths_dbm=paths)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlacedShadow:
-    """The shadow of a body, where the body is: centre (n, 3) in metres, rotation body to world (n, 3, 3)."""
-
-    shadow: Shadow
-    position_m: Floats
-    rotation: Floats
-
-    def loss_db(self, one: Floats, other: Floats) -> Floats:
-        """Return what the body takes away from segments (n, k or 1, 3) to (n, k, 3), in dB, (n, k)."""
-        a, b = ((spots - self.position_m[:, None]) @ self.rotation for spots in (one, other))
-        return ellipsoid_chord_m(self.shadow, a, b) * self.shadow.loss_db_per_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

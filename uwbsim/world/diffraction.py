@@ -87,9 +87,9 @@ def ellipsoid_chord_m(shadow: Shadow, a: Floats, b: Floats) -> Floats:
 
 def box_loss(obstacles: Sequence[Obstacle], a: Floats, b: Floats) -> tuple[Floats, Floats]:
     """Return loss in dB and excess length in metres of going straight through the obstacles, shape (n,) each."""
-    properties = np.array([o.properties() for o in obstacles])
+    materials = np.array([properties(o.material) for o in obstacles])
     chords = box_chords_m(obstacles, a, b)
-    return chords @ properties[:, 0], chords @ (properties[:, 1] - 1)
+    return chords @ materials[:, 0], chords @ (materials[:, 1] - 1)
 
 
 def edge_gain(nu: Floats) -> Floats:
@@ -359,3 +359,17 @@ def coupling(mirrors: Mirrors, axes: tuple[Floats, Floats], way: Floats, cosine:
     # Straight on the mirror there is no plane of incidence, and both coefficients are one.
     straight = s * ((one * other).sum(axis=0) - parts[0][2] * parts[1][2]) / (parts[0][3] * parts[1][3])
     return np.asarray(np.where(sine2 > AXIAL**2, split, straight))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacedShadow:
+    """The shadow of a body, where the body is: centre (n, 3) in metres, rotation body to world (n, 3, 3)."""
+
+    shadow: Shadow
+    position_m: Floats
+    rotation: Floats
+
+    def loss_db(self, one: Floats, other: Floats) -> Floats:
+        """Return what the body takes away from segments (n, k or 1, 3) to (n, k, 3), in dB, (n, k)."""
+        a, b = ((spots - self.position_m[:, None]) @ self.rotation for spots in (one, other))
+        return ellipsoid_chord_m(self.shadow, a, b) * self.shadow.loss_db_per_m

@@ -14,7 +14,7 @@ import numpy as np
 from uwblink.arrays import Bools, Complexes, Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.random_streams import stream
-from uwbsim.scenario.bodies import Shadow
+from uwbsim.scenario.bodies import properties
 from uwbsim.scenario.model import WAVELENGTH_M, Scenario
 from uwbsim.scenario.radio import GeometricMultipath
 from uwbsim.world.diffraction import (
@@ -22,6 +22,7 @@ from uwbsim.world.diffraction import (
     LIT,
     WAVENUMBER,
     Mirrors,
+    PlacedShadow,
     body_gain,
     box_chords_m,
     box_cover,
@@ -162,12 +163,9 @@ class Placed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlacedBody:
+class PlacedBody(PlacedShadow):
     """A body with a shadow at m instants: its centre (m, 3) and rotation (m, 3, 3); `carries` (tags,) says whom."""
 
-    shadow: Shadow
-    position_m: Floats
-    rotation: Floats
     carries: Bools
 
     def past(self, at: Ints, a: Floats, b: Floats) -> Floats:
@@ -337,7 +335,7 @@ def _inside_boxes(around: Surroundings, a: Floats, b: Floats) -> tuple[Floats, F
     boxes = around.scenario.obstacles
     thinnest = np.array([min(hi - lo for lo, hi in zip(box.min_m, box.max_m, strict=True)) for box in boxes])
     chords = np.maximum(box_chords_m(boxes, a, b), thinnest)
-    loss, index = np.array([box.properties() for box in boxes]).T
+    loss, index = np.array([properties(box.material) for box in boxes]).T
     return chords * loss, chords * (index - 1)
 
 

@@ -25,14 +25,10 @@ def profile_at(profile: Profile, time_s: Floats) -> Floats:
     return np.full(time_s.shape, profile.value)
 
 
-def temperature_of(scenario: Scenario, tag: Tag) -> Profile | None:
-    """Return the temperature of a tag, or of its body; None where it is not known."""
-    return tag.temperature_c or next(b.temperature_c for b in scenario.bodies if b.name == tag.body)
-
-
-def supply_of(scenario: Scenario, tag: Tag) -> Profile | None:
-    """Return the supply voltage of a tag, or of its body; None where it is not known."""
-    return tag.supply_v or next(b.supply_v for b in scenario.bodies if b.name == tag.body)
+def profile_of(scenario: Scenario, tag: Tag, key: str) -> Profile | None:
+    """Return the `temperature_c` or `supply_v` of a tag, or of its body; None where it is not known."""
+    found: Profile | None = getattr(tag, key)
+    return found or next(getattr(body, key) for body in scenario.bodies if body.name == tag.body)
 
 
 def own(tag: Tag, devices: Devices, name: str) -> float:
@@ -46,8 +42,8 @@ def lengthening_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None
     devices = scenario.devices
     total: Floats | None = None
     for profile, slope, reference in (
-        (temperature_of(scenario, tag), own(tag, devices, "range_mm_per_k") * 1e-3, devices.reference_c),
-        (supply_of(scenario, tag), own(tag, devices, "range_cm_per_v") * 1e-2, devices.reference_v),
+        (profile_of(scenario, tag, "temperature_c"), own(tag, devices, "range_mm_per_k") * 1e-3, devices.reference_c),
+        (profile_of(scenario, tag, "supply_v"), own(tag, devices, "range_cm_per_v") * 1e-2, devices.reference_v),
     ):
         if profile is not None and slope:
             part = slope * (profile_at(profile, time_s) - reference)
@@ -58,7 +54,7 @@ def lengthening_m(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats | None
 def thermal_rate(scenario: Scenario, tag: Tag, time_s: Floats) -> Floats:
     """Return what temperature and warm-up add to the rate of a tag's clock at times (n,), as a fraction."""
     rate = tag.warm_up_ppm * 1e-6 * np.exp(-time_s / tag.warm_up_s)
-    profile, slope = temperature_of(scenario, tag), own(tag, scenario.devices, "skew_ppm_per_k")
+    profile, slope = profile_of(scenario, tag, "temperature_c"), own(tag, scenario.devices, "skew_ppm_per_k")
     if profile is not None and slope:
         rate = rate + slope * 1e-6 * (profile_at(profile, time_s) - scenario.devices.reference_c)
     return np.asarray(rate)
@@ -74,7 +70,7 @@ def readings(scenario: Scenario) -> Columns:
     noises = devices.reading_noise_k, devices.reading_noise_v
     parts: list[Columns] = []
     for tag in scenario.tags:
-        profiles = temperature_of(scenario, tag), supply_of(scenario, tag)
+        profiles = profile_of(scenario, tag, "temperature_c"), profile_of(scenario, tag, "supply_v")
         if any(profile is not None for profile in profiles):
             drawn = stream(scenario.run.seed, "temperature readings", tag.id).normal(size=(2, len(time_s)))
             read = [

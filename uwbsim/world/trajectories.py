@@ -24,24 +24,13 @@ Draw = Callable[[str], np.random.Generator]
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """A body's path: `position` maps seconds (n,) to metres (n, 3), `angles` to yaw, pitch, roll.
+    """A body's path at seconds (n,): positions (n, 3) in metres in the world frame (ENU), attitudes body to world.
 
-    Where `attitude` is given, it maps seconds to quaternions instead of `angles`.
+    Attitudes are quaternions x y z w, (n, 4).
     """
 
-    position: Callable[[Floats], Floats]
-    angles: Callable[[Floats], Floats]
-    attitude: Callable[[Floats], Floats] | None = None
-
-    def position_m(self, time_s: Floats) -> Floats:
-        """Return r_iw_a, shape (n, 3), in the world frame (ENU)."""
-        return self.position(time_s)
-
-    def quaternion(self, time_s: Floats) -> Floats:
-        """Return the attitude (body to world) as quaternions x y z w, shape (n, 4)."""
-        if self.attitude is not None:
-            return self.attitude(time_s)
-        return _quaternions(self.angles(time_s))
+    position_m: Callable[[Floats], Floats]
+    quaternion: Callable[[Floats], Floats]
 
     def pose(self, time_s: Floats) -> tuple[Floats, Floats]:
         """Return positions (n, 3) and rotations body to world (n, 3, 3)."""
@@ -53,7 +42,7 @@ class Trajectory:
 
     def point_m(self, time_s: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
         """Return where a point of the body is, shape (n, 3)."""
-        return np.asarray(self.position(time_s) + Rotation.from_quat(self.quaternion(time_s)).apply(lever_arm_m))
+        return np.asarray(self.position_m(time_s) + Rotation.from_quat(self.quaternion(time_s)).apply(lever_arm_m))
 
 
 def _quaternions(angles: Floats) -> Floats:
@@ -87,7 +76,7 @@ def _static(motion: Static, _duration_s: float, _draw: Draw) -> Trajectory:
     yaw = np.array([np.radians(motion.yaw_deg), 0.0, 0.0])
     return Trajectory(
         lambda t: np.broadcast_to(point, (len(t), 3)).copy(),
-        lambda t: np.broadcast_to(yaw, (len(t), 3)).copy(),
+        lambda t: _quaternions(np.broadcast_to(yaw, (len(t), 3))),
     )
 
 
@@ -117,7 +106,7 @@ def _waypoints(motion: Waypoints, _duration_s: float, _draw: Draw) -> Trajectory
 
 
 def _level(time_s: Floats) -> Floats:
-    return np.zeros((len(time_s), 3))
+    return _quaternions(np.zeros((len(time_s), 3)))
 
 
 def _straight(points: Floats, speed: float, acceleration: float) -> Callable[[Floats], Floats]:
@@ -154,11 +143,11 @@ def _figure(motion: Figure, _duration_s: float, _draw: Draw) -> Trajectory:
         height = 0.5 * motion.climb_m * np.sin(slow)
         return np.asarray(centre + np.column_stack([radius * np.cos(angle), radius * sideways, height]))
 
-    def angles(time_s: Floats) -> Floats:
+    def turning(time_s: Floats) -> Floats:
         yaw = 2 * np.pi * motion.turns_per_period * time_s / motion.period_s
-        return np.column_stack([yaw, np.zeros((len(time_s), 2))])
+        return _quaternions(np.column_stack([yaw, np.zeros((len(time_s), 2))]))
 
-    return Trajectory(position, angles)
+    return Trajectory(position, turning)
 
 
 def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
@@ -168,7 +157,6 @@ def _recorded(motion: Recorded, _duration_s: float, _draw: Draw) -> Trajectory:
     turns = Slerp(times, Rotation.from_quat(np.array(motion.quaternions)))
     return Trajectory(
         lambda t: np.asarray(path(np.clip(t, times[0], times[-1]))),
-        _level,
         lambda t: np.asarray(turns(np.clip(t, times[0], times[-1])).as_quat()),
     )
 
@@ -189,7 +177,8 @@ def _random_flight(motion: RandomFlight, duration_s: float, draw: Draw) -> Traje
     # A little after the end, where the last exchange may still be under way, the body holds its place.
     last_s = duration_s + leg_s
     return Trajectory(
-        lambda t: np.asarray(path(np.minimum(t, last_s))), lambda t: np.asarray(angles(np.minimum(t, last_s)))
+        lambda t: np.asarray(path(np.minimum(t, last_s))),
+        lambda t: _quaternions(np.asarray(angles(np.minimum(t, last_s)))),
     )
 
 

@@ -16,8 +16,9 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
-from uwbsim.world.channel import Ends, Link, PlacedShadow, link_between, paths_heard
+from uwbsim.world.channel import Ends, Link, link_between, paths_heard
 from uwbsim.world.clocks import NS_PER_S, SUBTICKS_PER_SECOND
+from uwbsim.world.diffraction import PlacedShadow
 from uwbsim.world.geometric_responses import GeometricResponses
 from uwbsim.world.impulse_response import PathsHeard, Waves
 from uwbsim.world.pair_states import PairLevels, ReflectedStates

@@ -2,12 +2,12 @@
 
 import gc
 import sys
+from collections import deque
 
 import uwblink
 import uwbsim
 from uwblink.boards.record import identify
 from uwblink.boards.recorder import Recorder
-from uwbsim.boards import virtual_port
 
 WARM, LATER = 200, 700
 
@@ -20,10 +20,11 @@ def two_boards():
     return uwbsim.VirtualPorts(uwbsim.load(scenario))
 
 
-def test_nothing_grows_with_what_boards_sent(monkeypatch):
-    monkeypatch.setattr(virtual_port, "MOST_TRANSFERS", 50)
+def test_nothing_grows_with_what_boards_sent():
     held: list[tuple[int, int]] = []
     ports = two_boards()
+    assert ports.transfers.maxlen
+    ports.transfers = deque(maxlen=50)
     found = identify(ports.names.values(), ports)
     plan = uwblink.RangingPlan(rate_hz=100.0)
     recorder = Recorder(found, plan, plan.turns(sorted(found)), [], ports=ports)

@@ -9,6 +9,7 @@ import pytest
 
 from tests import processes
 from uwblink.protocols.table import PROTOCOLS
+from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.protocols.comparison import compare, costs, optimum, over_reply, over_skew, winners
 from uwbsim.protocols.conditions import calibrated, conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
