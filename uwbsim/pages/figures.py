@@ -19,6 +19,7 @@ from uwblink.protocols.rows import RangingProtocol
 from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import TICK_S
 from uwbsim.protocols.comparison import ErrorCurve, Optimum
+from uwbsim.protocols.conditions import interval_stamps
 from uwbsim.random_streams import stream
 from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import after_marker_s, before_marker_s, message_bytes
@@ -248,12 +249,10 @@ def _draw_spans(
 
     dt53 is the third leg as its sender has it, dt64 as its receiver.
     """
-    spans = [("dt41", "tx1", "rx2", True), ("dt32", "rx1", "tx2", False)]
-    if len(protocol.messages) == 3:
-        sent_by_initiator = protocol.messages[2].sender == "initiator"
-        sender, receiver = ("rx2", "tx2") if sent_by_initiator else ("tx2", "rx2")
-        spans += [("dt53", sender, "tx3", sent_by_initiator), ("dt64", receiver, "rx3", not sent_by_initiator)]
-    for name, first, second, above in spans:
+    for name, (second, first) in interval_stamps(protocol).items():
+        # The initiator's intervals stand above.
+        sends = protocol.messages[int(first[2]) - 1].sender == "initiator"
+        above = sends == first.startswith("tx")
         length_us = (int(stamped.stamps[second][0]) - int(stamped.stamps[first][0])) * TICK_S * 1e6
         left, right = (times_us[int(end[-1]) - 1] for end in (first, second))
         level = 0.62 if above else 0.38

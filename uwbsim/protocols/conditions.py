@@ -18,10 +18,9 @@ from uwbsim.scenario.model import Scenario
 from uwbsim.scenario.ranging import before_marker_s
 from uwbsim.simulation.air import schedule
 from uwbsim.simulation.timestamps import draw_reply_s
-from uwbsim.world.antenna_delays import AntennaDelays
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, WALK_STEP_S, Clocks
 from uwbsim.world.radio import carrier_bias_ppm
-from uwbsim.world.reception import arrive
+from uwbsim.world.reception import AntennaDelays, arrive
 from uwbsim.world.world import World
 
 STATES: Final = 16_384
@@ -117,6 +116,19 @@ def chosen(protocols: Protocols | None, parameter: str = "protocols") -> list[Ra
     if not rows:
         raise ParameterError(f"found none, allowed: {', '.join(PROTOCOLS)}", parameter=parameter)
     return list(rows.values())
+
+
+def interval_stamps(protocol: RangingProtocol) -> dict[str, tuple[str, str]]:
+    """Return the two stamps that each interval of a protocol lies between, the later one first.
+
+    dt41 is the initiator's round trip and dt32 the target's reply; dt53 is the third leg as its sender has it, dt64 as
+    its receiver.
+    """
+    found = {"dt41": ("rx2", "tx1"), "dt32": ("tx2", "rx1")}
+    if len(protocol.messages) == 3:
+        ends = ("tx2", "rx2") if protocol.messages[2].sender == "target" else ("rx2", "tx2")
+        found |= {"dt53": ("tx3", ends[0]), "dt64": ("rx3", ends[1])}
+    return found
 
 
 def conditions_of(scenario: Scenario, count: int = STATES) -> Conditions:

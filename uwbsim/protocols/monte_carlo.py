@@ -16,7 +16,7 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.protocols.rows import Intervals, ProtocolMessage, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, TICK_S
-from uwbsim.protocols.conditions import STATES, Conditions
+from uwbsim.protocols.conditions import STATES, Conditions, interval_stamps
 from uwbsim.random_streams import stream
 from uwbsim.world.clocks import RATE_SPAN_S
 
@@ -221,10 +221,5 @@ def _intervals(
     carrier = c.carrier_ppm + c.carrier_sign * carrier_noise
     if draws.carrier is not None:
         carrier = carrier + draws.carrier * c.carrier_std_ppm
-    none = c.flight
-    dt53 = dt64 = none
-    if len(protocol.messages) == 3:
-        from_target = protocol.messages[2].sender == "target"
-        dt53 = stamps["tx3"] - stamps["tx2" if from_target else "rx2"]
-        dt64 = stamps["rx3"] - stamps["rx2" if from_target else "tx2"]
-    return Intervals(stamps["rx2"] - stamps["tx1"], stamps["tx2"] - stamps["rx1"], dt53, dt64, carrier)
+    spans = {name: stamps[later] - stamps[earlier] for name, (later, earlier) in interval_stamps(protocol).items()}
+    return Intervals(**({"dt53": c.flight, "dt64": c.flight} | spans), carrier_ppm=carrier)

@@ -17,7 +17,7 @@ from uwblink.arrays import Floats
 from uwblink.protocols.rows import Intervals, RangingProtocol
 from uwblink.ticks import ANTENNA_DELAY_TICKS, DELAYED_TX_GRID, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwbsim.errors import ParameterError
-from uwbsim.protocols.conditions import Conditions, chosen
+from uwbsim.protocols.conditions import Conditions, chosen, interval_stamps
 from uwbsim.scenario.devices import TX_SHARE
 from uwbsim.world.clocks import RATE_SPAN_S
 
@@ -100,22 +100,22 @@ def _noiseless(protocol: RangingProtocol, c: Conditions) -> tuple[Intervals, tup
         leave.append(since + true)
         arrive.append(leave[k] + way + c.flight_rate * leave[k])
 
-    def read(side: str, later: Floats, earlier: Floats) -> Floats:
-        return (1 + rate[side]) * (later - earlier) + drift[side] / 2 * (later**2 - earlier**2)
+    def stamp(name: str) -> tuple[str, Floats, Floats]:
+        """Return whose stamp it is, its true time, and what antenna and power add to it."""
+        k, sent = int(name[2]) - 1, name.startswith("tx")
+        side = protocol.messages[k].sender
+        if sent:
+            return side, leave[k], tx[side]
+        other = "target" if side == "initiator" else "initiator"
+        return other, arrive[k], rx[other]
 
-    i, j = "initiator", "target"
-    dt41 = read(i, arrive[1], leave[0]) + rx[i] - tx[i]
-    dt32 = read(j, leave[1], arrive[0]) + tx[j] - rx[j]
-    dt53 = dt64 = np.ones(len(c))
-    if len(protocol.messages) == 3:
-        if protocol.messages[2].sender == j:
-            dt53 = read(j, leave[2], leave[1])
-            dt64 = read(i, arrive[2], arrive[1])
-        else:
-            dt53 = read(i, leave[2], arrive[1]) + tx[i] - rx[i]
-            dt64 = read(j, arrive[2], leave[1]) + rx[j] - tx[j]
+    spans = {"dt53": np.ones(len(c)), "dt64": np.ones(len(c))}
+    for name, ends in interval_stamps(protocol).items():
+        (owner, later, added), (_, earlier, early) = map(stamp, ends)
+        true = (1 + rate[owner]) * (later - earlier) + drift[owner] / 2 * (later**2 - earlier**2)
+        spans[name] = (true + added - early) * ticks
     carrier = c.carrier_sign * (c.rate_initiator - c.rate_target) * 1e6 + c.carrier_bias_ppm
-    return Intervals(dt41 * ticks, dt32 * ticks, dt53 * ticks, dt64 * ticks, carrier), (leave, arrive)
+    return Intervals(**spans, carrier_ppm=carrier), (leave, arrive)
 
 
 def _reply_s(protocol: RangingProtocol, k: int, c: Conditions) -> Floats:
@@ -141,13 +141,8 @@ def _slopes(protocol: RangingProtocol, spans: Intervals) -> Iterator[tuple[str, 
 
 def _by_stamp(protocol: RangingProtocol, slopes: dict[str, Floats]) -> dict[str, Floats]:
     """Return the derivative of the flight by the error of each stamp."""
-    # Which stamps an interval is made of, the later first: their errors enter so.
-    parts = {"dt41": ("rx2", "tx1"), "dt32": ("tx2", "rx1")}
-    if len(protocol.messages) == 3:
-        from_target = protocol.messages[2].sender == "target"
-        parts |= {"dt53": ("tx3", "tx2" if from_target else "rx2"), "dt64": ("rx3", "rx2" if from_target else "tx2")}
     found: dict[str, Floats] = {}
-    for interval, (later, earlier) in parts.items():
+    for interval, (later, earlier) in interval_stamps(protocol).items():
         found[later] = found.get(later, 0.0) + slopes[interval]
         found[earlier] = found.get(earlier, 0.0) - slopes[interval]
     return found

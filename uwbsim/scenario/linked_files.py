@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -23,16 +23,6 @@ from uwbsim.errors import ScenarioError
 
 MOST_POSES: Final = 200_000
 
-MODELS: Final = {
-    "antenna": None,
-    "plan": None,
-    "group_delay": "table",
-    "motion": "recorded",
-    "temperature_c": "table",
-    "supply_v": "table",
-}
-"""Keys whose tables can name a file, and of which model these tables are then."""
-
 Folders = Iterable[str | os.PathLike[str]]
 
 
@@ -44,29 +34,22 @@ def fill_in(table: dict[str, Any], scenario: Path, folders: Folders = ()) -> Non
     folders = tuple(folders)
     for name in ("radio", "ranging", "bodies", "tags"):
         section = table.get(name)
-        tables: list[tuple[int, Any]] = [*enumerate(section)] if isinstance(section, list) else [(-1, section)]
-        for k, one in tables:
+        tables: list[tuple[str, Any]] = [(name, section)]
+        if isinstance(section, list):
+            tables = [(f"{name}[{k}]", one) for k, one in enumerate(section)]
+        for place, one in tables:
             for key, named in [*one.items()] if isinstance(one, dict) else ():
-                if key not in MODELS or not isinstance(named, dict) or "file" not in named:
+                model, read = READERS.get(key, (None, None))
+                if read is None or not isinstance(named, dict) or "file" not in named or named.get("model") != model:
                     continue
-                if named.get("model") != MODELS[key]:
-                    continue
-                where = f"{scenario}: {name}{f'[{k}]' if k >= 0 else ''}.{key}.file"
+                where = f"{scenario}: {place}.{key}.file"
                 if not isinstance(named["file"], str):
                     raise ScenarioError(f"{where}: found {named['file']!r}, expected the name of a file")
                 path = scenario.parent / named["file"]
                 path = check_linked(path, f"{where}: found {named['file']!r}", scenario.parent, folders)
-                if key == "antenna":
-                    one[key] = _grid(path, "gain_db")
-                elif key == "group_delay":
-                    named |= _grid(path, "delay_cm")
-                elif key == "plan":
-                    named["slots"] = _plan(path)
-                elif key == "motion":
-                    named |= _trajectory(path, named.get("body"), _duration(table))
-                else:
-                    rows = _rows(path, ("time_s", key))
-                    named |= {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
+                held = read(path, key, named, _duration(table))
+                # A table of antenna gains has no key of its own for its file.
+                one[key] = held if key == "antenna" else named | held
 
 
 def check_linked(path: Path, where: str, beside: Path, folders: Folders) -> Path:
@@ -147,14 +130,20 @@ def _grid(path: Path, name: str) -> dict[str, Any]:
     }
 
 
-def _plan(path: Path) -> list[tuple[float, int, int]]:
+def _plan(path: Path, *_: Any) -> dict[str, Any]:
     rows = _rows(path, ("time_s", "initiator", "target"))
     if not rows:
         raise ScenarioError(f"{path}: a plan without slots")
-    return [(row[0], int(row[1]), int(row[2])) for row in rows]
+    return {"slots": [(row[0], int(row[1]), int(row[2])) for row in rows]}
 
 
-def _trajectory(path: Path, body: str | None, duration_s: float) -> dict[str, Any]:
+def _profile(path: Path, key: str, *_: Any) -> dict[str, Any]:
+    rows = _rows(path, ("time_s", key))
+    return {"times_s": [row[0] for row in rows], "values": [row[1] for row in rows]}
+
+
+def _trajectory(path: Path, _key: str, named: Mapping[str, Any], duration_s: float) -> dict[str, Any]:
+    body = named.get("body")
     try:
         if path.suffix == ".uwb":
             with Recording.open(path) as recording:
@@ -187,3 +176,17 @@ def _of_body(path: Path, poses: Poses, body: str | None) -> Poses:
         raise ScenarioError(f"{path}: found body {body!r}, the file has {', '.join(names) or 'none'}")
     rows = np.flatnonzero(poses.body == body)[:MOST_POSES]
     return Poses(poses.time_ns[rows], poses.body[rows], poses.position_m[rows], poses.quaternion[rows])
+
+
+READERS: Final[dict[str, tuple[str | None, Callable[[Path, str, Mapping[str, Any], float], dict[str, Any]]]]] = {
+    "antenna": (None, lambda path, *_: _grid(path, "gain_db")),
+    "plan": (None, _plan),
+    "group_delay": ("table", lambda path, *_: _grid(path, "delay_cm")),
+    "motion": ("recorded", _trajectory),
+    "temperature_c": ("table", _profile),
+    "supply_v": ("table", _profile),
+}
+"""Keys whose tables can name a file, of which model these tables are then, and what the file holds.
+
+Readers are called with the file, the key, its table, and the duration of the run in seconds.
+"""

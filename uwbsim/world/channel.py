@@ -8,7 +8,7 @@ segments from `a` (n, 3) to `b` (n, 3), metres.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from typing import Final
 
 import numpy as np
@@ -47,8 +47,7 @@ class Link:
 
     def __getitem__(self, rows: Ints) -> Link:
         """Return the chosen links."""
-        names = ("distance_m", "excess_m", "power_dbm", "total_dbm", "paths_m", "paths_dbm", "noise_s")
-        columns = {name: getattr(self, name) for name in names}
+        columns = {column.name: getattr(self, column.name) for column in fields(self)}
         return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
     def weaker(self, loss_db: Floats) -> Link:

@@ -13,8 +13,8 @@ from uwblink.ticks import SPEED_OF_LIGHT
 from uwbsim.errors import ScenarioError
 from uwbsim.protocols.conditions import conditions_of
 from uwbsim.protocols.monte_carlo import range_errors_m
-from uwbsim.world.antenna_delays import AntennaDelays
 from uwbsim.world.clocks import SUBTICKS_PER_SECOND, Clocks
+from uwbsim.world.reception import AntennaDelays
 
 TYPICAL = {"range_mm_per_k": 2.15, "range_cm_per_v": 5.35}
 WARM = {"model": "warm-up", "start": 23.0, "end": 43.0, "time_constant_s": 5.0}
