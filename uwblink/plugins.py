@@ -22,6 +22,25 @@ NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
 """What a row can be called: people type it, and it stands in files."""
 
 
+def check_row(kind: str, row: Any, of: type[Any], fields: Mapping[str, tuple[Callable[[Any], object], str]]) -> None:
+    """Raise `ArgumentError` for a row that is not `of` a class, or has a field that is not as it must be.
+
+    `fields` has a test of each field and what is expected, beside the name, which must be a word.
+    """
+    if not isinstance(row, of):
+        raise ArgumentError(f"{kind}: found {row!r:.60}, expected a {of.__name__}")
+    named = {"name": (lambda name: isinstance(name, str) and NAME.fullmatch(name), "a word such as 'ds-alt'")}
+    for field, (is_good, expected) in (named | dict(fields)).items():
+        value = getattr(row, field)
+        if not is_good(value):
+            raise ArgumentError(f"{kind} {row.name!r:.60}: {field}: found {value!r:.60}, expected {expected}")
+
+
+def is_text(value: Any) -> bool:
+    """Whether a value is text that is not empty."""
+    return isinstance(value, str) and bool(value)
+
+
 class Named(Protocol):
     """What a row of a table needs: the name that people choose it by."""
 

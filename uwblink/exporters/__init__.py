@@ -13,7 +13,7 @@ from uwblink.exporters.mcap import write_mcap
 from uwblink.exporters.rosbag2 import write_rosbag2
 from uwblink.exporters.tables import write_csv, write_parquet, write_tum
 from uwblink.output import place_beside, take_name
-from uwblink.plugins import NAME, Registry
+from uwblink.plugins import Registry, check_row
 from uwblink.recording.intake import check_name
 
 
@@ -32,23 +32,21 @@ class Exporter:
 
 def check_exporter(row: Any) -> None:
     """Raise `ArgumentError` for a row that cannot be an exporter."""
-    if not isinstance(row, Exporter):
-        raise ArgumentError(f"exporter: found {row!r:.60}, expected an Exporter")
-    if not isinstance(row.name, str) or not NAME.fullmatch(row.name):
-        raise ArgumentError(f"exporter: name: found {row.name!r:.60}, expected a word such as 'csv'")
-    if not callable(row.write):
-        raise ArgumentError(f"exporter {row.name!r}: write: found {row.write!r:.60}, expected a function of two paths")
+    check_row("exporter", row, Exporter, {"write": (callable, "a function of two paths")})
 
 
-_OWN: Final = (
-    Exporter("csv", write_csv, "a CSV file a table"),
-    Exporter("parquet", write_parquet, "a Parquet file a table"),
-    Exporter("tum", write_tum, "a trajectory a body (time x y z qx qy qz qw)"),
-    Exporter("mcap", write_mcap, "one file of JSON messages, for Foxglove and PlotJuggler"),
-    Exporter("rosbag2", write_rosbag2, "a bag of ROS 2: PoseStamped, tf, sensor_msgs/Range and Imu"),
+EXPORTERS: Final[Registry[Exporter]] = Registry(
+    "exporter",
+    "uwbcal.exporters",
+    (
+        Exporter("csv", write_csv, "a CSV file a table"),
+        Exporter("parquet", write_parquet, "a Parquet file a table"),
+        Exporter("tum", write_tum, "a trajectory a body (time x y z qx qy qz qw)"),
+        Exporter("mcap", write_mcap, "one file of JSON messages, for Foxglove and PlotJuggler"),
+        Exporter("rosbag2", write_rosbag2, "a bag of ROS 2: PoseStamped, tf, sensor_msgs/Range and Imu"),
+    ),
+    check_exporter,
 )
-
-EXPORTERS: Final[Registry[Exporter]] = Registry("exporter", "uwbcal.exporters", _OWN, check_exporter)
 """Exporters by name: the project's, those of `register_exporter`, and those of installed distributions."""
 
 

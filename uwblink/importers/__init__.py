@@ -20,7 +20,7 @@ from uwblink.importers.miluv import read_miluv
 from uwblink.importers.poses import add_poses
 from uwblink.importers.staging import Watch
 from uwblink.output import check_output
-from uwblink.plugins import NAME, Registry
+from uwblink.plugins import Registry, check_row, is_text
 from uwblink.recording.contents import Contents
 
 __all__ = [
@@ -66,20 +66,20 @@ class Importer:
 
 def check_importer(row: Any) -> None:
     """Raise `ArgumentError` for a row that cannot be an importer."""
-    if not isinstance(row, Importer):
-        raise ArgumentError(f"importer: found {row!r:.60}, expected an Importer")
-    if not isinstance(row.name, str) or not NAME.fullmatch(row.name):
-        raise ArgumentError(f"importer: name: found {row.name!r:.60}, expected a word such as 'csv'")
-    where = f"importer {row.name!r}"
-    if not isinstance(row.suffixes, tuple) or not all(isinstance(s, str) and s[:1] == "." for s in row.suffixes):
-        raise ArgumentError(
-            f"{where}: suffixes: found {row.suffixes!r:.60}, expected a tuple such as ('.csv', '.csv.gz')"
-        )
-    if not callable(row.read):
-        raise ArgumentError(f"{where}: read: found {row.read!r:.60}, expected a function of a path and a map's path")
-    for name in ("help", *(["map_help"] if row.map_help is not None else [])):
-        if not isinstance(getattr(row, name), str) or not getattr(row, name):
-            raise ArgumentError(f"{where}: {name}: found {getattr(row, name)!r:.60}, expected a line of text")
+    check_row(
+        "importer",
+        row,
+        Importer,
+        {
+            "suffixes": (
+                lambda found: isinstance(found, tuple) and all(isinstance(s, str) and s[:1] == "." for s in found),
+                "a tuple such as ('.csv', '.csv.gz')",
+            ),
+            "read": (callable, "a function of a path and a map's path"),
+            "help": (is_text, "a line of text"),
+            "map_help": (lambda found: found is None or is_text(found), "a line of text"),
+        },
+    )
 
 
 def read_tables(sources: Sequence[Path], map_file: Path | None = None) -> Contents:
@@ -98,35 +98,38 @@ def _read_bag(source: Path, map_file: Path | None = None) -> Contents:
         return found.contents()
 
 
-_OWN: Final = (
-    Importer(
-        "csv",
-        TABLE_SUFFIXES,
-        read_table,
-        "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
-        map_help="Names, units and constants (.toml).",
-        read_all=read_tables,
-        open_all=open_tables,
+IMPORTERS: Final[Registry[Importer]] = Registry(
+    "importer",
+    "uwbcal.importers",
+    (
+        Importer(
+            "csv",
+            TABLE_SUFFIXES,
+            read_table,
+            "Import exchanges, messages or ranges from a table: CSV, Parquet or JSON lines.",
+            map_help="Names, units and constants (.toml).",
+            read_all=read_tables,
+            open_all=open_tables,
+        ),
+        Importer(
+            "bag",
+            BAG_SUFFIXES,
+            _read_bag,
+            "Import exchanges from messages in a bag of ROS 1, ROS 2 or MCAP.",
+            map_help="Topics, names of fields, units and constants (.toml).",
+            open_all=open_exchange_bag,
+        ),
+        Importer("exported", (), read_exported, "Import a folder that 'uwblink export' wrote as CSV or Parquet."),
+        Importer(
+            "miluv",
+            (),
+            read_miluv,
+            "Import the folder of a flight of the MILUV dataset.",
+            map_help='Which anchors of anchors.yaml (.toml: constellation = "0").',
+        ),
     ),
-    Importer(
-        "bag",
-        BAG_SUFFIXES,
-        _read_bag,
-        "Import exchanges from messages in a bag of ROS 1, ROS 2 or MCAP.",
-        map_help="Topics, names of fields, units and constants (.toml).",
-        open_all=open_exchange_bag,
-    ),
-    Importer("exported", (), read_exported, "Import a folder that 'uwblink export' wrote as CSV or Parquet."),
-    Importer(
-        "miluv",
-        (),
-        read_miluv,
-        "Import the folder of a flight of the MILUV dataset.",
-        map_help='Which anchors of anchors.yaml (.toml: constellation = "0").',
-    ),
+    check_importer,
 )
-
-IMPORTERS: Final[Registry[Importer]] = Registry("importer", "uwbcal.importers", _OWN, check_importer)
 """Importers by name: the project's, those of `register_importer`, and those of installed distributions."""
 
 

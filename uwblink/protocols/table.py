@@ -10,16 +10,9 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.errors import ArgumentError
-from uwblink.plugins import NAME, Registry
+from uwblink.plugins import Registry, check_row, is_text
 from uwblink.protocols import rows
 from uwblink.protocols.rows import Intervals, ProtocolMessage, RangingProtocol
-
-_COURSE: Final = (
-    (("initiator", ""),),
-    (("target", "rx1"),),
-    (("target", "tx2"), ("initiator", "rx2")),
-)
-"""Who may send each message of an exchange, and after which stamp: that is what dt41 to dt64 are made of."""
 
 
 def _own_rows() -> tuple[RangingProtocol, ...]:
@@ -59,7 +52,7 @@ def _own_rows() -> tuple[RangingProtocol, ...]:
     )
 
 
-ON_BOARDS: Final = ("ss", "ds")
+ON_BOARDS: Final = ("ds", "ss")
 """The protocols that the boards' firmware executes."""
 
 
@@ -69,16 +62,14 @@ def check_protocol(row: RangingProtocol) -> None:
     Its messages are two or three, of the order that the stamps of a recording have; and its formulas, tried on two
     exchanges without noise or skew, find the time of flight exactly, and take an antenna delay on either side out.
     """
-    if not isinstance(row, RangingProtocol):
-        raise ArgumentError(f"protocol: found {row!r:.60}, expected a RangingProtocol")
-    if not isinstance(row.name, str) or not NAME.fullmatch(row.name):
-        raise ArgumentError(f"protocol: name: found {row.name!r:.60}, expected a word such as 'ds-alt'")
-    if not isinstance(row.title, str) or not row.title:
-        raise ArgumentError(f"protocol {row.name!r}: title: found {row.title!r:.60}, expected what pages call it")
-    if not isinstance(row.messages, tuple) or not all(isinstance(m, ProtocolMessage) for m in row.messages):
-        raise ArgumentError(
-            f"protocol {row.name!r}: messages: found {row.messages!r:.60}, expected a tuple of ProtocolMessage"
-        )
+    formula = (callable, "a function of Intervals")
+    is_messages = (
+        lambda found: isinstance(found, tuple) and all(isinstance(m, ProtocolMessage) for m in found),
+        "a tuple of ProtocolMessage",
+    )
+    title = (is_text, "what pages call it")
+    fields = {"title": title, "messages": is_messages, "flight_ticks": formula, "delay_weights": formula}
+    check_row("protocol", row, RangingProtocol, fields)
     _check_messages(row)
     _check_formulas(row)
 
@@ -91,7 +82,9 @@ def _check_messages(row: RangingProtocol) -> None:
             f"{where}: found {len(messages)}, expected 2 or 3: an exchange is recorded with the six stamps of three "
             "messages, and one message alone measures no round trip"
         )
-    for number, (message, allowed) in enumerate(zip(messages, _COURSE, strict=False), start=1):
+    # Who may send each message, and after which stamp: that is what dt41 to dt64 are made of.
+    course = ([("initiator", "")], [("target", "rx1")], [("target", "tx2"), ("initiator", "rx2")])
+    for number, (message, allowed) in enumerate(zip(messages, course, strict=False), start=1):
         if (message.sender, message.after) not in allowed:
             choices = " or ".join(f"from the {sender} after {after or 'nothing'}" for sender, after in allowed)
             raise ArgumentError(
@@ -104,9 +97,6 @@ def _check_messages(row: RangingProtocol) -> None:
 def _check_formulas(row: RangingProtocol) -> None:
     """Raise `ArgumentError` for formulas that are not exact for exchanges without noise, or leave antenna delays in."""
     where, tried = f"protocol {row.name!r}", np.array([1000.0, 4000.0])
-    for name in ("flight_ticks", "delay_weights"):
-        if not callable(getattr(row, name)):
-            raise ArgumentError(f"{where}: {name}: found {getattr(row, name)!r:.60}, expected a function of Intervals")
     for delays in ((0.0, 0.0), (64.0, 0.0), (0.0, 64.0)):
         spans = _tried(tried, row.third_sender, delays)
         try:
