@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from typing import Final, Self, TypeVar
+from typing import Self, TypeVar
 
 from uwblink.boards.connection import ANSWER_S, FENCE, QUIET_TARGET_S, Connection
 from uwblink.boards.ports import SerialPort, Transport
 from uwblink.closing import Closing
 from uwblink.errors import BoardError, NoAnswerError, RefusedError
+from uwblink.protocols.table import ON_BOARDS
 from uwblink.wire.codec import Event
 from uwblink.wire.messages import (
     Bootloader,
@@ -35,9 +36,6 @@ from uwblink.wire.messages import (
     Skipped,
     TestsDone,
 )
-
-PROTOCOL_FLAGS: Final = {"ss": False, "ds": True}
-"""The protocols of the boards, and their flag in C05."""
 
 Reply = TypeVar("Reply", bound=Message)
 
@@ -123,11 +121,11 @@ class Board(Closing):
         With both `target_reports` and `get_cir` it returns when the target has printed its impulse response, too, so
         that neither board is asked something meanwhile, which would damage what it prints.
         """
-        if protocol not in PROTOCOL_FLAGS:
-            raise RefusedError(f"protocol {protocol!r}: the boards know {' and '.join(PROTOCOL_FLAGS)}")
+        if protocol not in ON_BOARDS:
+            raise RefusedError(f"protocol {protocol!r}: the boards know {' and '.join(ON_BOARDS)}")
         if self._id is not None and target == self._id:
             raise RefusedError(f"{self.name}: target {target} is the board's own id; name another one")
-        report = self._ask(RangeCommand(target, target_reports, PROTOCOL_FLAGS[protocol], get_cir), RangeReport)
+        report = self._ask(RangeCommand(target, target_reports, protocol == "ds", get_cir), RangeReport)
         if target_reports and get_cir:
             self._pass(QUIET_TARGET_S)
         return report

@@ -25,11 +25,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from uwblink.errors import PlanError
+from uwblink.protocols.table import ON_BOARDS
 from uwblink.recording.antenna_delays import FILE_KEYS as DELAY_KEYS
-from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, delay_of, read_antenna_delays
+from uwblink.recording.antenna_delays import AntennaDelay, AntennaDelays, known_delays, read_antenna_delays
 from uwblink.recording.schema import Tag
 from uwblink.recording.tags import is_board_id, read_tags
 from uwblink.text_files import FileKey, TomlReader, heads, is_number
@@ -78,8 +79,8 @@ class RangingPlan:
         """Check what was given."""
         if self.rate_hz is not None and not (is_number(self.rate_hz) and self.rate_hz > 0):
             raise PlanError(f"rate_hz: found {self.rate_hz!r}, expected a positive number")
-        if self.protocol not in ("ds", "ss"):
-            raise PlanError(f"protocol: found {self.protocol!r}, allowed: ds, ss")
+        if self.protocol not in ON_BOARDS:
+            raise PlanError(f"protocol: found {self.protocol!r}, allowed: {', '.join(ON_BOARDS)}")
         for pair in () if self.pairs == "all" else self.pairs:
             if not (isinstance(pair, tuple) and len(pair) == 2 and all(map(is_board_id, pair)) and pair[0] != pair[1]):
                 raise PlanError(f'pairs: found {pair!r:.60}, expected "all" or pairs of two different ids')
@@ -90,14 +91,13 @@ class RangingPlan:
 
     def programmed(self, present: Iterable[int]) -> AntennaDelays:
         """Return what is programmed into boards that are present; raises `PlanError` where only some are told."""
-        found = {board: delay_of(self.delays(), board) for board in sorted(present)}
-        unknown = [board for board, delay in found.items() if delay is None]
-        if unknown:
+        found = known_delays(self.delays(), sorted(present))
+        if unknown := sorted({*present} - found.keys()):
             raise PlanError(
                 f"antenna_delays: nothing is said of board {_listed(unknown)}; say what is programmed into it, or give "
                 "tx, rx and reply for all that are not named"
             )
-        return {board: delay for board, delay in found.items() if delay is not None}
+        return found
 
     def turns(self, present: Sequence[int]) -> tuple[tuple[int, int], ...]:
         """Return the pairs among boards that are present, none to only listen; raises `PlanError` naming absent ones.
@@ -125,28 +125,24 @@ def load_plan(path: Path) -> RangingPlan:
     file = TomlReader(path, PlanError)
     table = file.table
     file.known(table, (name.removesuffix("[]") for name in heads(FILE_KEYS)))
-    rate = table.get("rate_hz")
-    file.check("rate_hz", rate, rate is None or (is_number(rate) and rate > 0), "a positive number")
     flags = {name: table.get(name, False) for name in ("target_reports", "get_cir")}
-    protocol = file.choice("protocol", table.get("protocol", "ds"), ("ds", "ss"))
     for name, value in flags.items():
         file.check(name, value, isinstance(value, bool), "true or false")
-    pairs = _pairs(path, table.get("pairs", "all"))
-    return RangingPlan(
-        pairs, rate_hz=rate, protocol=protocol, tags=read_tags(file), antenna_delays=read_antenna_delays(file), **flags
-    )
-
-
-def _pairs(path: Path, value: Any) -> tuple[tuple[int, int], ...] | Literal["all"]:
-    if value == "all":
-        return "all"
-    good = isinstance(value, list) and value and all(isinstance(p, list) and len(p) == 2 for p in value)
-    if not good or not all(is_board_id(tag) for pair in value for tag in pair):
-        raise PlanError(f'{path}: pairs: found {value!r}, expected "all" or [[initiator, target], ...] of ids')
-    for a, b in value:
-        if a == b:
-            raise PlanError(f"{path}: pairs: tag {a} cannot range with itself")
-    return tuple((a, b) for a, b in value)
+    pairs = table.get("pairs", "all")
+    listed = isinstance(pairs, list) and pairs and all(isinstance(pair, list) for pair in pairs)
+    file.check("pairs", pairs, pairs == "all" or bool(listed), '"all" or [[initiator, target], ...] of ids')
+    tags, delays = read_tags(file), read_antenna_delays(file)
+    try:
+        return RangingPlan(
+            tuple(map(tuple, pairs)) if listed else "all",
+            rate_hz=table.get("rate_hz"),
+            protocol=table.get("protocol", "ds"),
+            tags=tags,
+            antenna_delays=delays,
+            **flags,
+        )
+    except PlanError as error:
+        raise PlanError(f"{path}: {error}") from error
 
 
 def _listed(tags: Iterable[int]) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Final
 
-from uwblink.boards.board import PROTOCOL_FLAGS, Board
+from uwblink.boards.board import Board
 from uwblink.boards.connection import FENCE, QUIET_AFTER_CIR_S, QUIET_TARGET_S, CommandOutcome, Connection
 from uwblink.boards.listeners import Heard, Listener, Pair, PairState, Progress, ReportCheck, Turn
 from uwblink.boards.ports import Ports, SerialPorts, Transport, serial_number
@@ -219,8 +219,7 @@ class Recorder:
             self._next_s = max(self._next_s + (1 / self._plan.rate_hz if self._plan.rate_hz else 0.0), now_s)
             self._active = station, pair = found
             plan = self._plan
-            flag = PROTOCOL_FLAGS[plan.protocol]
-            self._say(station, RangeCommand(pair[1], plan.target_reports, flag, plan.get_cir))
+            self._say(station, RangeCommand(pair[1], plan.target_reports, plan.protocol == "ds", plan.get_cir))
 
     def _next_turn(self, now_s: float) -> tuple[Station, Pair] | None:
         """Return the next pair of the plan that can range, passing over those of which a board is busy or away."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from uwblink.errors import PlanError
 from uwblink.recording.schema import Tag
 from uwblink.text_files import TomlReader, is_number
-
-LARGEST_BOARD_ID: Final = 254
-"""255 is no board's: the firmware's ids have eight bits."""
 
 
 def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, float, float]]]:
@@ -26,11 +23,8 @@ def load_places(path: Path) -> tuple[tuple[Tag, ...], dict[int, tuple[float, flo
     found: dict[int, tuple[float, float, float]] = {}
     taken = {tag.tag for tag in tags}
     for k, row in enumerate(rows):
-        number: Any = row.get("id")
+        number = _new_id(file, f"anchors[{k}].id", row, {*found} | taken)
         place: Any = row.get("position_m")
-        file.check(f"anchors[{k}].id", number, is_board_id(number), f"a whole number 0 to {LARGEST_BOARD_ID}")
-        if number in found or number in taken:
-            raise PlanError(f"{path}: anchors[{k}].id: found a second {number}, ids must differ")
         file.check(f"anchors[{k}].position_m", place, _are_numbers(place, 3), "three numbers (metres)")
         spread = row.get("covariance_m2", [0.0] * 6)
         file.check(f"anchors[{k}].covariance_m2", spread, _are_numbers(spread, 6), "xx xy xz yy yz zz, six numbers")
@@ -45,16 +39,21 @@ def read_tags(file: TomlReader) -> tuple[Tag, ...]:
     """
     tags: list[Tag] = []
     for k, row in enumerate(file.rows("tags", None if _is_scenario(file) else ("id", "body", "lever_arm_m"))):
-        number: Any = row.get("id")
+        number = _new_id(file, f"tags[{k}].id", row, {tag.tag for tag in tags})
         body: Any = row.get("body")
         arm = row.get("lever_arm_m", [0.0, 0.0, 0.0])
-        file.check(f"tags[{k}].id", number, is_board_id(number), f"a whole number 0 to {LARGEST_BOARD_ID}")
-        if any(tag.tag == number for tag in tags):
-            raise file.error(f"{file.path}: tags[{k}].id: found a second {number}, ids must differ")
         file.check(f"tags[{k}].body", body, isinstance(body, str) and bool(body), "the name of a body")
         file.check(f"tags[{k}].lever_arm_m", arm, _are_numbers(arm, 3), "three numbers (metres)")
         tags.append(Tag(number, body, (float(arm[0]), float(arm[1]), float(arm[2]))))
     return tuple(tags)
+
+
+def _new_id(file: TomlReader, key: str, row: dict[str, Any], taken: set[int]) -> int:
+    """Return the id of a tag or an anchor; raises the file's error for one that is none, or is taken."""
+    number: Any = row.get("id")
+    file.check(key, number, is_board_id(number), "a whole number 0 to 254")
+    file.check(key, number, number not in taken, "another id than those before")
+    return int(number)
 
 
 def _file_of_tags(path: Path) -> TomlReader:
@@ -77,5 +76,5 @@ def _are_numbers(value: Any, count: int) -> bool:
 
 
 def is_board_id(value: Any) -> bool:
-    """Whether a value can be the id of a board."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST_BOARD_ID
+    """Whether a value can be the id of a board: the firmware's ids have eight bits, and 255 is not used."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 254

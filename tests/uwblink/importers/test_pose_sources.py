@@ -149,7 +149,7 @@ def test_trajectories_of_several_bodies_and_anchors(recording, tmp_path):
     [
         ("[[anchors]]\nid = 9\n", "anchors[0].position_m"),
         ("[[anchors]]\nid = 9\nposition_m = [1, 2]\n", "three numbers"),
-        ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\n" * 2, "a second 9"),
+        ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\n" * 2, "found 9, expected another id"),
         ("[[anchors]]\nid = 9\nposition_m = [1, 2, 3]\ncovariance_m2 = [1.0]\n", "six numbers"),
         ("[[anchors]]\nid = 9\nplace = [1, 2, 3]\n", "unknown key"),
         ("anchors = 3\n", "expected tables [[anchors]]"),
