@@ -176,19 +176,14 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
         taken[place] = name
 
 
-OTHER_FORMATS: Final = (
-    *(".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson"),
-    *(".bag", ".mcap", ".db3", ".toml", ".html", ".pdf"),
-)
-"""Endings by which programs choose how to read a file, and none of which is a recording's."""
-
-
 def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
     """Raise the one clear error if `path` cannot be written to; writes nothing.
 
     A `recording` may not have the name of another kind of file: who reads a table would be handed a database.
     """
-    if recording and path.suffix.lower() in OTHER_FORMATS:
+    tables = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson")
+    others = (".bag", ".mcap", ".db3", ".toml", ".html", ".pdf")
+    if recording and path.suffix.lower() in tables + others:
         raise RecordingError(
             f"{path}: a recording is written here, and {path.suffix} is the ending of another kind of file; name it "
             f"{path.stem}.uwb (`uwblink export` makes tables of it)"

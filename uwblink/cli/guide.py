@@ -15,14 +15,8 @@ from uwblink.cli.options import Command
 from uwblink.errors import OfParameter
 from uwblink.settings import flags_of
 
-COMMA: Final = ","
-"""What separates names in one word."""
-
 WRITTEN: Final = ("output", "pdf", "figures", "report", "tum", "plot")
 """Parameters of commands that name what is written; all other paths are read."""
-
-WIDEST: Final = 20
-"""Letters that names may take in the column of an option's values, in a terminal of 80 columns."""
 
 
 def add(
@@ -156,16 +150,16 @@ def choice(*names: str, more: Callable[[], Iterable[str]] | None = None) -> dict
         return starting(incomplete, names if more is None else more())
 
     together = "|".join(names)
-    # Where they do not fit in their column, they are broken between names.
-    return {"metavar": together if len(together) <= WIDEST else " | ".join(names), "autocompletion": complete}
+    # Where they do not fit in their column of 20 letters (of 80), they are broken between names.
+    return {"metavar": together if len(together) <= 20 else " | ".join(names), "autocompletion": complete}
 
 
 def several(names: Callable[[], Iterable[str]]) -> dict[str, Any]:
     """Return what `typer.Option` takes for names with commas between, whose last one is completed."""
 
     def complete(incomplete: str) -> list[str]:
-        before, comma, last = incomplete.rpartition(COMMA)
-        taken = set(before.split(COMMA))
+        before, comma, last = incomplete.rpartition(",")
+        taken = set(before.split(","))
         return [f"{before}{comma}{name}" for name in starting(last, names()) if name not in taken]
 
     return {"metavar": "NAME,...", "autocompletion": complete}

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,12 +24,11 @@ from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM, Poses
 if TYPE_CHECKING:
     import duckdb
 
-CSV_CELLS: Final = {"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"}
-
 
 def write_csv(recording: Path, folder: Path) -> dict[str, int]:
     """Write a CSV file a table, with a header; returns the rows by file. Raises `RecordingError`."""
-    return _write(recording, folder, "csv", "FORMAT csv, HEADER true, NULLSTR ''", CSV_CELLS)
+    cells = {"BLOB": "hex({0})", "USMALLINT[]": "CAST({0} AS VARCHAR)"}
+    return _write(recording, folder, "csv", "FORMAT csv, HEADER true, NULLSTR ''", cells)
 
 
 def write_parquet(recording: Path, folder: Path) -> dict[str, int]:

@@ -21,6 +21,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from uwblink.errors import ImportTableError, first_line
+from uwblink.exporters.mcap import RANGE
 from uwblink.importers.column_map import ColumnMap, load_map
 from uwblink.importers.exchange_tables import TableImport, plan
 from uwblink.importers.staging import Watch, staged
@@ -29,12 +30,6 @@ from uwblink.text_files import require_regular
 BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
 MAX_RECORD_BYTES: Final = 2**28
 """Of a record, and of what a compressed chunk unpacks to: both are held in memory. Writers make chunks of some MB."""
-
-MAX_COLUMNS_OF_ARRAY: Final = 16
-"""Numbers of an array that become columns; longer ones are images and the like."""
-
-OWN_RANGE: Final = "uwb.Range"
-"""What the project calls its ranges in MCAP files."""
 
 OWN_COLUMNS: Final = {
     "from_id": "initiator", "to_id": "target", "range_m": "range_m", "gt_range_m": "truth_m",
@@ -210,7 +205,7 @@ def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMa
 
 def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
     """Return a map that names topics: its own, those of the project's own ranges, or the only one there is."""
-    own = [topic for topic, kind in bag.kinds.items() if kind == OWN_RANGE]
+    own = [topic for topic, kind in bag.kinds.items() if kind == RANGE]
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:400] or "none"
     for topic in column_map.topics:
         if topic not in bag.kinds:
@@ -233,7 +228,7 @@ def _rows(bag: Bag, column_map: ColumnMap) -> Iterator[dict[str, Any]]:
     each = column_map.each
     for topic, kind, time_ns, message in bag.messages(column_map.topics):
         # What is not known is left out of the project's own messages.
-        fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == OWN_RANGE else {}) | _plain(message)
+        fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE else {}) | _plain(message)
         row = {**fields, "topic": topic, "log_time": time_ns, **column_map.topics[topic]}
         if each is None:
             yield row
@@ -254,7 +249,7 @@ def _plain(value: Any) -> Any:
             return int(whole[0]) * 1_000_000_000 + int(whole[1])
         return {name: _plain(one) for name, one in value.items()}
     if isinstance(value, np.ndarray):
-        short = value.size <= MAX_COLUMNS_OF_ARRAY
+        short = value.size <= 16  # longer ones are images and the like
         return {str(k): _plain(one) for k, one in enumerate(value.tolist())} if short else None
     if isinstance(value, list | tuple):
         return [_plain(one) for one in value]

@@ -59,7 +59,6 @@ NAMES: Final = (
 )  # fmt: skip
 """The columns of tables; `event` says in words whether a stamp is of sending or of receiving."""
 
-LAYOUTS: Final = ("exchanges", "messages", "stamps", "parts", "ranges")
 STAMP_UNITS: Final = {
     "ticks": 1.0,
     "ps": TICKS_PER_SECOND * 1e-12,
@@ -148,7 +147,6 @@ FILE_KEYS: Final = (
         "Of bags: a topic to read, and what its messages do not say.",
     ),
 )
-KEYS: Final = heads(FILE_KEYS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -196,7 +194,7 @@ def load_map(path: Path) -> ColumnMap:
     """Read a map; raises `ImportTableError` that names the key."""
     file = TomlReader(path, ImportTableError, "map")
     table = file.table
-    file.known(table, KEYS)
+    file.known(table, heads(FILE_KEYS))
     columns, units, constants, ids = (file.section(name) for name in ("columns", "units", "constants", "ids"))
     file.known(columns, NAMES, "columns.")
     file.known(constants, NAMES, "constants.")
@@ -215,7 +213,7 @@ def load_map(path: Path) -> ColumnMap:
     within = table.get("within_s", 1.0)
     file.check("within_s", within, is_number(within) and within > 0, "seconds")
     return ColumnMap(
-        layout=file.choice("layout", table.get("layout"), (None, *LAYOUTS)),
+        layout=file.choice("layout", table.get("layout"), (None, "exchanges", "messages", "stamps", "parts", "ranges")),
         bits=file.choice("bits", table.get("bits"), (None, *BITS)),
         counter=file.choice("counter", table.get("counter"), (None, "wrapped", "signed", "unwrapped")),
         protocol=file.choice("protocol", table.get("protocol"), (None, *PROTOCOLS)),

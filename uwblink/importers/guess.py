@@ -22,7 +22,6 @@ from uwblink.importers.column_map import (
     DISTANCE_UNITS,
     DISTANCES,
     IDS,
-    LAYOUTS,
     POSITIONS,
     POWERS,
     STAMP_UNITS,
@@ -46,20 +45,14 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.twr import STAMPS
 
 _ANY_UNIT: Final = f"of any unit: write {', '.join(STAMP_UNITS)}"
-_NEEDED: Final = {
-    "exchanges": STAMPS[:4],
-    "messages": ("tx", "rx"),
-    "stamps": ("message",),
-    "ranges": ("range_m",),
-    "nothing": (),
+_LAYOUTS: Final = {
+    "exchanges": (STAMPS[:4], "a row has the stamps of a whole exchange"),
+    "messages": (("tx", "rx"), "a row has one stamp of a sender and one of a receiver"),
+    "stamps": (("message",), "a row has one stamp, and says whether it is of sending or of receiving"),
+    "ranges": (("range_m",), "there are ranges and no stamps"),
+    "nothing": ((), "neither stamps nor ranges were recognised: rename columns below"),
 }
-_WHY: Final = {
-    "exchanges": "a row has the stamps of a whole exchange",
-    "messages": "a row has one stamp of a sender and one of a receiver",
-    "stamps": "a row has one stamp, and says whether it is of sending or of receiving",
-    "ranges": "there are ranges and no stamps",
-    "nothing": "neither stamps nor ranges were recognised: rename columns below",
-}
+"""The layouts that are recognised: the columns that each needs, and how it was recognised."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +86,8 @@ def guess_map(path: Path) -> Guess:
     for name in POSITIONS if unplaced else ():
         columns.pop(name, None)
         cells.pop(name, None)
-    top = [f'layout = "{layout}"  # {_WHY[layout]}' if layout in LAYOUTS else f"# {_WHY[layout]}"]
+    needed, why = _LAYOUTS[layout]
+    top = [f"# {why}" if layout == "nothing" else f'layout = "{layout}"  # {why}']
     units, delays = _unit_lines(columns, cells), list[str]()
     if layout in ("exchanges", "messages", "stamps"):
         counter, unit, delays = _stamp_lines(columns, cells, layout)
@@ -101,7 +95,7 @@ def guess_map(path: Path) -> Guess:
     missing = [name for name in IDS if name not in columns]
     asked = [*missing, *(line.split()[0] for line in [*top, *units] if f'= "{ASKED}"' in line)]
     left = [name for name in table.names if name not in columns.values()]
-    lacking = [name for name in _NEEDED[layout] if name not in cells or _only_words(cells, name)]
+    lacking = [name for name in needed if name not in cells or _only_words(cells, name)]
     lacking += ["message"] if layout == "messages" and _only_words(cells, "message") else []
     mixed = _distance_units(columns)
     # Names are a stranger's, and a line break in one would end the comment.
@@ -129,7 +123,7 @@ def _only_words(cells: dict[str, Floats], name: str) -> bool:
 
 def _layout(cells: dict[str, Floats]) -> str:
     return next(
-        (one for one in ("exchanges", "messages", "ranges") if all(n in cells for n in _NEEDED[one])), "nothing"
+        (one for one in ("exchanges", "messages", "ranges") if all(n in cells for n in _LAYOUTS[one][0])), "nothing"
     )
 
 

@@ -31,9 +31,6 @@ from uwblink.twr import LARGEST_ID, STAMPS, Exchanges
 Vectors = dict[str, dict[int, tuple[float, float, float]]]
 """Vectors by name and number: lever arms by robot and tag, or places in metres by constellation and anchor."""
 
-SAME_ANCHORS_M: Final = 0.05
-"""Median difference from `gt_range`: the constellations of the dataset are a decimetre and more apart."""
-
 _ENDS: Final = {"initiator": "from_id", "target": "to_id"}
 
 
@@ -268,7 +265,8 @@ def _find_anchors(
         off = np.abs(true_m - measured_m)[np.isin(ends[0], list(places)) | np.isin(ends[1], list(places))]
         off = off[np.isfinite(off)]
         found.append((float(np.median(off)) if len(off) else float("nan"), name, places))
-    chosen = [one for one in found if one[1] == wanted or (wanted is None and one[0] < SAME_ANCHORS_M)]
+    # The constellations of the dataset are a decimetre and more apart.
+    chosen = [one for one in found if one[1] == wanted or (wanted is None and one[0] < 0.05)]
     if not chosen:
         raise ImportTableError(
             f"{path}: which constellation the flight was beside cannot be told from gt_range; "

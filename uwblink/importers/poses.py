@@ -23,12 +23,10 @@ from uwblink.importers.tables import Table
 from uwblink.importers.units import other_unit
 from uwblink.recording.distances import distances_m, find_offset
 from uwblink.recording.file import Recording
-from uwblink.recording.schema import Poses, Tag
+from uwblink.recording.schema import POSE, Poses, Tag
 from uwblink.recording.tags import load_places
 from uwblink.text_files import read_text, require_regular
 from uwblink.twr import LATEST_NS, Exchanges, raw_range
-
-NUMBERS: Final = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 Place = Callable[[int, str], tuple[int, str]]
 """Returns the line of a pose, the first being 0, and what stands there in a column."""
@@ -92,21 +90,21 @@ def _from_table(path: Path, body: str | None) -> Poses:
     """Return the poses of a CSV file with a header."""
     with Table(path, ",", ".") as table:
         time = next((name for name in ("time_ns", "time_s") if name in table.names), "")
-        missing = [name for name in (*NUMBERS, *(() if body else ("body",))) if name not in table.names]
+        missing = [name for name in (*POSE, *(() if body else ("body",))) if name not in table.names]
         if not time or missing:
             raise ImportTableError(
                 f"{path}: column {[*missing, 'time_s'][0]!r} is missing; there are {', '.join(table.names)[:400]}; "
                 "expected a first line of time_s or time_ns, body (or `body` for all rows), x, y, z, qx, qy, qz, qw, "
                 "in metres and between commas"
             )
-        cells = {name: table.number(name) for name in (*NUMBERS, time)}
+        cells = {name: table.number(name) for name in (*POSE, time)}
         # One query, as a file that somebody is still writing is longer when it is read again.
         cells |= {"exact": table.whole_number(time)} if time == "time_ns" else {}
         cells |= {} if body else {"body": table.word("body")}
         found = table.query(cells)
         if len(lines := table.rejected()):
             raise ImportTableError(f"{path}: row {lines[0]}: more cells than the header has")
-        numbers = {name: np.ma.filled(found[name], np.nan) for name in (*NUMBERS, time)}
+        numbers = {name: np.ma.filled(found[name], np.nan) for name in (*POSE, time)}
         count = len(numbers["x"])
 
         def place(row: int, name: str) -> tuple[int, str]:
@@ -121,13 +119,13 @@ def _from_table(path: Path, body: str | None) -> Poses:
         time_ns = _nanoseconds(path, time, seconds, place)
         if "exact" in cells:  # also those that no float holds
             time_ns = np.where(np.ma.getmaskarray(found["exact"]), time_ns, np.ma.getdata(found["exact"]))
-        values = np.column_stack([numbers[name] for name in NUMBERS])
+        values = np.column_stack([numbers[name] for name in POSE])
         return _poses(path, time_ns, bodies, values, place)
 
 
 def _from_lines(path: Path, body: str | None, *, euroc: bool) -> Poses:
     """Return the poses of a TUM or a EuRoC file."""
-    kind, mark, time, names = "TUM", None, "time_s", NUMBERS
+    kind, mark, time, names = "TUM", None, "time_s", POSE
     if euroc:
         kind, mark, time, names = "EuRoC", ",", "time_ns", ("x", "y", "z", "qw", "qx", "qy", "qz")
     if body is None:
@@ -150,7 +148,7 @@ def _from_lines(path: Path, body: str | None, *, euroc: bool) -> Poses:
     def place(row: int, name: str) -> tuple[int, str]:
         return lines[row], text[lines[row] - 1].split(mark)[(time, *names).index(name)]
 
-    order = [names.index(name) for name in NUMBERS]
+    order = [names.index(name) for name in POSE]
     time_ns = _nanoseconds(path, time, np.array(seconds), place)
     time_ns = np.where(np.array(exact, dtype=np.int64) != 0, exact, time_ns)  # no float holds nanoseconds since 1970
     return _poses(path, time_ns, np.full(len(lines), body), np.array(values).reshape(-1, 7)[:, order], place)
@@ -175,12 +173,12 @@ def _nanoseconds(path: Path, name: str, times: Floats, place: Place) -> Ints:
 
 
 def _poses(path: Path, time_ns: Ints, body: np.ndarray, values: Floats, place: Place | None = None) -> Poses:
-    """Return poses in order of time; `values` (n, 7) are `NUMBERS`, finite ones where there is a place of each."""
+    """Return poses in order of time; `values` (n, 7) are `POSE`, finite ones where there is a place of each."""
     wrong = ~np.isfinite(values)
     if place is not None and wrong.any():
         row, column = (int(k) for k in np.argwhere(wrong)[0])
-        line, cell = place(row, NUMBERS[column])
-        raise ImportTableError(f"{path}: row {line}: column {NUMBERS[column]!r}: found {cell!r}, expected a number")
+        line, cell = place(row, POSE[column])
+        raise ImportTableError(f"{path}: row {line}: column {POSE[column]!r}: found {cell!r}, expected a number")
     norm = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.flatnonzero((norm < 0.9) | (norm > 1.1))
     if len(bad):
@@ -240,7 +238,7 @@ def _chosen_topics(path: Path, kinds: Mapping[str, str], topics: Mapping[str, st
 
 
 def _of_message(kind: str, message: Any) -> Iterator[tuple[int, str, list[float]]]:
-    """Yield time in nanoseconds, body (empty where the message does not say it), and `NUMBERS` of each pose."""
+    """Yield time in nanoseconds, body (empty where the message does not say it), and `POSE` of each pose."""
     position, attitude, named = MESSAGES[kind]
     for one in message.transforms if kind == "tf2_msgs/msg/TFMessage" else [message]:
         is_json = isinstance(one, dict)
@@ -368,11 +366,8 @@ def _in_order(parts: list[Poses]) -> Poses:
 
 
 def _offset_ns(text: str) -> int:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or abs(value) > 4e9:
+    value = _number(text)
+    if not abs(value) <= 4e9:
         raise ImportTableError(f"`offset`: found {text!r}, expected seconds or auto")
     return round(value * 1e9)
 

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 ROWS_AT_ONCE: Final = 245_760
 """Twice what DuckDB keeps together: parts of that would stay apart in a recording."""
 
-MAX_ID_WORDS: Final = 1_000_000
-"""Different words in a column of ids from which on it holds none: more than ids can be written in."""
-
 Watch = Callable[[str, float], object]
 """Called with the step that runs ("reading", "writing" ...) and the share of it that is done."""
 
@@ -221,7 +218,8 @@ class Staging:
         words = {n: f"{n}_exact" if n in exact else f"coalesce(CAST({x} AS VARCHAR), '')" for n, x in numbers.items()}
         found = set(told.values())
         for word in words.values():
-            if self._ask(f"approx_count_distinct({word})") > MAX_ID_WORDS:
+            # A million different words are more than ids can be written in.
+            if self._ask(f"approx_count_distinct({word})") > 1_000_000:
                 raise self._too_many_ids()
             found |= {str(one) for (one,) in self.db.execute(f"SELECT DISTINCT {word} FROM staged").fetchall()}
         known = self._number_words(sorted(found - {""}))

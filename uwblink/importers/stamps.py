@@ -34,9 +34,6 @@ GOOD_ENOUGH: Final = 0.5
 CLEARLY: Final = 0.9
 """Share of plausible ranges from which on another reading fits."""
 
-UNDELAYED_M: Final = 2 * ANTENNA_DELAY_TICKS * METRES_PER_TICK
-"""How much longer ranges are where nothing was programmed: half of what is lacking at both ends, in both directions."""
-
 
 def whole(values: Floats) -> Ints:
     """Return numbers rounded to whole ones, `NEVER` where there is none."""
@@ -168,7 +165,9 @@ class Sample:
             protocol=np.full(count, reading.protocol), skew2_ppm=self.skew2_ppm, **stamps,
             **dict.fromkeys(("range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "truth_m"), unknown),
         )  # fmt: skip
-        raw = raw_range(exchanges) - (UNDELAYED_M if reading.undelayed else self.longer_m)
+        # Half of what is lacking at both ends, in both directions, where nothing was programmed.
+        undelayed_m = 2 * ANTENNA_DELAY_TICKS * METRES_PER_TICK
+        raw = raw_range(exchanges) - (undelayed_m if reading.undelayed else self.longer_m)
         ranges = np.where(np.isfinite(raw), raw, np.nan)  # no time between the last two messages makes them infinite
         good = self._plausible(ranges, exchanges)
         low, high = np.nanpercentile(ranges, [5, 95]) if np.isfinite(ranges).any() else (np.nan, np.nan)

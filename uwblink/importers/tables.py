@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,6 @@ from uwblink.text_files import require_regular
 if TYPE_CHECKING:
     import duckdb
 
-STAGED_MB: Final = 350
-"""Of what is staged so much is kept in memory: with 250 MB messages take a tenth longer (2026-11-22)."""
-
 Columns = dict[str, NDArray[Any]]
 
 
@@ -41,7 +38,8 @@ def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBP
     for path in paths:
         if not is_utf8(path):
             raise ImportTableError(f"{path}: its name and those of its folders must be UTF-8; rename it")
-    return connect(paths=paths, temporary=folder, memory_mb=None if folder is None else STAGED_MB)
+    # With 250 MB messages take a tenth longer (2026-11-22).
+    return connect(paths=paths, temporary=folder, memory_mb=None if folder is None else 350)
 
 
 class Table(Closing):

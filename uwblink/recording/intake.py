@@ -8,12 +8,11 @@ that nothing in a file can take (`system.main.`), and the file is refused if it 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Timer
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from uwblink.database import duckdb, log_of
 from uwblink.display import printable
@@ -133,18 +132,11 @@ def decode_json(text: object, path: Path, key: str) -> Any:
     if not isinstance(text, str):
         raise RecordingError(f"{path}: table meta: {printable(key)} has no value")
     try:
-        return json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        value = json.loads(text)
+        json.dumps(value, allow_nan=False)  # Python reads NaN and 1e400, which are not JSON
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: table meta holds a value that is not JSON, that of {printable(key)}") from error
-
-
-def _refuse(word: str) -> NoReturn:
-    raise ValueError(word)
-
-
-def _finite(word: str) -> float:
-    number = float(word)
-    return number if math.isfinite(number) else _refuse(word)
+    return value
 
 
 def is_locked(path: Path, *, update: bool) -> bool:

@@ -25,9 +25,6 @@ LOOPBACK: Final = "127.0.0.1"
 VIEWERS: Final = "foxglove.dev"
 """The domain of Foxglove's own pages (https://app.foxglove.dev)."""
 
-IDLE_S: Final = 10.0
-"""A connection that sends no request for so long is closed: each has a thread."""
-
 
 def hidden_address() -> str:
     """Return a loopback address that a web site cannot guess, where the system has more than one."""
@@ -87,7 +84,7 @@ class Gate(socketserver.ThreadingTCPServer):
 
 class _Request(socketserver.StreamRequestHandler):
     rbufsize = 0  # what follows the request is for the server behind
-    timeout = IDLE_S
+    timeout = 10.0  # a connection without a request is closed then: each has a thread
     server: Gate
 
     def handle(self) -> None:

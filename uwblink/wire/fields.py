@@ -104,18 +104,6 @@ def write_printed(value: float) -> bytes:
     return sign + b"%d.%04d" % divmod(whole, 10_000)
 
 
-def _read_printed_or_zero(text: bytes) -> float | None:
-    return None if text == b"0" else _read_printed(text)
-
-
-def _write_printed_or_zero(value: float | None) -> bytes:
-    return b"0" if value is None else write_printed(value)
-
-
-def _read_raw_float(data: bytes) -> float:
-    return float(struct.unpack("<f", data)[0])
-
-
 def _write_raw_float(value: float) -> bytes:
     try:
         return struct.pack("<f", value)
@@ -140,17 +128,19 @@ def _bytes(longest: int) -> Kind:
     return Kind(f"bytes up to {longest}", lambda data: data[2:], write, size)
 
 
-def _four(_data: bytes, _at: int) -> int:
-    return 4
-
-
 ID: Final = _integer(0, 255)
 STAMP: Final = _integer(0, 2**32 - 1)
 INT: Final = _integer(-(2**31), 2**31 - 1)
 BOOL: Final = Kind("bool", _read_bool, _write_bool)
 TEXT: Final = Kind("text", _read_text, _write_text)
 PRINTED: Final = Kind("printed number", _read_printed, write_printed)
-PRINTED_OR_ZERO: Final = Kind("printed number or 0", _read_printed_or_zero, _write_printed_or_zero)
-RAW_FLOAT: Final = Kind("four-byte float", _read_raw_float, _write_raw_float, _four)
+PRINTED_OR_ZERO: Final = Kind(
+    "printed number or 0",
+    lambda text: None if text == b"0" else _read_printed(text),
+    lambda value: b"0" if value is None else write_printed(value),
+)
+RAW_FLOAT: Final = Kind(
+    "four-byte float", lambda data: struct.unpack("<f", data)[0], _write_raw_float, lambda _data, _at: 4
+)
 BROADCAST: Final = _bytes(LONGEST_BROADCAST)
 BYTES: Final = _bytes(1000)  # more than any frame, so that the end of damage is found
