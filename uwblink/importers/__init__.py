@@ -1,6 +1,7 @@
-"""Turns other people's files into recordings: one row a kind of file, to which anyone can add.
+"""Import of files in other formats; programs and other distributions can register importers of their own.
 
-A reader of a kind of one's own takes a path and returns `Contents`; writing, and refusing to overwrite, is done here.
+A registered reader takes a path and returns `Contents`. This module writes the recording, and never overwrites one
+unless it is told to.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ __all__ = [
 
 
 class Importing(Protocol):
-    """What files hold, and need not be in memory at once."""
+    """The contents of files, which do not need to be in memory at once."""
 
     def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
-        """Write a recording; returns how many rows its tables have, and what a user should know of the import."""
+        """Write a recording; returns the number of rows by table, and notes for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +50,9 @@ class Importer:
     `read(source, map)` returns what the file at `source` holds and raises `ImportTableError`; `map` is the path of a
     file that explains it, for kinds with a `map_help`, else None. `suffixes` are what names of such files end with, in
     small letters, none for a kind of folder; `name` is that of the command `uwblink import NAME`, and `help` its line.
-    `read_all`, of kinds of which several files can be one recording, takes a list of paths instead of one. `open_all`
-    is for kinds whose files need not be in memory at once, and used where a recording is written: it takes a list of
-    paths, the map's, and who is told what is being done, and yields an object with a method `write`.
+    `read_all` takes a list of paths instead of one; formats without it take one file. `open_all` is for formats whose
+    files do not need to be in memory at once: it takes a list of paths, the path of the map and a callback for
+    progress, and yields an object with a method `write`.
     """
 
     name: str
@@ -164,7 +165,7 @@ def import_recording(
     map_file: str | os.PathLike[str] | None = None,
     force: bool = False,
 ) -> int:
-    """Make a recording of somebody else's file, or of several tables as one; returns how many exchanges it has.
+    """Import a file, or several tables as one, into a new recording; returns the number of exchanges.
 
     `importer` names a row of `IMPORTERS`; without it the name of the file decides. `map_file` explains a table's
     columns. Raises `ArgumentError`, `ImportTableError` and what `Recording.create` raises; nothing is written then.
@@ -180,7 +181,7 @@ def import_recording(
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What was imported: how many rows by table, the exchanges first, and what a user should know of it."""
+    """What was imported: the number of rows by table, exchanges first, and notes for the user."""
 
     counts: dict[str, int]
     notes: list[str]
@@ -213,9 +214,9 @@ def import_file(
 def read_source(
     source: Source, *, importer: str | None = None, map_file: str | os.PathLike[str] | None = None
 ) -> Contents:
-    """Return what somebody else's file holds, without writing anything; parameters and errors of `import_recording`.
+    """Read a file without writing anything; parameters and errors are those of `import_recording`.
 
-    An importer may say in `meta["notes"]`, a list of lines, what a user should know of the import.
+    Importers put notes for the user into `meta["notes"]`, a list of lines.
     """
     return _read(*_chosen(source, importer, map_file))
 
@@ -223,7 +224,7 @@ def read_source(
 def _chosen(
     source: Source, importer: str | None, map_file: str | os.PathLike[str] | None
 ) -> tuple[list[Path], Importer, Path | None]:
-    """Return the files, who reads them, and the file that explains them."""
+    """Return the files, their importer, and the map."""
     sources = [Path(source)] if isinstance(source, str | os.PathLike) else [Path(one) for one in source]
     if not sources:
         raise ArgumentError("found no files, expected a path or several", parameter="source")

@@ -1,8 +1,9 @@
 """Bags of ROS 1, ROS 2 and MCAP: their messages, and exchanges in them by a map of the messages' fields.
 
-A message becomes a row of a table whose columns are its fields, as `header.frame_id`; a time (`header.stamp`) is in
-whole nanoseconds, and the numbers of an array are `stamps.0`, `stamps.1` ... `topic` and `log_time` are columns, too.
-From there on a bag is a table of JSON lines. The project's own MCAP files need no map: all ranges in them are taken.
+Each message becomes a row of a table. Its columns are the fields of the message, such as `header.frame_id`; times
+(`header.stamp`) are whole nanoseconds, and the elements of an array are `stamps.0`, `stamps.1` and so on. `topic` and
+`log_time` are columns, too. The table is then read as JSON lines. The project's own MCAP files need no map: all their
+ranges are imported.
 """
 
 from __future__ import annotations
@@ -29,21 +30,20 @@ from uwblink.text_files import require_regular
 
 BAG_SUFFIXES: Final = (".bag", ".mcap", ".db3")
 MAX_RECORD_BYTES: Final = 2**28
-"""Of a record, and of what a compressed chunk unpacks to: both are held in memory. Writers make chunks of some MB."""
+"""Largest record and largest unpacked chunk, which are both held in memory. Writers make chunks of a few MB."""
 
 OWN_COLUMNS: Final = {
     "from_id": "initiator", "to_id": "target", "range_m": "range_m", "gt_range_m": "truth_m",
     "fpp1": "fpp1_dbm", "fpp2": "fpp2_dbm", "skew1": "skew1_ppm", "skew2": "skew2_ppm",
 }  # fmt: skip
-"""What is in these ranges, by the names of a map."""
+"""The fields of the project's own ranges, by the names of a map."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bag:
-    """An open bag: what kind of message each topic has, as `geometry_msgs/msg/PoseStamped`, and its messages.
+    """An open bag: the message type of each topic, such as `geometry_msgs/msg/PoseStamped`, and the messages.
 
-    `messages(topics)` yields topic, kind, time in nanoseconds by the recorder, and message; it raises
-    `ImportTableError`.
+    `messages(topics)` yields topic, type, recording time in nanoseconds, and message; it raises `ImportTableError`.
     """
 
     path: Path
@@ -52,8 +52,8 @@ class Bag:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Bag]:
-    """Open a bag; raises `ImportTableError` for what is none, also from within the block.
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a bag; raises `ImportTableError` for other files and for damaged ones, also within the block.
 
     Messages of ROS need rosbags; an MCAP file of JSON messages does not.
     """
@@ -81,13 +81,13 @@ def opened(path: Path) -> Iterator[Bag]:
 
 
 def _ros_bag(path: Path, reader: Any) -> Bag:
-    """Return a bag with the messages of ROS, whatever it is stored as."""
+    """Return a bag of ROS messages, in any storage format."""
 
     def messages(topics: Iterable[str]) -> Iterator[tuple[str, str, int, Any]]:
         wanted = set(topics)
         used = [connection for connection in reader.connections if connection.topic in wanted]
         for connection in used:
-            # All bags define the kinds that are no standard ones, but those of ROS 2 before Iron stored in SQLite.
+            # Every bag defines its own message types, except bags of ROS 2 before Iron that are stored in SQLite.
             if connection.msgtype not in reader.typestore.types:
                 raise ImportTableError(
                     f"{path}: does not say what a {connection.msgtype} is; convert it to MCAP in ROS, which does"
@@ -99,7 +99,7 @@ def _ros_bag(path: Path, reader: Any) -> Bag:
 
 
 def _is_json(path: Path) -> bool:
-    """Whether a file is MCAP whose first topic is one of JSON messages."""
+    """Return whether a file is MCAP and its first topic has JSON messages."""
     with path.open("rb") as file:
         if file.read(8) != b"\x89MCAP0\r\n":
             return False
@@ -179,7 +179,7 @@ def open_exchange_bag(
 def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMap:
     """Write the messages of a bag as JSON lines; returns the map of these."""
     first: dict[str, Any] | None = None
-    with opened(source) as bag:
+    with open_bag(source) as bag:
         column_map = _with_topics(bag, column_map)
         try:
             with table.open("w", encoding="utf-8") as file:
@@ -195,7 +195,7 @@ def _to_json_lines(source: Path, column_map: ColumnMap, table: Path) -> ColumnMa
             ) from error
     if first is None:
         raise ImportTableError(f"{source}: no message on the topics of the map")
-    # A time is in nanoseconds where nobody says otherwise.
+    # Times are in nanoseconds unless the map says otherwise.
     column_map = replace(column_map, time_unit=column_map.time_unit or "ns")
     if "time_s" in column_map.columns or "time_s" in column_map.constants:
         return column_map
@@ -224,10 +224,10 @@ def _with_topics(bag: Bag, column_map: ColumnMap) -> ColumnMap:
 
 
 def _rows(bag: Bag, column_map: ColumnMap) -> Iterator[dict[str, Any]]:
-    """Yield a row a message, or one for each element of the list in it that the map names."""
+    """Yield one row for each message, or for each element of the list that the map names (`each`)."""
     each = column_map.each
     for topic, kind, time_ns, message in bag.messages(column_map.topics):
-        # What is not known is left out of the project's own messages.
+        # The project's own messages leave out unknown values.
         fields = (dict.fromkeys(OWN_COLUMNS.values()) if kind == RANGE else {}) | _plain(message)
         row = {**fields, "topic": topic, "log_time": time_ns, **column_map.topics[topic]}
         if each is None:
@@ -239,7 +239,7 @@ def _rows(bag: Bag, column_map: ColumnMap) -> Iterator[dict[str, Any]]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a message as JSON has it; what JSON has no word for is None."""
+    """Return a message as values of JSON types; all other values become None."""
     fields = getattr(value, "__dataclass_fields__", None)
     if fields is not None:
         value = {n: getattr(value, n) for n in fields if not n.isupper() and n != "__msgtype__"}

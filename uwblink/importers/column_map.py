@@ -1,4 +1,4 @@
-"""What a table of exchanges calls its columns, and in which units: the TOML map of `uwblink import csv`.
+"""The TOML map of `uwblink import csv`: names and units of a table's columns.
 
 Every key is optional; docs/importing.md explains each.
 
@@ -51,13 +51,13 @@ POSITIONS: Final = tuple(f"{end}_{axis}_m" for end in ("from", "to") for axis in
 DISTANCES: Final = ("range_m", "gt_range_m", *POSITIONS)
 IDS: Final = {"from_id": "who begins each exchange", "to_id": "who answers"}
 ASKED: Final = "?"
-"""What `uwblink import guess` writes where somebody has to say it."""
+"""Placeholder that `uwblink import guess` writes for a value that the user must give."""
 
 NAMES: Final = (
     "time_s", *IDS, *STAMPS, "fpp1", "fpp2", "skew1", "skew2", "rxp1", "rxp2", *DISTANCES,
     "sequence", "message", "tx", "rx", "fpp", "rxp", "skew", "stamp", "event",
 )  # fmt: skip
-"""The columns of tables; `event` says in words whether a stamp is of sending or of receiving."""
+"""The columns of tables; `event` has words that tell whether a stamp is of transmission or of reception."""
 
 STAMP_UNITS: Final = {
     "ticks": 1.0,
@@ -151,10 +151,9 @@ FILE_KEYS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnMap:
-    """How to read a table; what is None is found out from the table itself.
+    """How to read a table; fields that are None are determined from the table.
 
-    `ticks_per_unit` turns stamps into ticks. `antenna_delays` is what was programmed, in ticks: for all devices under
-    None, for single ones under their ids.
+    `ticks_per_unit` converts stamps into ticks. `antenna_delays` are the programmed delays by device, in ticks.
     """
 
     layout: str | None = None
@@ -177,16 +176,16 @@ class ColumnMap:
 
     @property
     def metres_per_unit(self) -> float:
-        """The unit of distances, metres where it is not said."""
+        """The unit of distances, metres by default."""
         return DISTANCE_UNITS[self.distance_unit or "m"]
 
     @property
     def power_sign(self) -> float:
-        """What powers are multiplied by."""
+        """The factor of powers: -1 if they are written without their sign."""
         return -1.0 if self.power_unit == "-dBm" else 1.0
 
     def header(self, name: str) -> str:
-        """Return what the table calls one of `NAMES`."""
+        """Return the table's name of a column of `NAMES`."""
         return self.columns.get(name, name)
 
 

@@ -1,4 +1,4 @@
-"""Tables as files of text: how a CSV file is written, whether its lines can be read, and where a row stands."""
+"""CSV files: their dialect, limits of their lines, and the line numbers of rows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uwblink.errors import ImportTableError, first_line
 from uwblink.text_files import require_regular
 
 PIECE_BYTES: Final = 1 << 20
-"""Bytes of a file that are searched for lines at once."""
+"""Size of the blocks in which line numbers are counted."""
 
 MAX_LINE_BYTES: Final = 4_000_000
 """An impulse response in one cell takes 6,000."""
@@ -29,7 +29,7 @@ MAX_CELLS: Final = 4096
 
 
 class CsvDialect(NamedTuple):
-    """How a CSV file is written; the first row of values comes after `skip` lines."""
+    """Dialect of a CSV file; the first row of values follows after `skip` lines."""
 
     names: tuple[str, ...]
     delimiter: str
@@ -44,7 +44,7 @@ def open_file(path: Path) -> IO[bytes]:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Raise `ImportTableError` for whatever keeps a file of text from being read."""
+    """Convert errors of reading a text file into `ImportTableError`."""
     try:
         yield
     except UnicodeDecodeError as error:
@@ -58,7 +58,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def detect(path: Path, delimiter: str | None = None, decimal: str | None = None) -> CsvDialect:
-    """Return how a CSV file is written, by its first 64 KiB; `delimiter` and `decimal` override what is found.
+    """Return the dialect of a CSV file by its first 64 KiB; `delimiter` and `decimal` override what is found.
 
     Lines before the header that are empty or begin with "#" are skipped. Raises `ImportTableError` for a file that is
     not text with a header.
@@ -86,7 +86,7 @@ def detect(path: Path, delimiter: str | None = None, decimal: str | None = None)
 
 
 def _delimiter(lines: list[str]) -> str:
-    """Return the mark that cuts the header and the rows into equally many cells, and into most."""
+    """Return the delimiter that splits header and rows into equal numbers of cells, and into the most."""
 
     def quality(mark: str) -> tuple[bool, int, int]:
         counts = [len(row) for row in csv.reader(lines[:50], delimiter=mark) if row] or [0]
@@ -96,17 +96,17 @@ def _delimiter(lines: list[str]) -> str:
 
 
 def check_lines(path: Path, delimiter: str | None = None) -> None:
-    """Read a file of text through; raises `ImportTableError` for a line that is too long, or has too many cells.
+    """Read a text file to its end; raises `ImportTableError` for a line that is too long or has too many cells.
 
-    Cells stand between delimiters, if there is one. Of each cell too many DuckDB would note the whole line, and it
-    would read a broken compressed file for ever.
+    Without a `delimiter` only the length is checked. DuckDB would store the whole line for each extra cell, and would
+    never finish a broken compressed file.
     """
     mark, block = (delimiter or "").encode(), 4096
     length = cells = 0
     with reading(path), open_file(path) as file:
         while piece := file.read(16 * block):
             for start in range(0, len(piece), block):
-                # Only lines that fill whole blocks are looked at: a hundredth of the time of looking at all.
+                # Only lines that fill whole blocks are measured, which takes a hundredth of the time.
                 if piece.find(b"\n", start, start + block) >= 0:
                     length = cells = 0
                     continue
@@ -141,7 +141,7 @@ def lines_of(path: Path, skip: int, rejected: Ints, rows: Ints) -> Ints:
 
 
 def _first_lines_of_rows(file: IO[bytes], skip: int) -> Iterator[Ints]:
-    """Yield the lines at which rows begin, in ascending order, those of one piece of the file at a time."""
+    """Yield the line numbers at which rows begin, in ascending order, block by block."""
     before, quoted = 0, False
     while piece := file.read(PIECE_BYTES):
         piece += file.readline()
@@ -161,7 +161,7 @@ def _first_lines_of_rows(file: IO[bytes], skip: int) -> Iterator[Ints]:
 
 
 def _is_plain(piece: bytes) -> bool:
-    """Whether each line of a piece of a file is a row: it begins with a letter, a digit or a sign of ASCII."""
+    """Return whether each line of a block is a row: no quotes, and each begins with a printable ASCII character."""
     if b'"' in piece or piece.count(b"\r") != piece.count(b"\r\n"):
         return False
     letters = np.frombuffer(piece, dtype=np.uint8)

@@ -1,10 +1,10 @@
 """Tables of exchanges, of messages or of plain ranges, as CSV, Parquet or JSON lines, one file or several.
 
-A table is staged (`staging`), rows of one exchange are brought together (`long_tables`), rows that cannot be used go to
-the faults (`usable_rows`); then the exchanges are written some rows at a time. A table of which half of the rows or
-more cannot be used is refused. `range_m` is what the device reported, or else the range by the stamps. `gt_range_m`, or
-the distance between the two antenna positions (`from_x_m` ... `to_z_m`), is stored beside the exchange as its measured
-truth; antennas of which the table has positions are bodies with poses.
+The steps: stage the table (`staging`), combine the rows of each exchange (`long_tables`), record unusable rows as
+faults (`usable_rows`), write the exchanges in blocks. A table is refused if half of its rows or more are unusable.
+`range_m` is the range that the device reported, or else the range by the stamps. `gt_range_m`, or the distance between
+the two antenna positions (`from_x_m` ... `to_z_m`), is stored as the true distance of the exchange; antennas with
+positions become bodies with poses.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ import numpy as np
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS, POSITIONS, ColumnMap, load_map
-from uwblink.importers.long_tables import exchanges_of_long
+from uwblink.importers.long_tables import assemble_exchanges
 from uwblink.importers.staging import ROWS_AT_ONCE, Staging, Watch, staged
 from uwblink.importers.stamps import (
-    GOOD_ENOUGH,
+    ACCEPTED_SHARE,
     MIN_ROWS,
-    SAMPLE,
+    SAMPLE_ROWS,
     Reading,
     Sample,
     Trial,
     clocks,
+    find_other_reading,
     stamps_of,
     to_ticks,
-    try_others,
 )
 from uwblink.importers.tables import Columns
 from uwblink.importers.units import check_units, optional, truth_m
@@ -48,16 +48,16 @@ from uwblink.twr import LARGEST_ID, STAMPS, Exchanges, raw_range
 
 TABLE_SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".parquet", ".jsonl", ".ndjson", ".jsonl.gz")
 ROW_PERIOD_NS: Final = 1_000_000
-"""Between rows of a table that has no times."""
+"""Time between the rows of a table without times."""
 
 
 @contextmanager
 def open_tables(
     sources: Sequence[Path], map_file: Path | None = None, watch: Watch | None = None
 ) -> Iterator[TableImport]:
-    """Yield what a table holds, all tables in a folder as one, or several files; raises `ImportTableError`.
+    """Open one table, all tables of a folder as one, or several files as one; raises `ImportTableError`.
 
-    `map_file` says what columns are called.
+    `map_file` has names and units of the columns.
     """
     paths = list(sources)
     if len(paths) == 1 and paths[0].is_dir():
@@ -72,9 +72,9 @@ def open_tables(
 
 
 def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None = None) -> TableImport:
-    """Return what is to be written; raises `ImportTableError` where half of the rows or more are no use.
+    """Check staged tables and return the import; raises `ImportTableError` if half of the rows or more are unusable.
 
-    `source` and `imported_from` are what the recording says it comes from.
+    `source` and `imported_from` go into the recording's `meta`.
     """
     column_map, rows, faults = staging.column_map, staging.rows, Faults(staging)
     for name in IDS:
@@ -83,7 +83,7 @@ def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None 
     notes = _notes(staging)
     layout, protocol = column_map.layout or _layout(staging), column_map.protocol
     if layout in ("messages", "stamps", "parts"):
-        rows, good, found = exchanges_of_long(staging, layout, faults, watch)
+        rows, good, found = assemble_exchanges(staging, layout, faults, watch)
         protocol = protocol or found
     else:
         good = faults.reject(rows, ENDS)
@@ -96,8 +96,8 @@ def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None 
             raise staging.missing("range_m")
         usable = usable_ranges(rows, faults, good)
         faults.check(total)
-        check_units(column_map, staging.paths[0], usable.sample(SAMPLE), None)
-        notes += filter(None, [likely_repeated(next(usable.blocks()))])
+        check_units(column_map, staging.paths[0], usable.sample(SAMPLE_ROWS), None)
+        notes += filter(None, [note_on_repeats(next(usable.blocks()))])
     else:
         protocol = protocol or ("ds" if rows.has("tx3") and rows.has("rx3") else "ss")
         for name in stamps_of(protocol):
@@ -111,7 +111,7 @@ def plan(staging: Staging, source: str, imported_from: str, watch: Watch | None 
             )
         if counter != "wrapped":
             notes.append(f"stamps are {counter}, and are taken modulo 2^{bits}")
-        sample = usable.sample(SAMPLE)
+        sample = usable.sample(SAMPLE_ROWS)
         reading = _reading(column_map, staging.paths[0], sample, Reading(protocol, bits), notes)
         raw = raw_range(exchanges_of(column_map, sample, reading))
         check_units(column_map, staging.paths[0], sample, raw)
@@ -131,7 +131,7 @@ def _notes(staging: Staging) -> list[str]:
 
 
 def _layout(staging: Staging) -> str:
-    """Return what a row is, by the columns that there are."""
+    """Return the layout that the columns suggest."""
     has = staging.rows.has
     for layout, names in (("exchanges", STAMPS[:4]), ("messages", ("tx", "rx")), ("stamps", ("stamp", "event"))):
         if all(map(has, names)):
@@ -142,15 +142,15 @@ def _layout(staging: Staging) -> str:
 
 
 def _reading(column_map: ColumnMap, path: Path, rows: Columns, reading: Reading, notes: list[str]) -> Reading:
-    """Return how to read the stamps: as they were meant, or as they clearly make ranges where they do not so."""
+    """Return how to read the stamps: as the map says, or otherwise if only that makes plausible ranges."""
     pair = rows["from_id"] * (LARGEST_ID + 1) + rows["to_id"]
-    # As they stand in the table, ticks or not: a stamp that only other protocols have may be missing.
+    # In the unit of the table; stamps that only other protocols have may be missing.
     cells: dict[str, Floats] = {name: rows[name] for name in STAMPS if name in rows}
     longer_m = _longer_m(column_map, rows)
     truth_m, skew2 = optional(rows, "gt_range_m"), optional(rows, "skew2")
-    first, other = try_others(Sample(cells, pair, truth_m, skew2, longer_m, column_map.ticks_per_unit), reading)
+    first, other = find_other_reading(Sample(cells, pair, truth_m, skew2, longer_m, column_map.ticks_per_unit), reading)
     if other is None:
-        if first.plausible < GOOD_ENOUGH and len(pair) >= MIN_ROWS:
+        if first.plausible < ACCEPTED_SHARE and len(pair) >= MIN_ROWS:
             notes.append(
                 f"the ranges are not plausible ({_span(first)}), and no other protocol, width or order of the columns "
                 "makes better ones; check the map"
@@ -173,7 +173,7 @@ def _reading(column_map: ColumnMap, path: Path, rows: Columns, reading: Reading,
 
 
 def _longer_m(column_map: ColumnMap, rows: Columns) -> Floats:
-    """Return by how much ranges (n,) are longer because of antenna delays that were not programmed, by the map."""
+    """Return the lengths (n,) that missing antenna delays add to ranges, by the map."""
     lacking, delays = np.zeros(len(rows["origin"])), column_map.antenna_delays
     for name in IDS if delays else ():
         ids, back = np.unique(rows[name], return_inverse=True)
@@ -187,9 +187,9 @@ def _span(trial: Trial) -> str:
 
 
 def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, before: int = 0) -> Exchanges:
-    """Return rows as exchanges, `before` which others came; ranges as reported, or by the stamps.
+    """Return rows as exchanges with the reported ranges, or else those by the stamps; `before` counts earlier rows.
 
-    Without a reading they are plain ranges: single-sided exchanges whose stamps are 0.
+    Without a reading the rows are ranges without stamps: single-sided exchanges whose stamps are 0.
     """
     count = len(rows["origin"])
     stamps: dict[str, Any] = dict.fromkeys(STAMPS, np.zeros(count, dtype=np.int64))
@@ -213,7 +213,7 @@ def exchanges_of(column_map: ColumnMap, rows: Columns, reading: Reading | None, 
 
 @dataclass(frozen=True, slots=True)
 class TableImport:
-    """Rows of tables that can be used, and how they are to be read (None: as plain ranges)."""
+    """Usable rows of tables, and how to read their stamps (None: ranges without stamps)."""
 
     staging: Staging
     usable: UsableRows
@@ -226,7 +226,7 @@ class TableImport:
     watch: Watch | None
 
     def write(self, path: str | os.PathLike[str], *, force: bool = False) -> tuple[dict[str, int], list[str]]:
-        """Write a recording; returns how many rows its tables have, those without any left out, and the notes.
+        """Write a recording; returns the number of rows of each table that has any, and the notes.
 
         Raises what `Recording.create` raises.
         """
@@ -262,7 +262,7 @@ class TableImport:
         )
 
     def _notes_and_faults(self) -> tuple[list[str], Iterator[list[Fault]]]:
-        faults, count = iter(self.faults), len(self.faults) + self.faults.too_long()
+        faults, count = iter(self.faults), len(self.faults) + self.faults.count_too_long()
         if not count:
             return self.notes, faults
         first = next(faults)
@@ -270,7 +270,7 @@ class TableImport:
         return [*self.notes, said], chain([first], faults)
 
     def _exchanges(self) -> Iterator[tuple[Exchanges, Columns]]:
-        """Yield the exchanges in the order of their rows, some at a time, and their columns of the table `powers`."""
+        """Yield blocks of exchanges in the order of their rows, and their columns of the table `powers`."""
         before = 0
         for rows in self.usable.blocks():
             if self.watch:
@@ -304,7 +304,7 @@ class TableImport:
         return self.staging.names.get(tag, f"tag{tag}")
 
     def _poses(self) -> Iterator[Poses]:
-        """Yield where antennas were, in order of time: one pose a time, and one alone for what never moves."""
+        """Yield the poses of antennas in order of time; antennas that never move have a single one."""
         rows, db = self.usable.rows, self.staging.db
         if not all(map(rows.has, POSITIONS)):
             return
@@ -318,7 +318,7 @@ class TableImport:
             axes = ", ".join(f"{end}_{axis}_m AS {axis}" for axis in "xyz")
             known = " AND ".join(f"{end}_{axis}_m IS NOT NULL" for axis in "xyz")
             ends.append(f"SELECT time_ns, {name} AS tag, {rank} AS rank, row, {axes} FROM located WHERE {known}")
-        # Of two places at a time the first counts, those of initiators before those of targets.
+        # The first of several positions at one time counts; initiators come before targets.
         one = ", ".join(f"arg_min({axis}, (rank, row)) AS {axis}" for axis in "xyz")
         db.execute(f"CREATE TABLE places AS SELECT time_ns, tag, {one} FROM ({' UNION ALL '.join(ends)}) GROUP BY ALL")
         moves = " OR ".join(f"min({axis}) <> max({axis})" for axis in "xyz")
@@ -337,11 +337,11 @@ class TableImport:
             yield Poses(np.ma.getdata(found["time_ns"]), names[which], position, level)
 
 
-def likely_repeated(rows: Columns) -> str:
-    """Return a note where ranges without stamps are probably recorded twice; empty text otherwise.
+def note_on_repeats(rows: Columns) -> str:
+    """Return a note if ranges without stamps are probably recorded twice; empty text otherwise.
 
-    A range that equals the previous one of the same two devices does so by chance, or repeats it. Equal by chance, it
-    follows the previous one after as long a time as others do, which the rank test of Mann and Whitney checks.
+    A range may equal the previous one of the same two devices by chance, or because it repeats it. In the first case
+    the times since the previous range are distributed as those of other ranges: rank test of Mann and Whitney.
     """
     if "time_ns" not in rows:
         return ""
@@ -355,7 +355,7 @@ def likely_repeated(rows: Columns) -> str:
         return ""
     from scipy.stats import mannwhitneyu
 
-    # One in a million sound tables is told to repeat ranges.
+    # False alarm for one in a million sound tables.
     if not mannwhitneyu(gap[equal], gap[~equal], alternative="less", method="asymptotic").pvalue < 1e-6:
         return ""
     after, others = (f"{1e3 * np.median(some):.3g} ms" for some in (gap[equal], gap[~equal]))

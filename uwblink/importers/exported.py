@@ -1,4 +1,4 @@
-"""A folder that `uwblink export --to csv` or `parquet` wrote, back into a recording: every column of every table."""
+"""Import of folders that `uwblink export --to csv` or `parquet` wrote: every column of every table."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from uwblink.errors import ImportTableError, first_line
-from uwblink.importers.tables import confined
+from uwblink.importers.tables import connect_to
 from uwblink.recording.contents import Contents, load
 from uwblink.recording.schema import BY_POSES, TABLES, TRUTH_FROM
 from uwblink.recording.store import Store
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def read_exported(folder: Path, _map_file: Path | None = None) -> Contents:
-    """Return what an export to CSV or Parquet holds; raises `ImportTableError`."""
+    """Read an export to CSV or Parquet; raises `ImportTableError`."""
     if not folder.is_dir():
         raise ImportTableError(f"{folder}: no such folder; expected what 'uwblink export' wrote")
     paths = {table: _path(folder, table) for table in TABLES}
@@ -43,7 +43,7 @@ def _path(folder: Path, table: str) -> Path | None:
 def _take(store: Store, table: str, source: Path) -> None:
     import duckdb
 
-    with confined([source]) as db:
+    with connect_to([source]) as db:
         try:
             store.insert(table, dict(db.execute(_query(db, table, source), [str(source)]).fetchnumpy()))
         except (duckdb.Error, UnicodeDecodeError, csv.Error) as error:
@@ -51,7 +51,7 @@ def _take(store: Store, table: str, source: Path) -> None:
 
 
 def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
-    """Return what reads a table, in which nothing but our names is SQL."""
+    """Return the query that reads a table; text from the file never becomes part of it."""
     columns, read = TABLES[table] | {TRUTH_FROM: "VARCHAR"}, "read_parquet(?)"
     if source.suffix == ".csv":
         with source.open(encoding="utf-8-sig", newline="") as file:
@@ -72,7 +72,7 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, source: Path) -> str:
         }
         cells = {name: f"CAST({text} AS {TABLES[table][name]})" for name, text in texts.items()}
     if TRUTH_FROM in there and table == "exchanges":
-        # Where the distance is that of the poses, which come in, too.
+        # Distances by poses are left out, because the poses are imported, too.
         cells["truth_m"] = f"CASE WHEN {TRUTH_FROM} = '{BY_POSES}' THEN NULL ELSE {cells['truth_m']} END"
     listed = ", ".join(f'{cell} AS "{name}"' for name, cell in cells.items())
     return f"SELECT {listed} FROM {read}"  # noqa: S608 - keys of TABLES

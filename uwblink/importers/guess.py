@@ -1,7 +1,7 @@
-"""What a table might mean: a map that it would be read with, and the reason for each line of it.
+"""Propose a map for a table, with the reason for each line.
 
-Columns are recognised by their names; units by the ends of the names, by the size of the numbers, and by which of them
-makes plausible ranges of the stamps; the protocol by trying all.
+Columns are recognised by their names. Units are determined from suffixes of the names, from the size of the numbers,
+and by which unit of the stamps makes plausible ranges; the protocol is found by trying all.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from uwblink.importers.column_map import (
 )
 from uwblink.importers.guess_columns import OF_MESSAGES, named_columns, stamp_and_event, unusable_positions
 from uwblink.importers.stamps import (
-    CLEARLY,
-    GOOD_ENOUGH,
+    ACCEPTED_SHARE,
+    FITTING_SHARE,
     MIN_ROWS,
-    SAMPLE,
+    SAMPLE_ROWS,
     Reading,
     Sample,
     Trial,
-    how_counted_in,
+    counter_format_of,
     stamps_of,
 )
 from uwblink.importers.tables import Table
@@ -57,9 +57,9 @@ _LAYOUTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """A map as TOML text with its reasons as comments, and whether it is enough to import the table.
+    """A map as TOML text with reasons as comments, and whether it is sufficient to import the table.
 
-    `asked` are keys that the table does not tell: the map says "?" there, which somebody who knows must replace.
+    `asked` are keys that cannot be determined from the table: the map has "?" there, which the user must replace.
     """
 
     text: str
@@ -68,7 +68,7 @@ class Guess:
 
 
 def guess_map(path: Path) -> Guess:
-    """Look at a table and return the map that it would be read with; raises `ImportTableError`."""
+    """Return the proposed map of a table; raises `ImportTableError`."""
     if path.suffix.lower() == ".uwb":
         raise ImportTableError(f"{path}: is a recording already, and needs no map; 'uwblink show' says what it holds")
     with Table(path) as table:
@@ -134,7 +134,7 @@ def _belongs(name: str, layout: str) -> bool:
 
 
 def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str) -> tuple[list[str], str, list[str]]:
-    """Return lines of the map on protocol and counter, the unit of stamps, and antenna delays, with their reasons."""
+    """Return the map's lines on protocol and counter, on the unit of stamps, and on antenna delays, with reasons."""
     names = [name for name in (STAMPS if layout == "exchanges" else ("tx", "rx", "stamp")) if name in cells]
     stamps: dict[str, Floats] = {name: cells[name] for name in names}
     whole = all(np.array_equal(column, np.rint(column), equal_nan=True) for column in stamps.values())
@@ -142,9 +142,9 @@ def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str)
     if layout != "exchanges":
         named = next(iter(ended), None)
         scale = STAMP_UNITS[named or "ticks"]
-        bits, kind = how_counted_in(column * scale for column in stamps.values())
+        bits, kind = counter_format_of(column * scale for column in stamps.values())
         largest = max(float(np.nanmax(column, initial=0.0)) for column in stamps.values())
-        # In nine tables of ten that hold ticks some of 22 stamps are in the last tenth of the counter.
+        # Of 22 stamps in ticks one at least is in the last tenth of the counter in nine tables of ten.
         full = whole and 0.9 * 2.0**bits < largest < 2.0**bits
         unit = named or ("ticks" if full else ASKED)
         why = "by the columns' names" if named else f"whole numbers up to 2^{bits}" if full else _ANY_UNIT
@@ -155,8 +155,8 @@ def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str)
     metres = DISTANCE_UNITS[min(_distance_units(columns), default="m")]
     trials = [trial for unit in units for trial in _trials(stamps, cells, unit, metres)]
     unit, kind, best = max(trials, key=lambda found: round(found[2].plausible, 2))
-    known = best.plausible >= GOOD_ENOUGH
-    check = "" if best.plausible >= CLEARLY else "; check columns and units"
+    known = best.plausible >= ACCEPTED_SHARE
+    check = "" if best.plausible >= FITTING_SHARE else "; check columns and units"
     share = f"{100 * best.plausible:.0f} % of its ranges are plausible, {best.low_m:.3g} to {best.high_m:.3g} m{check}"
     lines = [
         f'protocol = "{best.reading.protocol if known else ASKED}"  # {share}',
@@ -178,12 +178,12 @@ def _stamp_lines(columns: dict[str, str], cells: dict[str, Floats], layout: str)
 def _trials(
     stamps: dict[str, Floats], cells: dict[str, Floats], unit: str, metres: float
 ) -> list[tuple[str, str, Trial]]:
-    """Return what stamps in a unit give by each protocol: unit, how the counter is written, and the trial."""
-    chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE]
+    """Try stamps in a unit with each protocol; returns unit, format of the counter, and trial."""
+    chosen = np.flatnonzero(np.all([np.isfinite(column) for column in stamps.values()], axis=0))[:SAMPLE_ROWS]
     if not len(chosen):
         raise ImportTableError("its stamps are no numbers in any row")
     sampled, scale, count = {name: column[chosen] for name, column in stamps.items()}, STAMP_UNITS[unit], len(chosen)
-    bits, counter = how_counted_in(column * scale for column in sampled.values())
+    bits, counter = counter_format_of(column * scale for column in sampled.values())
     truth = cells["gt_range_m"][chosen] * metres if "gt_range_m" in cells else np.full(count, np.nan)
     pair, unknown = np.zeros(count, dtype=np.int64), np.full(count, np.nan)
     sample = Sample(sampled, pair, truth, unknown, np.zeros(count), scale)
@@ -192,7 +192,7 @@ def _trials(
     readings = [Reading(name, bits) for name in names]
     if np.isfinite(truth).any():
         readings += [replace(reading, undelayed=True) for reading in readings]
-    return [(unit, counter, sample.attempt(reading)) for reading in readings]
+    return [(unit, counter, sample.try_reading(reading)) for reading in readings]
 
 
 def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:
@@ -212,7 +212,7 @@ def _unit_lines(columns: dict[str, str], cells: dict[str, Floats]) -> list[str]:
 
 
 def _distance_units(columns: dict[str, str]) -> set[str]:
-    """Return the units that columns of ranges, true distances and positions are called after."""
+    """Return the units in the names of columns of ranges, true distances and positions."""
     ended = (_suffix(columns[name], DISTANCE_UNITS) for name in DISTANCES if name in columns)
     return {unit for unit in ended if unit}
 
@@ -232,7 +232,7 @@ def _time_unit(header: str, values: Floats) -> tuple[str, str]:
 
 
 def _suffix(header: str, units: Iterable[str]) -> str | None:
-    """Return the unit that a name ends with, as in `range_mm` or `time [ns]`."""
+    """Return the unit at the end of a name such as `range_mm` or `time [ns]`, None without one."""
     last = re.split(r"[^a-z0-9]+", header.lower().strip(")] "))[-1]
     last = {"tick": "ticks", "dtu": "ticks", "sec": "s"}.get(last, last)
     return last if last in units and last != header.lower() else None

@@ -1,6 +1,6 @@
-"""Which columns of a table are which of ours: by their names, and where names do not say it, by what is in them.
+"""Recognise the columns of a table by their names, or else by their contents.
 
-The words are those by which labs call columns, English and German, as patterns of plain names.
+The patterns cover English and German names that labs use.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 
 from uwblink.arrays import Floats
 from uwblink.importers.column_map import POSITIONS
-from uwblink.importers.stamps import CLEARLY
 from uwblink.importers.tables import Table
 from uwblink.twr import STAMPS
 
@@ -47,9 +46,9 @@ _WORDS: Final = {
 
 
 def _place(name: str) -> str:
-    """Return what columns of one of `POSITIONS` are called: `tag_x`, `anchor_pos_x_m`, `x_tag`, `x1`; `x` is whose?
+    """Return the pattern of a column of `POSITIONS`, for names such as `tag_x`, `anchor_pos_x_m`, `x_tag` and `x1`.
 
-    A single `x` is that of the initiator, which moves where anchors are called so.
+    A plain `x` is the initiator's, since the initiator moves if the other devices are called anchors.
     """
     end, axis = name.split("_")[:2]
     words, number = _WORDS[end], 1 if end == "from" else 2
@@ -91,22 +90,22 @@ _PATTERNS: Final = {
     "rxp": r"{rxp}",
     "skew": r"{skew}",
 } | {name: _place(name) for name in POSITIONS}
-"""What columns of ours are called, in terms of `_WORDS`."""
+"""Patterns of the names of columns, in terms of `_WORDS`."""
 
 _OF_MESSAGE: Final = {"poll": 1, "resp": 2, "response": 2}
 _AT_DEVICE: Final = {"resp": 1, "responder": 1, "target": 1, "anchor": 1, "init": 2, "initiator": 2, "tag": 2}
 
 
 def _plain(header: str) -> str:
-    """Return a name in small letters without accents, words joined by `_`: `first_path_1_dbm`."""
+    """Return a name in lower case without accents, its words joined by `_`: `first_path_1_dbm`."""
     bare = unicodedata.normalize("NFKD", header.replace("ß", "ss")).encode("ascii", "ignore").decode()
     return re.sub(r"[^a-z0-9]+", "_", bare.lower()).strip("_")
 
 
 def _plain_names(headers: Iterable[str]) -> dict[str, str]:
-    """Return plain names by header; powers and skews have the number of their message: `fp_power_init` is `fp_power_2`.
+    """Return plain names by header; powers and skews get the number of their message: `fp_power_init` is `fp_power_2`.
 
-    `resp` is the device where another column is of the initiator, else the message.
+    `resp` means the responding device if another column names the initiator, else the response message.
     """
     level = "(?P<level>{fpp}|{rxp}|{skew})".format_map(_WORDS)
     end, whose = _WORDS["end"], "|".join(sorted({*_OF_MESSAGE, *_AT_DEVICE}, key=len)[::-1])
@@ -122,13 +121,13 @@ def _plain_names(headers: Iterable[str]) -> dict[str, str]:
 
 
 def named_columns(headers: Iterable[str]) -> dict[str, str]:
-    """Return which column each of our names is, raw ones before others, first ones before later ones."""
+    """Return the header of each recognised column; raw columns come before others, then earlier ones first."""
     listed = sorted(headers, key=lambda header: "raw" not in header.lower())
     called = _plain_names(listed)
     found = _ends(called)
     for ours, pattern in _PATTERNS.items():
         whole = f"({pattern}){{end}}".format_map(_WORDS)
-        # A column is one thing; only the names of messages may repeat those of exchanges, until the layout is known.
+        # Each column is used once, but for names of messages, which may repeat those of exchanges at this stage.
         taken = {header for name, header in found.items() if (name in OF_MESSAGES) == (ours in OF_MESSAGES)}
         for header in listed:
             if re.fullmatch(whole, called[header]) and listed.count(header) == 1 and header not in taken:
@@ -138,7 +137,7 @@ def named_columns(headers: Iterable[str]) -> dict[str, str]:
 
 
 def _ends(called: dict[str, str]) -> dict[str, str]:
-    """Return which columns are of the two devices where these are called alike, as `node_i` and `node_j`."""
+    """Return the columns of the two devices if their names differ by a letter, as `node_i` and `node_j`."""
     letters = (("a", "b"), ("i", "j"), ("1", "2"), ("0", "1"), ("one", "two"))
     for both, form in product(letters, ("{0}_?{1}", "{0}{2}_{1}", "{0}_?{1}{2}")):
         patterns = [form.format(_WORDS["device"], letter, _WORDS["id"]) for letter in both]
@@ -150,9 +149,9 @@ def _ends(called: dict[str, str]) -> dict[str, str]:
 
 
 def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | None:
-    """Return the columns of a table with a row a stamp; None where no column says of sending or of receiving.
+    """Return the columns of a table with one stamp in each row; None without a column of transmissions and receptions.
 
-    Of several columns that are times the stamp is the one that is called after a device, or else not after the host.
+    If several columns are times, the stamp is the one whose name mentions a device, or else does not mention the host.
     """
     if all(name in columns for name in STAMPS[:4]) or ("tx" in columns and "rx" in columns):
         return None
@@ -178,15 +177,15 @@ def stamp_and_event(table: Table, columns: dict[str, str]) -> dict[str, str] | N
 
 
 def _is_event(table: Table, name: str) -> bool:
-    """Whether words of a column are of sending and of receiving, about as often."""
+    """Return whether a column has words for transmission and reception, about equally often."""
     words = np.char.lower(table.read(words=[name])[1][name])
     sent = np.isin(words, ("tx", "t", "sent", "send", "transmit", "transmitted"))
     received = np.isin(words, ("rx", "r", "received", "receive", "recv"))
-    return bool(np.mean(sent | received) > CLEARLY and 0.25 < np.mean(sent) < 0.75) if len(sent) else False
+    return bool(np.mean(sent | received) > 0.9 and 0.25 < np.mean(sent) < 0.75) if len(sent) else False
 
 
 def unusable_positions(columns: dict[str, str], cells: dict[str, Floats]) -> str:
-    """Return why positions that a table has cannot be used; nothing where they can be, or where there are none."""
+    """Return why the positions of a table cannot be used; empty text if they can, or if there are none."""
     lacking = [name for name in POSITIONS if name not in columns]
     if len(lacking) == len(POSITIONS):
         return ""

@@ -1,9 +1,9 @@
-"""Tables in which an exchange has several rows, as rows of exchanges.
+"""Tables in which an exchange has several rows, converted into one row for each exchange.
 
-Each row is a message with the stamps of its sender and its receiver ("messages"), or one of these stamps ("stamps"), or
-has some of the columns of an exchange, as where both devices report ("parts"). Rows are one group where they have the
-same devices and numbers, and follow each other by no more than `within_s` of the map. They are put in order by that; a
-group is then what lies between two rows at which one begins. Of all this only DuckDB's sort holds many rows.
+A row is a message with the stamps of its sender and its receiver ("messages"), or one of these stamps ("stamps"), or
+has some of the columns of an exchange, for example if both devices report ("parts"). Rows belong to one group if they
+have the same devices and numbers and follow each other within `within_s` of the map. The rows are sorted by these keys,
+so that each group is contiguous. Only DuckDB's sort holds many rows at once.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _WHOLE: Final = ("gt_range_m", "range_m")
 """Columns that belong to the whole exchange."""
 
 
-def exchanges_of_long(
+def assemble_exchanges(
     staging: Staging, layout: str, faults: Faults, watch: Watch | None = None
 ) -> tuple[StagedRows, str, str | None]:
-    """Return rows of "messages", "stamps" or "parts" as exchanges, and the protocol as far as they tell it.
+    """Combine rows of "messages", "stamps" or "parts" into exchanges.
 
-    The text between is SQL that is true of the rows that are whole exchanges; all others go to the faults. Raises
-    `ImportTableError`.
+    Returns the rows, an SQL condition that holds for complete exchanges, and the protocol, if the rows determine it.
+    Incomplete exchanges are faults. Raises `ImportTableError`.
     """
     rows, within_s = staging.rows, staging.column_map.within_s
     needed = {"messages": ("tx", "rx"), "stamps": ("stamp", "event", "message"), "parts": ()}
@@ -57,12 +57,12 @@ def _grouped(
     *,
     ascending: bool = False,
 ) -> StagedRows:
-    """Return a table with a row a group, whose columns are `values`: SQL aggregates over the rows of a group.
+    """Return a table with one row for each group; `values` are its columns as SQL aggregates over the group's rows.
 
-    In these `first` is true of the first row of a group, and `place` counts its rows from 1. Rows are in the order of
-    their keys, their time, and as they came. With `ascending` numbers of messages only go up in a group.
+    In these `first` is true for the first row of a group, and `place` counts its rows from 1. Rows are sorted by keys,
+    time and original order. With `ascending` a group ends where the number of the message does not increase.
     """
-    # Small types: with keys of 32 bytes or less, one more for each column, DuckDB sorts in half the time.
+    # DuckDB sorts in half the time if the keys have 32 bytes or less, including one for each column.
     cells = {name: name for name in rows.columns} | {"origin": "CAST(origin AS UINTEGER)"}
     kinds = {"sequence": "BIGINT", "message": "TINYINT"}
     cells |= {name: f"TRY_CAST(trunc({name}) AS {kind})" for name, kind in kinds.items() if name in cells}
@@ -79,7 +79,7 @@ def _grouped(
     if ascending:
         same.append("coalesce(message > lag(message) OVER (), false)")
     marked = f"SELECT *, rowid AS serial, NOT ({' AND '.join(same)}) AS first FROM sorted"
-    # Windows without an order go through the rows one after the other, and hold none.
+    # Windows without ORDER BY stream through the rows.
     start = "max(CASE WHEN first THEN serial END) OVER (ROWS UNBOUNDED PRECEDING)"
     placed = f"SELECT *, {start} AS start, serial - {start} + 1 AS place FROM ({marked})"
     listed = ", ".join(f"{value} AS {column}" for column, value in values.items())
@@ -90,22 +90,22 @@ def _grouped(
 
 
 def _of_first(rows: StagedRows, *more: str) -> dict[str, str]:
-    """Return aggregates that take columns of a group from its first row."""
+    """Return aggregates that take columns from the first row of a group."""
     names = ("origin", "from_id", "to_id", "time_ns", *more)
     return {name: f"any_value({name}) FILTER (first)" for name in names if name in rows.columns}
 
 
 def _exchanges_of_messages(rows: StagedRows, good: str, faults: Faults, within_s: float) -> tuple[StagedRows, str, str]:
-    """Return messages as exchanges, which messages are whole, and the protocol that most of them tell.
+    """Combine messages into exchanges; returns rows, the condition for complete exchanges, and the protocol of most.
 
-    Messages are 1, 2 and 3, by a column (or 0, 1 and 2 there) or by their order. The first one's sender is the
-    initiator; who sends the third tells "ds" from "ds-alt".
+    Messages are numbered 1, 2 and 3 (or 0, 1 and 2) by a column, or by their order. The sender of the first is the
+    initiator; the sender of the third distinguishes "ds" from "ds-alt".
     """
     number = "place"
     if rows.has("message"):
         numbers = "count(message), count(*) FILTER (message = 0), max(message)"
         ((some, zeros, largest),) = rows.db.execute(f"SELECT {numbers} FROM {rows.name} WHERE {good}").fetchall()
-        # From 0 where all do: a few zeros are damage.
+        # Numbers begin at 0 if many are 0; a few zeros are damaged cells.
         number = "message + 1" if some and largest <= 2 and 4 * zeros > some else "message"
     values = _of_first(rows, *_WHOLE)
     for n in (1, 2, 3):
@@ -124,7 +124,7 @@ def _exchanges_of_messages(rows: StagedRows, good: str, faults: Faults, within_s
 
 
 def _messages_of_stamps(rows: StagedRows, good: str, faults: Faults, within_s: float) -> tuple[StagedRows, str]:
-    """Return single stamps as messages, and which have one stamp of their sender and one of their receiver."""
+    """Combine stamps into messages; returns rows and the condition that both stamps are there once."""
     cells = [n for n in ("sequence", "message", *_POWERS, *_WHOLE) if n in rows.columns]
     values = _of_first(rows) | {name: f"max({name})" for name in cells}
     for name, event in (("tx", 1), ("rx", 2)):
@@ -137,7 +137,7 @@ def _messages_of_stamps(rows: StagedRows, good: str, faults: Faults, within_s: f
 
 
 def _exchanges_of_parts(rows: StagedRows, good: str, faults: Faults, within_s: float) -> tuple[StagedRows, str, None]:
-    """Return rows that each have some of the columns as exchanges, and in which no stamp has two values."""
+    """Combine rows with some of the columns into exchanges; the condition is that no stamp has two values."""
     # The initiator is whoever the row with its first stamp names first.
     values = _of_first(rows)
     if rows.has("tx1"):

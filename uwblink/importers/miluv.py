@@ -1,4 +1,4 @@
-"""A flight of the MILUV dataset, as its authors publish it, into a recording.
+"""Import of flights of the MILUV dataset in the form in which its authors publish them.
 
 A folder holds one folder a robot with `uwb_range.csv`, and optionally `uwb_passive.csv`, `uwb_cir.csv`, `mocap.csv`,
 `imu_px4.csv` and `height.csv`, and beside those `timeshift.yaml`, `tags.yaml` (lever arms) and `anchors.yaml`
@@ -19,7 +19,7 @@ import yaml
 
 from uwblink.arrays import Floats
 from uwblink.errors import ImportTableError, first_line
-from uwblink.importers.stamps import NEVER, clocks, to_ticks, whole
+from uwblink.importers.stamps import MISSING, clocks, to_ticks, whole
 from uwblink.importers.tables import Columns, Table
 from uwblink.recording.contents import Contents
 from uwblink.recording.distances import distances_m
@@ -36,9 +36,9 @@ _ENDS: Final = {"initiator": "from_id", "target": "to_id"}
 
 @dataclass(slots=True)
 class Flight:
-    """A folder, its robots' folders, and what was found in them that is no row: doubled ones by file, and faults.
+    """A folder, its robots' folders, the number of duplicate rows by file, and faults.
 
-    Times are nanoseconds since the clock of the folder began.
+    Times are nanoseconds on the clock of the folder.
     """
 
     folder: Path
@@ -48,10 +48,10 @@ class Flight:
 
 
 def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
-    """Return the flight in `folder`; rows that stand in the files of two robots are taken once.
+    """Return the flight in `folder`; rows that are in the files of two robots are imported once.
 
-    `map_file` may name the anchors of anchors.yaml (`constellation = "0"`); else they are those whose distances are
-    `gt_range`. `meta["notes"]` says what was left out. Raises `ImportTableError`.
+    `map_file` may name the constellation of anchors.yaml (`constellation = "0"`); by default it is the one whose
+    distances agree with `gt_range`. `meta["notes"]` lists what was left out. Raises `ImportTableError`.
     """
     wanted = _constellation(map_file)
     if not folder.is_dir():
@@ -66,7 +66,7 @@ def read_miluv(folder: Path, map_file: Path | None = None) -> Contents:
     poses, tags = _read_poses(flight), _read_tags(flight)
     constellation, off_m, places = _find_anchors(flight, exchanges, measured_m, poses, tags, wanted)
     poses, tags = _with_anchors(poses, tags, places)
-    # What the authors measured stands in where a tag's place is not known, and nowhere else.
+    # The distances measured by the authors are used only if the position of a tag is not known.
     known_m = distances_m(poses, tags, exchanges.initiator, exchanges.target, exchanges.time_ns)
     truth_m = np.where(np.isfinite(known_m), np.nan, measured_m)
     ranging = {*exchanges.initiator.tolist(), *exchanges.target.tolist()} - {tag.tag for tag in tags}
@@ -129,11 +129,11 @@ def _read(
     by_clock: tuple[tuple[str, ...], ...] = (),
     lists: Mapping[str, str] = {},
 ) -> Columns:
-    """Return the rows of all robots' files of one name in order of time; nothing where no robot has such rows.
+    """Return the rows of all robots' files of one name in order of time; an empty dictionary if there are none.
 
-    `ids`, `numbers` and so on are the files' columns by ours; `{raw}` stands for `_raw` where a file has that. Rows
-    with ids are taken once; those without are of the robot's body. Rows in which a number is missing that is not
-    optional go to the faults.
+    `ids`, `numbers` and so on map names of columns to those of the files; `{raw}` is replaced by `_raw` if a file has
+    such columns. Duplicates of rows with ids are dropped; rows without ids belong to the robot's body. Rows that lack
+    a number that is not optional are faults.
     """
     parts: list[Columns] = []
     for robot in flight.robots:
@@ -148,7 +148,7 @@ def _read(
                 n: table.query({"taps": f"TRY_CAST({table.word(h)} AS USMALLINT[])"})["taps"] for n, h in lists.items()
             }
         time_ns = whole(found["timestamp"] * 1e9)
-        good, count = time_ns != NEVER, len(time_ns)
+        good, count = time_ns != MISSING, len(time_ns)
         columns: Columns = {"time_ns": time_ns}
         if not ids:
             columns["body"] = np.full(count, robot.name)
@@ -157,7 +157,7 @@ def _read(
             good &= (values >= 0) & (values <= LARGEST_ID) & (values == np.rint(values))
             columns[ours] = whole(values)
         ticks = to_ticks({n: found[named[n]] for n in stamps}, by_clock, TICKS_PER_SECOND * 1e-9, REPORT_BITS)
-        good &= np.all([column != NEVER for column in [time_ns, *ticks.values()]], axis=0)
+        good &= np.all([column != MISSING for column in [time_ns, *ticks.values()]], axis=0)
         columns |= ticks | {ours: found[named[ours]] for ours in numbers}
         good &= np.all([np.ones(count), *(np.isfinite(columns[ours]) for ours in numbers)], axis=0)
         columns |= {n: found[extra[n]] if n in extra else np.full(count, np.nan) for n in optional}
@@ -197,7 +197,7 @@ def _read_exchanges(flight: Flight) -> tuple[Exchanges, Floats]:
 
 
 def _read_overheard(flight: Flight) -> Columns:
-    """Return the exchanges that robots overheard: what the listener measured, and what the two robots did (`_n`)."""
+    """Return overheard exchanges: measurements of the listener, and those of the two robots (`_n`)."""
     own = {f"rx{k}": f"rx{k}{{raw}}" for k in (1, 2, 3)}
     neighbours = {f"{name}_n": f"{name}{{raw}}_n" for name in STAMPS}
     by_clock = (tuple(own), *(tuple(f"{name}_n" for name in clock) for clock in clocks("ds")))
@@ -216,7 +216,7 @@ def _cir_rows(columns: Columns) -> list[CirRow]:
 
 
 def _read_poses(flight: Flight) -> Poses:
-    """Return the poses of the robots, none where there is no motion capture."""
+    """Return the poses of the robots; none without motion capture."""
     names = [*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw")]
     columns = _read(flight, "mocap.csv", {}, {name: name for name in names})
     if not columns:
@@ -231,7 +231,7 @@ def _read_poses(flight: Flight) -> Poses:
 
 
 def _read_tags(flight: Flight) -> list[Tag]:
-    """Return the robots' tags and lever arms from tags.yaml; none where there is no such file."""
+    """Return the robots' tags and lever arms from tags.yaml; none without such a file."""
     path = flight.folder / "tags.yaml"
     arms, names = _read_vectors(path) if path.exists() else {}, {robot.name for robot in flight.robots}
     return [Tag(number, body, arm) for body, tags in arms.items() if body in names for number, arm in tags.items()]
@@ -240,11 +240,11 @@ def _read_tags(flight: Flight) -> list[Tag]:
 def _find_anchors(
     flight: Flight, exchanges: Exchanges, measured_m: Floats, poses: Poses, tags: list[Tag], wanted: str | None
 ) -> tuple[str | None, float, dict[int, tuple[float, float, float]]]:
-    """Return the constellation called `wanted`, or else the one whose distances are those of `gt_range`.
+    """Return the constellation `wanted`, or else the one whose distances agree with `gt_range`.
 
-    It is the name (None: no anchors known), the median difference of its distances from `gt_range`, NaN where nothing
-    can be compared, and places by anchor. Raises `ImportTableError` for a name that anchors.yaml does not have, and
-    where no constellation fits.
+    Returns its name (None without anchors), the median difference of its distances from `gt_range` (NaN if none can be
+    compared), and positions by anchor. Raises `ImportTableError` for a name that is not in anchors.yaml, and if no
+    constellation fits.
     """
     path = flight.folder / "anchors.yaml"
     if not path.exists():
@@ -279,7 +279,7 @@ def _find_anchors(
 def _with_anchors(
     poses: Poses, tags: list[Tag], places: dict[int, tuple[float, float, float]]
 ) -> tuple[Poses, list[Tag]]:
-    """Return poses and tags with those of anchors: each alone on a body with a single pose, which does not move."""
+    """Return poses and tags with anchors added, each on a body of its own with a single pose."""
     numbers = sorted(places)
     anchors = [Tag(number, f"anchor{number}", (0.0, 0.0, 0.0)) for number in numbers]
     begins = int(poses.time_ns.min()) if len(poses) else 0

@@ -1,4 +1,4 @@
-"""Motion-capture poses from files, as truth of a recording: CSV with a body a row, TUM and EuRoC, ROS bags.
+"""Motion-capture poses from files: CSV, TUM, EuRoC and ROS bags.
 
 CSV has the columns `time_s` (or `time_ns`), `body`, `x, y, z` (metres, ENU) and `qx, qy, qz, qw` (body to world). TUM
 has `time x y z qx qy qz qw` separated by blanks, and EuRoC `time_ns, x, y, z, qw, qx, qy, qz, ...` below a line that
@@ -18,7 +18,7 @@ import numpy as np
 
 from uwblink.arrays import Floats, Ints, few_words
 from uwblink.errors import ImportTableError, RecordingExistsError
-from uwblink.importers.bags import opened
+from uwblink.importers.bags import open_bag
 from uwblink.importers.tables import Table
 from uwblink.importers.units import other_unit
 from uwblink.recording.distances import distances_m, find_offset
@@ -29,7 +29,7 @@ from uwblink.text_files import read_text, require_regular
 from uwblink.twr import LATEST_NS, Exchanges, raw_range
 
 Place = Callable[[int, str], tuple[int, str]]
-"""Returns the line of a pose, the first being 0, and what stands there in a column."""
+"""Returns the line number of a pose, counted from 0, and the text of one of its cells."""
 
 MESSAGES: Final = {
     "geometry_msgs/msg/PoseStamped": ("pose.position", "pose.orientation", False),
@@ -40,10 +40,8 @@ MESSAGES: Final = {
     "foxglove.PoseInFrame": ("pose.position", "pose.orientation", False),
     "foxglove.FrameTransform": ("translation", "rotation", True),
 }
-"""The messages that carry poses, those first that are taken where a bag has several kinds.
-
-Each with where in it position and attitude are, and whether its child frame is called after the body.
-"""
+"""Message types with poses, in order of preference: the fields of position and attitude, and whether the child frame
+has the name of the body."""
 
 DRIVERS: Final = frozenset(
     {
@@ -52,13 +50,13 @@ DRIVERS: Final = frozenset(
         "odom", "poses", "tf",
     }
 )  # fmt: skip
-"""What motion-capture nodes call all of their topics, beside the name of a body."""
+"""Parts of topic names that are not the name of a body."""
 
 
 def read_poses(path: Path, body: str | None = None, topics: Mapping[str, str] | None = None) -> Poses:
-    """Read poses by the file's kind; raises `ImportTableError`.
+    """Read poses from a file by its suffix; raises `ImportTableError`.
 
-    `body` names the body of a file that does not; `topics` are those of a bag to read, by body.
+    `body` is the body of files without names of bodies; `topics` are the topics of a bag to read, by body.
     """
     require_regular(path, ImportTableError, "file of poses", folders=True)
     kind = "bag" if path.is_dir() else path.suffix.lower().lstrip(".")
@@ -98,7 +96,7 @@ def _from_table(path: Path, body: str | None) -> Poses:
                 "in metres and between commas"
             )
         cells = {name: table.number(name) for name in (*POSE, time)}
-        # One query, as a file that somebody is still writing is longer when it is read again.
+        # One query only: a file that is still being written would be longer the second time.
         cells |= {"exact": table.whole_number(time)} if time == "time_ns" else {}
         cells |= {} if body else {"body": table.word("body")}
         found = table.query(cells)
@@ -117,7 +115,7 @@ def _from_table(path: Path, body: str | None) -> Poses:
             )
         seconds = numbers.pop(time)
         time_ns = _nanoseconds(path, time, seconds, place)
-        if "exact" in cells:  # also those that no float holds
+        if "exact" in cells:  # floats are not exact for nanoseconds since 1970
             time_ns = np.where(np.ma.getmaskarray(found["exact"]), time_ns, np.ma.getdata(found["exact"]))
         values = np.column_stack([numbers[name] for name in POSE])
         return _poses(path, time_ns, bodies, values, place)
@@ -150,7 +148,7 @@ def _from_lines(path: Path, body: str | None, *, euroc: bool) -> Poses:
 
     order = [names.index(name) for name in POSE]
     time_ns = _nanoseconds(path, time, np.array(seconds), place)
-    time_ns = np.where(np.array(exact, dtype=np.int64) != 0, exact, time_ns)  # no float holds nanoseconds since 1970
+    time_ns = np.where(np.array(exact, dtype=np.int64) != 0, exact, time_ns)  # floats are not exact for these
     return _poses(path, time_ns, np.full(len(lines), body), np.array(values).reshape(-1, 7)[:, order], place)
 
 
@@ -162,7 +160,7 @@ def _number(cell: str) -> float:
 
 
 def _nanoseconds(path: Path, name: str, times: Floats, place: Place) -> Ints:
-    """Return times in whole nanoseconds, of a column in seconds or in nanoseconds."""
+    """Return times of a column in seconds or nanoseconds as whole nanoseconds."""
     # Seconds since 1970 have ten digits; a float of them is good to 0.2 us.
     scaled = times if name == "time_ns" else times * 1e9
     wrong = ~(np.abs(scaled) <= LATEST_NS)
@@ -173,7 +171,7 @@ def _nanoseconds(path: Path, name: str, times: Floats, place: Place) -> Ints:
 
 
 def _poses(path: Path, time_ns: Ints, body: np.ndarray, values: Floats, place: Place | None = None) -> Poses:
-    """Return poses in order of time; `values` (n, 7) are `POSE`, finite ones where there is a place of each."""
+    """Return poses in order of time; `values` (n, 7) are the columns of `POSE`. `place` is for messages of errors."""
     wrong = ~np.isfinite(values)
     if place is not None and wrong.any():
         row, column = (int(k) for k in np.argwhere(wrong)[0])
@@ -189,12 +187,11 @@ def _poses(path: Path, time_ns: Ints, body: np.ndarray, values: Floats, place: P
 def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
     """Return the poses of a bag.
 
-    `topics` are those to read by the body that they are of. Without it all topics of PoseStamped are, or, where there
-    are none, all of the next kind of `MESSAGES`; a body is what a topic is called beside the name of its driver, and
-    that of a transform its child frame.
+    `topics` are the topics to read, by body. By default these are all topics of the first type of `MESSAGES` that the
+    bag has. The name of the body is the topic's without that of the driver, or the child frame of a transform.
     """
     times, bodies, values = list[int](), list[str](), array("d")
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         wanted = _chosen_topics(path, bag.kinds, topics)
         for topic, kind, _, message in bag.messages(wanted):
             try:
@@ -209,7 +206,7 @@ def _from_bag(path: Path, topics: Mapping[str, str] | None) -> Poses:
 
 
 def body_of(topic: str) -> str:
-    """Return the body of a topic: its first part that is not what motion-capture nodes call all of theirs."""
+    """Return the body of a topic: the first part of its name that is not in `DRIVERS`."""
     return _body_in(topic) or topic
 
 
@@ -218,7 +215,7 @@ def _body_in(name: str) -> str:
 
 
 def _chosen_topics(path: Path, kinds: Mapping[str, str], topics: Mapping[str, str] | None) -> dict[str, str | None]:
-    """Return the topics to read and the bodies they are of; None where the message or the topic's name says it."""
+    """Return the topics to read and their bodies; None if message or topic name the body."""
     for topic in (topics or {}).values():
         if kinds.get(topic) not in MESSAGES:
             known = ", ".join(sorted(name for name, kind in kinds.items() if kind in MESSAGES)) or "none"
@@ -238,7 +235,7 @@ def _chosen_topics(path: Path, kinds: Mapping[str, str], topics: Mapping[str, st
 
 
 def _of_message(kind: str, message: Any) -> Iterator[tuple[int, str, list[float]]]:
-    """Yield time in nanoseconds, body (empty where the message does not say it), and `POSE` of each pose."""
+    """Yield time in nanoseconds, body (empty if the message has none), and the values of `POSE` for each pose."""
     position, attitude, named = MESSAGES[kind]
     for one in message.transforms if kind == "tf2_msgs/msg/TFMessage" else [message]:
         is_json = isinstance(one, dict)
@@ -261,7 +258,7 @@ def _at(message: Any, path: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class AddedPoses:
-    """What was added: how many poses of which bodies, the offset used, and how many exchanges they cover."""
+    """Added poses: their number, bodies and offset, and the number of exchanges that they cover."""
 
     poses: int
     bodies: tuple[str, ...]
@@ -280,7 +277,7 @@ def add_poses(
     topics: Mapping[str, str] | None = None,
     force: bool = False,
 ) -> AddedPoses:
-    """Put poses from a file, or files by body, into a recording; `offset` is in seconds, or "auto".
+    """Add poses from a file, or from files by body, to a recording; `offset` is in seconds, or "auto".
 
     `tags_from` is a TOML file with `[[tags]]`, and `[[anchors]]` that stand still. `topics` are those of a bag to read,
     by body; `body` names that of a file which does not. Raises `RecordingExistsError` where there are poses already,
@@ -327,7 +324,7 @@ def add_poses(
 
 
 def _check_units(what: str, exchanges: Exchanges, poses: Poses, tags: Sequence[Tag], shift_ns: int = 0) -> None:
-    """Raise `ImportTableError` where the ranges say that positions, lever arms or themselves are not in metres."""
+    """Raise `ImportTableError` if positions, lever arms or ranges are evidently not in metres."""
     rows = np.unique(np.linspace(0, len(exchanges) - 1, 2000).astype(np.int64))
     some = exchanges[rows]
     ranges, time_ns = raw_range(some), some.time_ns - shift_ns
@@ -357,7 +354,7 @@ def _bodies(poses: Poses) -> set[str]:
 
 
 def _in_order(parts: list[Poses]) -> Poses:
-    """Return poses in order of time; those that stand still are given the time of the first that do not."""
+    """Join poses in order of time; single poses of bodies that stand still get the first time of the others."""
     if len(parts) == 1:
         return parts[0]
     first = min((int(part.time_ns.min()) for part in parts if len(part) > 1), default=0)

@@ -1,8 +1,7 @@
-"""The rows of tables, read once and staged in a database: columns by the names of a map, ids as numbers, SI units.
+"""Staging of tables in a database: columns by the names of a map, ids as numbers, SI units.
 
-The database belongs to the process. It keeps 350 MB in memory, and the rest in a folder for temporary files (`TMPDIR`)
-that vanishes with it, so memory does not grow with the tables. What all rows decide (whether ids are words, whether
-times are) is asked of what was staged; such columns are read a second time.
+The database is temporary. It keeps 350 MB in memory and the rest in a temporary folder (`TMPDIR`), so memory does not
+grow with the tables. Whether ids or times are words depends on all rows: such columns are read a second time.
 """
 
 from __future__ import annotations
@@ -18,25 +17,24 @@ import numpy as np
 
 from uwblink.errors import ImportTableError, first_line
 from uwblink.importers.column_map import DISTANCES, IDS, NAMES, POWERS, TIME_UNITS, ColumnMap
-from uwblink.importers.tables import Columns, Table, confined
+from uwblink.importers.tables import Columns, Table, connect_to
 from uwblink.twr import LARGEST_ID, LATEST_NS, STAMPS
 
 if TYPE_CHECKING:
     import duckdb
 
 ROWS_AT_ONCE: Final = 245_760
-"""Twice what DuckDB keeps together: parts of that would stay apart in a recording."""
+"""Two row groups of DuckDB: smaller blocks would remain separate row groups in a recording."""
 
 Watch = Callable[[str, float], object]
-"""Called with the step that runs ("reading", "writing" ...) and the share of it that is done."""
+"""Callback for progress: the current step ("reading", "writing" ...) and the share of it that is done."""
 
 
 @dataclass(frozen=True, slots=True)
 class StagedRows:
-    """Rows in a table or view of a database: `row` counts them, and `origin` is their place among all rows read.
+    """Rows of a table or view: `row` numbers them, and `origin` is their number among all rows read.
 
-    `from_id` and `to_id` are INTEGER, `time_ns` is BIGINT, all other `columns` are DOUBLE; NULL where a cell holds
-    none.
+    `from_id` and `to_id` are INTEGER, `time_ns` is BIGINT, all other `columns` are DOUBLE; missing values are NULL.
     """
 
     db: duckdb.DuckDBPyConnection
@@ -44,7 +42,7 @@ class StagedRows:
     columns: tuple[str, ...]
 
     def count(self, where: str = "true") -> int:
-        """Return the number of rows that fulfil a condition."""
+        """Return the number of rows that fulfil an SQL condition."""
         return int(self.db.execute(f"SELECT count(*) FROM {self.name} WHERE {where}").fetchall()[0][0])
 
     def has(self, name: str) -> bool:
@@ -52,9 +50,9 @@ class StagedRows:
         return ("time_ns" if name == "time_s" else name) in self.columns
 
     def read(self, more: str, columns: Collection[str] | None = None) -> Columns:
-        """Return columns (None: all) as arrays (n,), NaN where there is nothing; `more` follows the table in the query.
+        """Return columns (None: all) as arrays (n,), NaN for missing values; `more` follows the table in the query.
 
-        Ids and times are read of rows that have them.
+        The rows must have ids and times.
         """
         chosen = ", ".join(name for name in self.columns if columns is None or name in columns)
         found = self.db.execute(f"SELECT {chosen} FROM {self.name} {more}").fetchnumpy()
@@ -67,21 +65,21 @@ class StagedRows:
         }
 
     def blocks(self, where: str = "true") -> Iterator[Columns]:
-        """Yield the rows that fulfil a condition in their order, some at a time."""
+        """Yield the rows that fulfil a condition in their order, block by block."""
         for start in range(0, self.count(), ROWS_AT_ONCE):
-            # Rows come in their order without being asked to, which would sort them.
+            # DuckDB keeps the order of rows; ORDER BY would sort them.
             yield self.read(f"WHERE row >= {start} AND row < {start + ROWS_AT_ONCE} AND {where}")
 
 
 @contextmanager
 def staged(paths: Sequence[Path], column_map: ColumnMap, watch: Watch | None = None) -> Iterator[Staging]:
-    """Yield tables as one, which are forgotten after the block; raises `ImportTableError`, also where the disk is full.
+    """Stage several tables as one for the duration of the block; raises `ImportTableError`, also if the disk is full.
 
-    Of the tables the columns are read that the map names, and those that have our names.
+    Columns are read if the map names them, or if their names are in `NAMES`.
     """
     import duckdb
 
-    with TemporaryDirectory(prefix="uwblink-") as folder, confined(paths, folder) as db:
+    with TemporaryDirectory(prefix="uwblink-") as folder, connect_to(paths, folder) as db:
         try:
             yield Staging(db, paths, column_map, watch)
         except (duckdb.OutOfMemoryException, duckdb.IOException) as error:
@@ -92,10 +90,10 @@ def staged(paths: Sequence[Path], column_map: ColumnMap, watch: Watch | None = N
 
 
 class Staging:
-    """Tables as one: their `rows`.
+    """Tables staged as one; `rows` are their rows.
 
-    `names` are the ids that were words, by the number that they got; `offsets` are the place of the first row of each
-    table among all rows, and the number of all.
+    `names` are the ids that were words, by assigned number; `offsets` are the numbers of each table's first row among
+    all rows, and the number of all rows.
     """
 
     def __init__(
@@ -111,14 +109,14 @@ class Staging:
             if watch:
                 watch("reading", k / len(paths))
             self._add(Table(path, column_map.delimiter, column_map.decimal, db=db, key=k))
-            counts.append(self._ask("count(*)"))
+            counts.append(self._query_number("count(*)"))
         self.offsets = np.array(counts)
         if not counts[-1]:
             raise ImportTableError(f"{paths[0]}: a header and no rows")
         self.rows = self._make_rows()
 
     def missing(self, name: str) -> ImportTableError:
-        """Return the error that says which column the tables lack."""
+        """Return the error for a missing column."""
         names, header = self.tables[0].names, self.column_map.header(name)
         remedy = "a `map_file` can rename columns or give constants, and `uwblink import guess` proposes one"
         if {"qx", "qy", "qz", "qw"} <= {name.lower() for name in names}:
@@ -127,7 +125,7 @@ class Staging:
         return ImportTableError(f"{self.paths[0]}: column {header!r} is missing; there are {there}; {remedy}")
 
     def _add(self, table: Table) -> None:
-        """Stage the columns of one more table."""
+        """Stage the columns of another table."""
         self.tables.append(table)
         column_map = self.column_map
         wanted = {name: column_map.header(name) for name in NAMES if name not in column_map.constants}
@@ -145,18 +143,18 @@ class Staging:
         self._stage("staged", table, cells)
 
     def _stage(self, name: str, table: Table, cells: dict[str, str]) -> None:
-        """Read SQL expressions of columns of a table into one of the database."""
+        """Read SQL expressions of a table's columns into a table of the database."""
         chosen = ", ".join(f"{cell} AS {column}" for column, cell in cells.items())
         into = f"CREATE TABLE {name} AS" if table is self.tables[0] else f"INSERT INTO {name}"
         with table.reading():
             self.db.execute(f"{into} SELECT {chosen} FROM {table.source}")
 
-    def _ask(self, number: str) -> int:
-        """Return a number that a query finds in what is staged."""
+    def _query_number(self, number: str) -> int:
+        """Return the value of an SQL expression over the staged rows."""
         return int(self.db.execute(f"SELECT {number} FROM staged").fetchall()[0][0])
 
-    def _put_beside(self, query: str) -> None:
-        """Put the columns that a query returns beside those that are staged, row by row."""
+    def _add_columns(self, query: str) -> None:
+        """Add the columns of a query to the staged rows, row by row."""
         self.db.execute(f"CREATE TABLE beside AS {query}")
         self.db.execute("CREATE TABLE wider AS SELECT * FROM staged POSITIONAL JOIN beside")
         self.db.execute("DROP TABLE staged")
@@ -164,11 +162,11 @@ class Staging:
         self.db.execute("ALTER TABLE wider RENAME TO staged")
 
     def _make_rows(self) -> StagedRows:
-        """Return a view of what is staged with exact numbers, SI units, and ids as numbers."""
+        """Return a view of the staged rows with exact numbers, SI units, and ids as numbers."""
         exact, column_map = self._read_again(), self.column_map
         values = {name: name for name in self._headers}
         values |= {n: f"CAST({v!r} AS DOUBLE)" for n, v in column_map.constants.items() if not isinstance(v, str)}
-        # The low 40 bits of ticks are all that differences need.
+        # Differences need only the low 40 bits of ticks.
         low = {n: f"CAST({n}_exact & {(1 << 40) - 1} AS DOUBLE)" for n in exact if n in _COUNTED}
         values |= {n: f"CASE WHEN {n} = trunc({n}) THEN {value} ELSE {n} END" for n, value in low.items()}
         factors = dict.fromkeys(DISTANCES, column_map.metres_per_unit) | dict.fromkeys(POWERS, column_map.power_sign)
@@ -184,18 +182,18 @@ class Staging:
         return StagedRows(self.db, "rows", ("origin", *values))
 
     def _read_again(self) -> set[str]:
-        """Read columns again that are words, or hold whole numbers that no float does; returns which."""
+        """Read columns of words, and of integers that floats cannot represent, again; returns their names."""
         found: dict[str, Callable[[Table, str], str]] = {}
         for name in self._headers:
             unit = self.column_map.time_unit
             counted = name in _COUNTED and self.column_map.ticks_per_unit == 1.0
             if name in IDS:
-                # A few ids that are no numbers are faults; more than that say that ids are words.
-                if self._ask(f"count(*) - count(*) FILTER ({_is_id(name)})") > 0.01 * self.offsets[-1]:
+                # Up to 1 % of ids that are not numbers are faults; with more, ids are words.
+                if self._query_number(f"count(*) - count(*) FILTER ({_is_id(name)})") > 0.01 * self.offsets[-1]:
                     found[name] = Table.word
-            elif name == "time_s" and (unit == "iso" or (unit is None and not self._ask("count(time_s)"))):
+            elif name == "time_s" and (unit == "iso" or (unit is None and not self._query_number("count(time_s)"))):
                 found[name] = Table.time_ns
-            elif (counted or (name == "time_s" and unit == "ns")) and self._ask(
+            elif (counted or (name == "time_s" and unit == "ns")) and self._query_number(
                 f"count(*) FILTER (abs({name}) >= {2**53})"
             ):
                 found[name] = Table.whole_number  # not all whole numbers from 2**53 on are floats
@@ -203,12 +201,12 @@ class Staging:
             for table in self.tables:
                 cells = {f"{name}_exact": cell(table, self._headers[name]) for name, cell in found.items()}
                 self._stage("again", table, cells)
-            self._put_beside("SELECT * FROM again")
+            self._add_columns("SELECT * FROM again")
             self.db.execute("DROP TABLE again")
         return set(found)
 
     def _ids(self, values: dict[str, str], exact: set[str]) -> dict[str, str]:
-        """Return ids as whole numbers, NULL where there is none; words get numbers."""
+        """Return SQL expressions of ids as whole numbers, NULL if missing; words get numbers."""
         told = {n: v for n, v in self.column_map.constants.items() if n in IDS and isinstance(v, str)}
         numbers = {
             n: f"CASE WHEN {_is_id(values[n])} THEN CAST({values[n]} AS INTEGER) END" for n in IDS if n in values
@@ -219,7 +217,7 @@ class Staging:
         found = set(told.values())
         for word in words.values():
             # A million different words are more than ids can be written in.
-            if self._ask(f"approx_count_distinct({word})") > 1_000_000:
+            if self._query_number(f"approx_count_distinct({word})") > 1_000_000:
                 raise self._too_many_ids()
             found |= {str(one) for (one,) in self.db.execute(f"SELECT DISTINCT {word} FROM staged").fetchall()}
         known = self._number_words(sorted(found - {""}))
@@ -228,13 +226,13 @@ class Staging:
             self.db.register("known", columns)
             joined = " ".join(f"LEFT JOIN known {n} ON {n}.word = {word}" for n, word in words.items())
             chosen = ", ".join(f"CAST(nullif({n}.number, -1) AS INTEGER) AS {n}_number" for n in words)
-            self._put_beside(f"SELECT {chosen} FROM staged {joined} ORDER BY staged.rowid")
+            self._add_columns(f"SELECT {chosen} FROM staged {joined} ORDER BY staged.rowid")
             self.db.unregister("known")
         return {n: f"{n}_number" for n in words} | {n: f"CAST({known[word]} AS INTEGER)" for n, word in told.items()}
 
     def _number_words(self, words: list[str]) -> dict[str, int]:
-        """Return the number of each id: its own, that of the map, or else a free one in the order of the words."""
-        # Texts of thousands of digits are no numbers to Python, either.
+        """Return the number of each id: its own, the map's, or else the next free one in alphabetical order."""
+        # Python does not convert texts of thousands of digits.
         numbers = {w: int(w) for w in words if w.isdecimal() and len(w) < 9 and int(w) <= LARGEST_ID}
         if len(numbers) == len(words):
             return numbers

@@ -1,8 +1,8 @@
-"""Stamps of other devices as ticks of one counter, and whether they make ranges, by a protocol or by another one.
+"""Conversion of stamps into ticks of one counter, and tests whether they make plausible ranges with a protocol.
 
-Stamps come in any unit, wrapped, signed or unwrapped. A range is plausible from two metres below zero (antenna delays)
-to two kilometres above, widened for single-sided ranging by what clocks 50 ppm apart add in its reply; where a distance
-was measured, within 50 m of it. What missing antenna delays add is subtracted before: 154 m where none were programmed.
+Stamps have any unit and are wrapped, signed or unwrapped. A range is plausible between -2 m (antenna delays) and 2 km,
+extended for single-sided ranging by the error of clocks 50 ppm apart over the reply, and within 50 m of the measured
+distance, if there is one. The effect of missing antenna delays is subtracted before: 154 m if none were programmed.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from uwblink.protocols.table import PROTOCOLS
 from uwblink.ticks import ANTENNA_DELAY_TICKS, METRES_PER_TICK, SPEED_OF_LIGHT, TICK_S
 from uwblink.twr import STAMPS, Exchanges, intervals, raw_range
 
-NEVER: Final = np.iinfo(np.int64).min
-"""In place of a whole number that is missing."""
+MISSING: Final = np.iinfo(np.int64).min
+"""Stands for a missing integer."""
 
 MIN_ROWS: Final = 20
-"""Fewer rows may agree with anything."""
+"""Fewer rows can agree with any assumption by chance."""
 
-SAMPLE: Final = 2000
-"""Rows on which other readings are tried."""
+SAMPLE_ROWS: Final = 2000
+"""Number of rows on which readings are tried."""
 
-GOOD_ENOUGH: Final = 0.5
-"""Share of plausible ranges from which on no other reading is looked for."""
+ACCEPTED_SHARE: Final = 0.5
+"""From this share of plausible ranges on, a reading is accepted without trying others."""
 
-CLEARLY: Final = 0.9
-"""Share of plausible ranges from which on another reading fits."""
+FITTING_SHARE: Final = 0.9
+"""From this share of plausible ranges on, another reading fits."""
 
 
 def whole(values: Floats) -> Ints:
-    """Return numbers rounded to whole ones, `NEVER` where there is none."""
+    """Return numbers (n,) rounded to integers, `MISSING` for NaN and for those that do not fit."""
     with np.errstate(invalid="ignore"):
         good = np.abs(values) < 2.0**62
-    return np.where(good, np.rint(np.where(good, values, 0.0)), NEVER).astype(np.int64)
+    return np.where(good, np.rint(np.where(good, values, 0.0)), MISSING).astype(np.int64)
 
 
 def clocks(protocol: str) -> tuple[tuple[str, ...], ...]:
-    """Return the stamps of an exchange by the clock that they are taken with, the initiator's first."""
+    """Return the stamps of an exchange by clock, those of the initiator first."""
     third = PROTOCOLS[protocol].third_sender
     if third is None:
         return ("tx1", "rx2"), ("rx1", "tx2")
@@ -59,11 +59,11 @@ def stamps_of(protocol: str) -> tuple[str, ...]:
 def to_ticks(
     cells: Mapping[str, Floats], by_clock: Iterable[tuple[str, ...]], ticks_per_unit: float, bits: int
 ) -> dict[str, Ints]:
-    """Return stamps in any unit as ticks of a counter of `bits` bits, `NEVER` where one is missing.
+    """Return stamps in any unit as ticks of a counter of `bits` bits; missing ones are `MISSING`.
 
-    Stamps that are no ticks were multiplied, added up and written as floats, so that a long record is off by a part of
-    a tick that grows; what lies between two stamps of one clock is not. Hence the first stamp of each clock is rounded,
-    and the others by their distance from it.
+    Stamps in other units were scaled and written as floats, with an error that grows with the length of the record;
+    differences of stamps of one clock are accurate. So the first stamp of each clock is rounded, and the difference of
+    each other one from it.
     """
     found: dict[str, Ints] = {}
     mask = np.int64((1 << bits) - 1)
@@ -72,20 +72,20 @@ def to_ticks(
         for name in names:
             if ticks_per_unit == 1.0:
                 ticks = whole(cells[name])
-                found[name] = np.where(ticks == NEVER, NEVER, ticks & mask)
+                found[name] = np.where(ticks == MISSING, MISSING, ticks & mask)
             else:
                 since = whole((cells[name] - cells[names[0]]) * ticks_per_unit)
-                missing = (first == NEVER) | (since == NEVER)
-                found[name] = np.where(missing, NEVER, (first + since) & mask)
+                missing = (first == MISSING) | (since == MISSING)
+                found[name] = np.where(missing, MISSING, (first + since) & mask)
     return found
 
 
-def how_counted(count: Callable[[float, float], int], bits: int | None, counter: str | None) -> tuple[int, str]:
-    """Return the width of a counter in bits and how it is written, as far as they are not given.
+def counter_format(count: Callable[[float, float], int], bits: int | None, counter: str | None) -> tuple[int, str]:
+    """Return the width of a counter in bits and its format ("wrapped", "signed", "unwrapped"), unless they are given.
 
-    `count(low, high)` returns how many stamps in ticks are from `low` to below `high`. Numbers that fit 32 bits are
-    taken for 32, larger ones for 40, and those that fit neither for unwrapped; negative ones for signed where they fit.
-    Less than a hundredth of the stamps do not count: they are faults.
+    `count(low, high)` returns the number of stamps in ticks from `low` to below `high`. The first of 32 and 40 bits is
+    chosen into which 99 % of the stamps fit, wrapped or signed; the others are faults. If none fits, stamps are
+    unwrapped.
     """
     stamps = count(-np.inf, np.inf)
     for width, kind in ((32, "wrapped"), (32, "signed"), (40, "wrapped"), (40, "signed")):
@@ -96,28 +96,28 @@ def how_counted(count: Callable[[float, float], int], bits: int | None, counter:
     return bits or 32, counter or ("unwrapped" if stamps >= MIN_ROWS else "wrapped")
 
 
-def how_counted_in(ticks: Iterable[Floats], bits: int | None = None) -> tuple[int, str]:
-    """Return the bits of the counter of stamps in ticks (n,) each, and how it is written; see `how_counted`."""
+def counter_format_of(ticks: Iterable[Floats], bits: int | None = None) -> tuple[int, str]:
+    """Return width and format of the counter of stamps in ticks, (n,) each; see `counter_format`."""
     columns = [column[np.isfinite(column)] for column in ticks]
 
     def count(low: float, high: float) -> int:
         return sum(int(np.count_nonzero((column >= low) & (column < high))) for column in columns)
 
-    return how_counted(count, bits, None)
+    return counter_format(count, bits, None)
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A way to read stamps: by a protocol, of a counter's width, with some columns exchanged for others."""
+    """A way to read stamps: protocol, width of the counter, exchanged columns, and missing antenna delays."""
 
     protocol: str
     bits: int
     swapped: tuple[tuple[str, str], ...] = ()
     undelayed: bool = False
-    """Whether no antenna delays were programmed, whatever the map says or leaves open."""
+    """Whether no antenna delays were programmed, regardless of the map."""
 
     def difference(self, other: Reading) -> str:
-        """Say how this differs from another way."""
+        """Return the differences from another reading, as a map would state them."""
         said = [f'protocol = "{self.protocol}"'] if self.protocol != other.protocol else []
         said += [f"bits = {self.bits}"] if self.bits != other.bits else []
         said += [f"the columns of {one} and {two} exchanged" for one, two in self.swapped]
@@ -127,7 +127,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What a reading gives: the share of plausible ranges, the middle 90 % of the ranges, how much pairs scatter."""
+    """Result of a reading: share of plausible ranges, limits of the middle 90 % of ranges, scatter within pairs."""
 
     reading: Reading
     plausible: float
@@ -138,10 +138,10 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Stamps of some rows to try readings on, in their own unit, and their pairs.
+    """Rows on which readings are tried: stamps in their own unit, and pairs.
 
-    Measured distances, and the skew of the second message, are NaN where there is none. `longer_m` is by how much
-    ranges are longer for want of antenna delays in the devices, (n,), by what the map says of these.
+    Unknown true distances and skews of the second message are NaN. `longer_m` (n,) are the lengths that missing antenna
+    delays add to the ranges, by the map.
     """
 
     cells: Mapping[str, Floats]
@@ -151,8 +151,8 @@ class Sample:
     longer_m: Floats
     ticks_per_unit: float
 
-    def attempt(self, reading: Reading) -> Trial:
-        """Return what a reading gives on these rows."""
+    def try_reading(self, reading: Reading) -> Trial:
+        """Return the result of a reading on these rows."""
         columns = dict(self.cells)
         for one, two in reading.swapped:
             columns[one], columns[two] = columns[two], columns[one]
@@ -193,20 +193,20 @@ class Sample:
         return float(np.median(spreads))
 
 
-def try_others(sample: Sample, reading: Reading) -> tuple[Trial, Trial | None]:
-    """Return what a reading gives, and the other reading that clearly fits where it does not; None where none does."""
-    first = sample.attempt(reading)
-    if first.plausible >= GOOD_ENOUGH or len(sample.pair) < MIN_ROWS:
+def find_other_reading(sample: Sample, reading: Reading) -> tuple[Trial, Trial | None]:
+    """Try a reading; if it does not fit, also return another reading that does, None if none does."""
+    first = sample.try_reading(reading)
+    if first.plausible >= ACCEPTED_SHARE or len(sample.pair) < MIN_ROWS:
         return first, None
     for readings in _others(sample, reading):
-        fitting = [trial for trial in map(sample.attempt, readings) if trial.plausible >= CLEARLY]
+        fitting = [trial for trial in map(sample.try_reading, readings) if trial.plausible >= FITTING_SHARE]
         if fitting:
             return first, min(fitting, key=lambda trial: (-round(trial.plausible, 2), trial.scatter_m))
     return first, None
 
 
 def _others(sample: Sample, reading: Reading) -> Iterator[list[Reading]]:
-    """Yield other readings, simple ones first: another protocol or width, two columns exchanged, both."""
+    """Yield alternative readings, simple ones first: another protocol or width, exchanged columns, or both."""
     names = [row.name for row in PROTOCOLS.known() if set(stamps_of(row.name)) <= set(sample.cells)]
     names = [name for name in names if name != "ss-cfo" and (name != "ds-sym" or reading.protocol == name)]
     plain = [Reading(name, bits) for name in names for bits in (reading.bits, 72 - reading.bits)]

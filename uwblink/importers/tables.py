@@ -1,7 +1,7 @@
-"""Tables of other people, read by DuckDB: SQL expressions of their columns, and columns as arrays.
+"""Tables in CSV, Parquet or JSON lines, read by DuckDB: SQL expressions of their columns, and columns as arrays.
 
-DuckDB may open the named files and nothing else, and no text of a file or of a map becomes SQL: columns get names of
-ours, by their place, and paths and keys of JSON are variables of the connection.
+DuckDB can open the named files only, and text of a file or a map never becomes SQL: columns are named by their number,
+and paths and JSON keys are variables of the connection.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 Columns = dict[str, NDArray[Any]]
 
 
-def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBPyConnection:
-    """Return a connection that can open these files and no others, and whose settings are locked.
+def connect_to(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBPyConnection:
+    """Return a connection that can open only these files, and whose settings are locked.
 
     With a `folder` it keeps 350 MB in memory, and the rest there.
     """
@@ -43,7 +43,7 @@ def confined(paths: Sequence[Path], folder: str | None = None) -> duckdb.DuckDBP
 
 
 class Table(Closing):
-    """One file, whose columns are read when asked for. Close it, or use it as a context manager.
+    """One file, whose columns are read on request. Close it, or use it as a context manager.
 
     `names` are its columns. `source` is what a query reads FROM, and `number`, `word`, `whole_number` and `time_ns`
     return SQL expressions of columns of it.
@@ -60,12 +60,12 @@ class Table(Closing):
     ) -> None:
         """Open a CSV file (plain or gzipped), a Parquet file or JSON lines, by its suffix; raises `ImportTableError`.
 
-        `delimiter` and `decimal` override what a CSV file looks like. On a connection `db` that several tables share
-        each has a `key` of its own.
+        `delimiter` and `decimal` override what is detected in a CSV file. Tables that share a connection `db` have
+        different keys.
         """
         require_regular(path, ImportTableError, "table (.csv, .csv.gz, .parquet or .jsonl)")
         self.path, self._own = path, db is None
-        self.db = confined([path]) if db is None else db
+        self.db = connect_to([path]) if db is None else db
         self._key, self._skip, self._decimal_comma, self._is_csv = key, 0, False, False
         self._numeric: tuple[bool, ...] = ()
         self.db.execute(f"SET VARIABLE file{key} = ?", [str(path)])
@@ -93,7 +93,7 @@ class Table(Closing):
         )
 
     def _open_json(self) -> None:
-        """Take the fields of the first lines as columns; those of objects in objects are called as `pose.x`."""
+        """Use the fields of the first lines as columns; nested fields have names such as `pose.x`."""
         check_lines(self.path)
         fields: dict[str, str] = {}
         with reading(self.path), open_file(self.path) as file:
@@ -138,7 +138,7 @@ class Table(Closing):
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Raise `ImportTableError` for what DuckDB says of the file; what it says of the disk passes."""
+        """Convert DuckDB's errors about the file into `ImportTableError`; errors of the disk pass."""
         import duckdb
 
         try:
@@ -155,8 +155,8 @@ class Table(Closing):
         if self._is_parquet and self._numeric[place]:
             value = f"CAST({self._cells[place]} AS DOUBLE)"
         else:
-            # Not the bare column: a cast of that is done while the file is read, where a cell that is no number makes
-            # the whole row vanish among those with too many cells.
+            # DuckDB would cast a bare column while it reads the file, and would reject the whole row for a cell that is
+            # not a number.
             text = f"coalesce({self._text(place)}, '')"
             text = f"replace({text}, ',', '.')" if self._decimal_comma else text
             value = f"TRY_CAST({text} AS DOUBLE)"
@@ -175,7 +175,7 @@ class Table(Closing):
         if self._is_parquet and self._numeric[self._place(name)]:
             raise ImportTableError(f"{self.path}: column {name[:60]!r} holds numbers, not times as 2024-05-06T07:08:09")
         text = self.word(name)
-        # A zone is a shift of whole minutes, which the finer type would drop.
+        # TIMESTAMP_NS ignores time zones; TIMESTAMPTZ has microseconds, and zones are whole minutes.
         zone = f"regexp_matches({text}, '[T ].*[+-][0-9]{{2}}:?([0-9]{{2}})?$')"
         return (
             f"CASE WHEN {zone} THEN epoch_ns(TRY_CAST({text} AS TIMESTAMPTZ)) "
@@ -195,7 +195,7 @@ class Table(Closing):
         return f"CAST({self._cells[place]} AS VARCHAR)"
 
     def query(self, cells: Mapping[str, str], more: str = "") -> Columns:
-        """Return SQL expressions of columns as arrays (n,), by names of the caller's, masked where there is nothing.
+        """Return SQL expressions of columns as arrays (n,) by name, masked where values are missing.
 
         `more` follows the source in the query.
         """
@@ -208,7 +208,7 @@ class Table(Closing):
     ) -> tuple[dict[str, Floats], dict[str, NDArray[np.str_]]]:
         """Return columns as float64 (n,), NaN where a cell is empty or no number, and columns as text (n,).
 
-        Of a `limit` so many rows are read, from the first.
+        With a `limit` only the first rows are read.
         """
         listed, texts = list(dict.fromkeys(numbers)), list(dict.fromkeys(words))
         if not listed and not texts:
@@ -231,19 +231,19 @@ class Table(Closing):
         return {row: dict(zip(names, texts, strict=True)) for row, *texts in found}
 
     def rejected(self) -> Ints:
-        """Return the lines that were left out of what was read, in ascending order: those with too many cells."""
+        """Return the line numbers of rows with too many cells, which are not read, in ascending order."""
         if not self._is_csv:
             return np.empty(0, dtype=np.int64)
         found = self.db.execute(f"SELECT DISTINCT line FROM rejects{self._key} ORDER BY line").fetchnumpy()
         return np.ma.filled(found["line"].astype(np.int64), 0)
 
     def lines(self, rows: Ints) -> Ints:
-        """Return where in the file some rows (n,) are: lines, the first being 1, or rows of Parquet from 1."""
+        """Return the line numbers of rows (n,), counted from 1, or the row numbers of Parquet."""
         return rows + 1 if self._is_parquet else lines_of(self.path, self._skip, self.rejected(), rows)
 
 
 def _fields(row: dict[str, Any], name: str, pointer: str) -> Iterator[tuple[str, str]]:
-    """Yield names of fields as `pose.x`, and where they are as JSON pointers."""
+    """Yield names of fields such as `pose.x`, and their JSON pointers."""
     for key, value in row.items():
         where = f"{pointer}/{key.replace('~', '~0').replace('/', '~1')}"
         if isinstance(value, dict) and pointer.count("/") < 5:

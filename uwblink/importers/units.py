@@ -1,4 +1,4 @@
-"""Units of lengths and powers that a map does not state: whether the numbers can have the assumed unit."""
+"""Check the units of lengths and powers that a map does not state."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ from uwblink.recording.antenna_delays import REGISTER_MAX
 from uwblink.ticks import METRES_PER_TICK
 
 Errors = Callable[[float], Floats]
-"""Ranges less distances (n,), if some lengths are multiplied by a factor, in the unit that the ranges have as they are.
+"""Returns ranges less distances (n,) with some lengths multiplied by a factor, in the given unit of the ranges.
 
-So noise counts alike whatever the factor; else ranges of boards that stand still would pass for ranges in feet.
+In this unit noise does not depend on the factor; otherwise ranges of boards at rest would seem to be in feet.
 """
 
 
 def other_unit(errors: Mapping[str, Errors]) -> tuple[str, str] | None:
-    """Return which lengths are in which other unit than metres, where that explains the ranges; else None.
+    """Return the name and unit of lengths that are evidently not in metres; None if all are in metres.
 
-    `errors` are by the name of the lengths that are multiplied. What remains of errors beside a constant (antenna
-    delays) is compared: in another unit it must be less by more than the root of the unit's factor, that is nearer to
-    what the factor would make of it than to what it is. Distances that have nothing to do with the ranges come down to
-    the ranges' own spread, by the root of two at most.
+    `errors` are by the name of the lengths that are multiplied. The residuals of the errors from a constant (antenna
+    delays) are compared: a unit is found if they are smaller by more than the square root of its factor. Residuals of
+    distances that are unrelated to the ranges shrink to the spread of the ranges, by at most the square root of two.
     """
     best, found = 0.0, None
     for name, of in errors.items():
@@ -43,39 +42,39 @@ def other_unit(errors: Mapping[str, Errors]) -> tuple[str, str] | None:
 
 
 def _remaining(errors_m: Floats) -> float:
-    """Return the median size of errors beside a constant that antenna delays can make; NaN of few."""
+    """Return the median absolute residual of errors from a constant within antenna delays; NaN of few values."""
     finite = errors_m[np.isfinite(errors_m)]
     if len(finite) < MIN_ROWS:
         return float("nan")
-    longest = REGISTER_MAX * METRES_PER_TICK  # all that registers hold, at both ends
+    longest = REGISTER_MAX * METRES_PER_TICK  # the registers of both ends at their maximum
     constant = np.clip(np.median(finite), -longest, longest)
     return float(np.median(np.abs(finite - constant)))
 
 
 def reason_against_metres(ranges: Floats) -> str:
-    """Return why numbers (n,) cannot be ranges in metres; empty text where they can be."""
+    """Return why numbers (n,) cannot be ranges in metres; empty text if they can."""
     finite = ranges[np.isfinite(ranges)]
     if len(finite) < MIN_ROWS:
         return ""
     middle = float(np.median(np.abs(finite)))
     if middle > 300.0:  # DW1000 devices reach 290 m in the open by their data sheet
         return f"{middle:.6g} in the middle, farther than devices reach in metres"
-    # Noise of centimetres leaves no range a whole number of metres, those that repeat one number aside.
+    # With noise of centimetres, ranges are not all integers, unless one number repeats.
     if len(np.unique(finite)) > MIN_ROWS // 4 and np.array_equal(finite, np.rint(finite)):
         return "whole numbers all, as no ranges in metres are"
     return ""
 
 
 def reason_against_dbm(powers: Floats) -> str:
-    """Return why numbers (n,) cannot be received powers in dBm; empty text where they can be."""
-    finite = powers[np.isfinite(powers) & (powers != 0)]  # boards that cannot tell a power print 0
+    """Return why numbers (n,) cannot be received powers in dBm; empty text if they can."""
+    finite = powers[np.isfinite(powers) & (powers != 0)]  # boards print 0 for an unknown power
     middle = float(np.median(finite)) if len(finite) else -1.0
-    # What may be sent is -41.3 dBm/MHz, -14 dBm in 500 MHz.
+    # The legal limit of transmitted power is -41.3 dBm/MHz, -14 dBm in 500 MHz.
     return f"{middle:+.4g} in the middle, and no received power is above 0 dBm" if middle > 0 else ""
 
 
 def truth_m(rows: Columns) -> Floats:
-    """Return distances (n,) that were measured, or those between antennas; NaN where there are none."""
+    """Return measured distances (n,), or else those between the antenna positions; NaN if unknown."""
     if "gt_range_m" in rows or not all(name in rows for name in POSITIONS):
         return optional(rows, "gt_range_m")
     ends = np.array([rows[name] for name in POSITIONS])
@@ -83,15 +82,15 @@ def truth_m(rows: Columns) -> Floats:
 
 
 def optional(rows: Columns, name: str) -> Floats:
-    """Return a column (n,), NaN where there is no such column."""
+    """Return a column (n,), or NaN if there is no such column."""
     return rows[name] if name in rows else np.full(len(rows["origin"]), np.nan)
 
 
 def check_units(column_map: ColumnMap, path: Path, rows: Columns, raw_m: Floats | None) -> None:
-    """Raise `ImportTableError` where some rows of a table say that lengths or powers are in another unit.
+    """Raise `ImportTableError` if a sample of rows shows that lengths or powers are in another unit.
 
-    What is wrong by itself is asked for unless the map says the unit; lengths that contradict each other are refused.
-    `raw_m` are ranges by the stamps (n,), if there are any.
+    Implausible numbers are refused unless the map states their unit; lengths that contradict each other always are.
+    `raw_m` are the ranges by the stamps (n,), if there are any.
     """
     for name in POWERS:
         if column_map.power_unit is None and (why := reason_against_dbm(optional(rows, name))):

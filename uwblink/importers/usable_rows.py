@@ -1,4 +1,4 @@
-"""Which rows of tables can be used: those that cannot are faults with file, line, column and what stood there."""
+"""Usable rows of tables; other rows are faults with file, line, column and cell."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from uwblink.arrays import Ints
 from uwblink.errors import ImportTableError
 from uwblink.importers.column_map import IDS
 from uwblink.importers.staging import StagedRows, Staging
-from uwblink.importers.stamps import how_counted
+from uwblink.importers.stamps import counter_format
 from uwblink.importers.tables import Columns
 from uwblink.recording.schema import Fault
 from uwblink.twr import LARGEST_ID
@@ -21,7 +21,7 @@ FAULTS_AT_ONCE: Final = 100_000
 
 
 class Condition(NamedTuple):
-    """What is wrong with a row: the column (ours), what is expected there, and SQL that is true of such rows."""
+    """A condition that makes a row unusable: column, expected value, and SQL that is true for unusable rows."""
 
     column: str
     expected: str
@@ -32,13 +32,13 @@ ENDS: Final = (
     *(Condition(name, f"a whole number from 0 to {LARGEST_ID}", f"{name} IS NULL") for name in IDS),
     Condition("to_id", "another tag than from_id", "from_id = to_id"),
 )
-"""Of rows that name two devices."""
+"""Conditions on the ids of the two devices."""
 
 _TIME: Final = Condition("time_s", "a time", "time_ns IS NULL")
 
 
 class Faults:
-    """Rows that cannot be used, by the first reason of each."""
+    """Unusable rows, with the first reason of each."""
 
     def __init__(self, staging: Staging) -> None:
         """See `reject`."""
@@ -47,7 +47,7 @@ class Faults:
         staging.db.execute("CREATE TABLE faulty (origin BIGINT, reason INTEGER)")
 
     def reject(self, rows: StagedRows, conditions: Sequence[Condition], among: str = "true") -> str:
-        """Note the rows among some that fulfil one of the conditions; returns SQL that is true of the others."""
+        """Record the rows that fulfil a condition as unusable; returns SQL that is true for the others."""
         first = len(self._reasons)
         self._reasons += conditions
         cases = " ".join(f"WHEN {one.wrong} THEN {first + k}" for k, one in enumerate(conditions))
@@ -56,15 +56,15 @@ class Faults:
         return f"{among} AND CASE {cases} END IS NULL"
 
     def __len__(self) -> int:
-        """Return how many rows cannot be used, beside those with too many cells."""
+        """Return the number of unusable rows, without those with too many cells."""
         return int(self._staging.db.execute("SELECT count(*) FROM faulty").fetchall()[0][0])
 
-    def too_long(self) -> int:
-        """Return how many rows have more cells than the header."""
+    def count_too_long(self) -> int:
+        """Return the number of rows with more cells than the header."""
         return sum(len(table.rejected()) for table in self._staging.tables)
 
     def check(self, total: int) -> None:
-        """Raise for the first row that cannot be used where those are half of all or more."""
+        """Raise `ImportTableError` with the first unusable row if half of all rows or more are unusable."""
         if len(self) and 2 * len(self) >= total:
             order = "ORDER BY origin, reason LIMIT 1"
             ((origin, reason),) = self._staging.db.execute(f"SELECT origin, reason FROM faulty {order}").fetchall()
@@ -73,7 +73,7 @@ class Faults:
             raise ImportTableError(f"{path}: {fault.detail}")
 
     def __iter__(self) -> Iterator[list[Fault]]:
-        """Yield the faults, some at a time, in the order of their rows; those with too many cells last."""
+        """Yield blocks of faults in the order of their rows; rows with too many cells come last."""
         db, timed = self._staging.db, self._staging.rows.has("time_s")
         time = "coalesce(time_ns, 0)" if timed else "0"
         joined = f"SELECT f.*, {time} AS time_ns FROM faulty f JOIN rows USING (origin) ORDER BY origin, reason"
@@ -92,7 +92,7 @@ class Faults:
         return np.searchsorted(self._staging.offsets, origin, side="right") - 1
 
     def _described(self, origin: Ints, reason: Ints, time_ns: Ints) -> list[Fault]:
-        """Return rows, in ascending order, as faults: (n,) each."""
+        """Return faults of rows in ascending order; the arguments are arrays (n,)."""
         column_map, found = self._staging.column_map, []
         files = self._files(origin)
         for k in np.unique(files).tolist():
@@ -118,18 +118,18 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class UsableRows:
-    """The rows of which a condition in SQL is true: `count` of them."""
+    """The rows for which an SQL condition is true, and their number."""
 
     rows: StagedRows
     condition: str
     count: int
 
     def blocks(self) -> Iterator[Columns]:
-        """Yield the rows in their order, some at a time, without those that have no rows."""
+        """Yield the rows in their order, block by block; empty blocks are left out."""
         return filter(_some, self.rows.blocks(self.condition))
 
     def sample(self, size: int) -> Columns:
-        """Return some of the rows, drawn by chance, in their order."""
+        """Return a pseudo-random sample of the rows, in their order."""
         chosen = f"SELECT row FROM {self.rows.name} WHERE {self.condition} ORDER BY hash(row) LIMIT {size}"
         return self.rows.read(f"WHERE row IN ({chosen}) ORDER BY row")
 
@@ -144,7 +144,7 @@ def _some(columns: Columns) -> bool:
 
 
 def usable_ranges(rows: StagedRows, faults: Faults, among: str) -> UsableRows:
-    """Return the rows among some that hold a plain range."""
+    """Return the rows that have a range without stamps."""
     timed = [_TIME] if rows.has("time_s") else []
     return _usable(
         rows, faults.reject(rows, [*timed, Condition("range_m", "a finite number", "range_m IS NULL")], among)
@@ -154,9 +154,9 @@ def usable_ranges(rows: StagedRows, faults: Faults, among: str) -> UsableRows:
 def usable_exchanges(
     staging: Staging, rows: StagedRows, faults: Faults, among: str, stamps: Iterable[str]
 ) -> tuple[UsableRows, int, int, str]:
-    """Return the rows among some that hold all stamps, each exchange once, and how many repeat one before.
+    """Return the rows that have all stamps, without repetitions of an exchange.
 
-    The last two numbers are the bits of the counter, and how it is written.
+    Also returns the number of repetitions, and width and format of the counter.
     """
     scale, names = staging.column_map.ticks_per_unit, list(stamps)
     ticks = {name: name if scale == 1.0 else f"{name} * {scale!r}" for name in names}
@@ -166,7 +166,7 @@ def usable_exchanges(
         parts = (f"count(*) FILTER ({value} {span[0]} AND {value} {span[1]})" for value in ticks.values())
         return int(rows.db.execute(f"SELECT {' + '.join(parts)} FROM {rows.name}").fetchall()[0][0])
 
-    bits, counter = how_counted(count, staging.column_map.bits, staging.column_map.counter)
+    bits, counter = counter_format(count, staging.column_map.bits, staging.column_map.counter)
     largest = (1 << bits) - 1
     low = 0 if counter == "wrapped" else -(1 << (bits - 1))
     expected = f"{'a whole number' if scale == 1.0 else 'a stamp in ticks'} from {low} to {largest}"

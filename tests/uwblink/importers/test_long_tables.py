@@ -200,7 +200,7 @@ def test_memory_does_not_grow_with_what_is_read(tmp_path, monkeypatch, form, at_
         rows = [row | {"time_s": row["time_s"] + 100 * (k // 60)} for k, row in enumerate(repeated(flights(), times))]
         path = tmp_path / (f"{times}.mcap" if form == "bag" else f"{times}.csv")
         path.touch()
-        monkeypatch.setattr(bags, "opened", lambda path, rows=rows: nullcontext(Bag(path, rows)))
+        monkeypatch.setattr(bags, "open_bag", lambda path, rows=rows: nullcontext(Bag(path, rows)))
         if form != "bag":
             write(path, as_messages(wrapped(rows)) if form == "messages" else wrapped(rows))
         tracemalloc.start()
