@@ -1,8 +1,8 @@
-"""The arrays of the project by what they hold, and columns made of what callers have.
+"""Types of arrays, tables of columns, and conversion of arguments into columns.
 
-Shapes stand in the docstrings of whoever takes or returns arrays. Callers give lists, arrays, data-frame columns or one
-value for all rows; every check raises `ArgumentError` that names the column, the first row that is wrong, and what is
-expected.
+Shapes are given in the docstrings of functions that take or return arrays. Arguments are lists, arrays, data-frame
+columns or one value for all rows; each check raises `ArgumentError` that names the column, the first wrong row, and
+what is expected.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class ColumnTable:
 
 
 def length(name: str, values: ArrayLike) -> int:
-    """Return the number of rows that a column has; raises for what is not one-dimensional."""
+    """Return the number of rows of a column; raises `ArgumentError` if it is not one-dimensional."""
     shape = np.shape(values)
     if len(shape) != 1:
         raise ArgumentError(f"{name}: found an array of shape {shape}, expected one value a row, shape (n,)")
@@ -85,7 +85,7 @@ def length(name: str, values: ArrayLike) -> int:
 
 
 def whole_numbers(name: str, values: ArrayLike, count: int, low: int, high: int, hint: str = "") -> Ints:
-    """Return int64 (count,) of whole numbers from `low` to `high`; `hint` is added to what a refusal says."""
+    """Return int64 (count,) of whole numbers from `low` to `high`; `hint` is added to the error."""
     found = _rows(name, values, count)
     if found.dtype.kind not in "iufb" or found.dtype.kind == "b":
         raise ArgumentError(f"{name}: found {_kind(found)}, expected whole numbers")
@@ -99,7 +99,7 @@ def whole_numbers(name: str, values: ArrayLike, count: int, low: int, high: int,
 
 
 def numbers(name: str, values: ArrayLike | None, count: int) -> Floats:
-    """Return float64 (count,), NaN where nothing is known; all of them where `values` is None."""
+    """Return float64 (count,), NaN for unknown values; all are NaN if `values` is None."""
     if values is None:
         return np.full(count, np.nan)
     found = _rows(name, values, count)
@@ -139,9 +139,9 @@ def vectors(name: str, values: ArrayLike, count: int, size: int) -> Floats:
 
 
 def few_words(column: NDArray[Any]) -> tuple[NDArray[np.str_], Ints] | None:
-    """Return the different words of a column of text (n,), as they first come, and which each row has (n,), from 0.
+    """Return the distinct words of a column of text (n,) in order of appearance, and the index of each row's word (n,).
 
-    None where there are more than 16, which sorting finds sooner, and for a column that is not of text, or empty.
+    None if there are more than 16 words, for which sorting is faster, and for an empty column or one that is not text.
 
     >>> words, which = few_words(np.array(["b", "a", "b"]))
     >>> words.tolist(), which.tolist()
@@ -162,7 +162,7 @@ def few_words(column: NDArray[Any]) -> tuple[NDArray[np.str_], Ints] | None:
 
 
 def reject(name: str, values: NDArray[Any], bad: Bools, expected: str) -> None:
-    """Raise for the first row that is bad; nothing where none is."""
+    """Raise `ArgumentError` for the first bad row, if there is one."""
     if bad.any():
         _refuse(name, values, bad, expected)
 

@@ -1,7 +1,7 @@
-"""The one place that opens DuckDB: files and tables of strangers pass through it, so nothing of it is left open.
+"""Connections to DuckDB, restricted because files can come from anyone.
 
-A connection reaches the file that it is opened for and what the caller names, and no other file; it loads no extension,
-and its settings are locked. A test holds that nothing else in the packages opens DuckDB.
+A connection can open its own file and the named files only, cannot load extensions, and has locked settings. No other
+module opens DuckDB, which a test checks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STORAGE_VERSION: Final = "v1.5.0"
 """Storage of new files: that of the lowest version in pyproject.toml, so that every allowed version reads them."""
 
 _LOCKED: Final = {"enable_external_access": False, "lock_configuration": True}
-"""The second makes all settings last, so it comes last."""
+"""The second locks all settings, so it comes last."""
 
 
 def connect(
@@ -35,10 +35,10 @@ def connect(
     threads: int | None = None,
     temporary: str | None = None,
 ) -> duckdb.DuckDBPyConnection:
-    """Open a file of DuckDB, or a database in memory, that reaches only `paths` and what lies in `folders`.
+    """Open a DuckDB file, or a database in memory, with access to `paths` and to files in `folders` only.
 
-    It keeps `memory_mb` in memory, by default most of what there is, and the rest in the folder `temporary`. Raises
-    what DuckDB raises, and what `check_log` raises.
+    It uses up to `memory_mb` of memory, by default most of the machine's, and the folder `temporary` for the rest.
+    Raises DuckDB's errors, and what `check_log` raises.
     """
     if path is not None:
         check_log(path)
@@ -71,14 +71,14 @@ def connect(
 
 
 def log_of(path: Path) -> Path:
-    """Return where DuckDB keeps what was committed to a file and is not in the file itself yet."""
+    """Return the path of DuckDB's write-ahead log of a file."""
     return path.with_name(path.name + ".wal")
 
 
 def check_log(path: Path) -> None:
-    """Raise `RecordingError` where a file, or what DuckDB writes beside it, is a link, a pipe or a device.
+    """Raise `RecordingError` if a file is not regular, or if what DuckDB writes beside it is a link, pipe or device.
 
-    DuckDB would write its log through a link, over whatever that leads to, and wait for ever for a pipe.
+    DuckDB would follow the link when it writes its log, and would wait for a pipe forever.
     """
     if path.exists() and not path.is_file():
         raise RecordingError(f"{path}: is no regular file")

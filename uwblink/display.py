@@ -1,4 +1,4 @@
-"""How tables look in a terminal and in a notebook: short, whatever they hold."""
+"""Short texts of tables for terminals and notebooks."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ WIDTH: Final = 79
 
 
 def printable(value: Any) -> str:
-    """Return text in which nothing steers a terminal; what a file says may come from anyone."""
+    """Return text without control characters, since texts of files can come from anyone."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(value))
 
 
 def excerpt(columns: Mapping[str, NDArray[Any]]) -> list[list[str]]:
-    """Return the names of columns, and as text their first rows and the last one where there are more."""
+    """Return the names of columns, and as text their first rows and the last one."""
     count = len(next(iter(columns.values())))
     rows = list(range(count)) if count <= SHOWN_ROWS else [*range(SHOWN_ROWS - 1), count - 1]
     table = [list(columns), *([_cell(column[k]) for column in columns.values()] for k in rows)]
@@ -59,7 +59,7 @@ def cut(line: str, width: int = WIDTH) -> str:
 
 
 def first_few(items: Iterable[str], most: int = SHOWN_ROWS) -> str:
-    """Return words with commas between; how many more there are after the first ones; `none` for nothing."""
+    """Return the first words, separated by commas, and the number of others; `none` for no words."""
     listed = list(items)
     more = f" and {len(listed) - most} more" if len(listed) > most else ""
     return (", ".join(listed[:most]) + more) or "none"

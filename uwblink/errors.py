@@ -1,17 +1,16 @@
-"""Everything `uwblink` raises on bad input, each also the standard type a caller would expect."""
+"""The errors of `uwblink`; each is also the standard exception that fits it."""
 
 
 class OfParameter(Exception):  # noqa: N818 - the base of the bases
-    """Base of the errors of all three packages: `parameter` names the parameter that is at fault, where it is one.
+    """Base of the errors of all three packages; `parameter` is the name of the parameter at fault, if there is one.
 
-    Texts are for those who call functions: a parameter stands in backticks, its own before the text. The command line
-    puts flags in their place (`uwblink.cli.shared.with_flags`).
+    Names of parameters are in backticks, and the one at fault comes first. The command line replaces them by options
+    (`uwblink.cli.shared.with_flags`).
     """
 
     def __init__(self, text: str, *, parameter: str | None = None) -> None:
         """Say what, where and what to do; a parameter's name goes before the text."""
-        # A text quotes what others wrote, names and cells of any length: more than a screen of it nobody reads, and
-        # what to do stands behind that.
+        # Texts quote names and cells of any length; the end of the text says what to do.
         if len(text) > 2000:
             text = f"{text[:1500]} ... {text[-500:]}"
         super().__init__(f"`{parameter}`: {text}" if parameter else text)
@@ -27,7 +26,7 @@ class ArgumentError(UwblinkError, ValueError):
 
 
 class PluginWarning(UserWarning):
-    """A plug-in of another distribution that was left out, and why."""
+    """A plug-in of another distribution cannot be used, and why."""
 
 
 class FrameError(UwblinkError, ValueError):
@@ -103,5 +102,5 @@ class RefusedError(BoardError, ValueError):
 
 
 def first_line(error: Exception) -> str:
-    """Return what an error says first, at most 200 letters of it; the rest is for who wrote the query."""
+    """Return the first line of an error's text, 200 characters at most."""
     return (str(error).splitlines() or [""])[0][:200]

@@ -1,4 +1,4 @@
-"""Names that a package offers at its front door, imported when somebody first asks for them (PEP 562)."""
+"""Public names of a package that are imported on first use (PEP 562)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ from typing import Any
 
 
 def offer(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package whose public names live in the modules `homes` maps them to.
-
-    So `import calib` costs nothing but this, and `calib.fit` what a fit needs.
-    """
+    """Return `__getattr__` and `__dir__` of a package; `homes` maps public names to the modules that define them."""
 
     def get(name: str) -> Any:
         if name not in homes:

@@ -1,4 +1,4 @@
-"""Files that are whole or not there at all."""
+"""Writing files completely or not at all."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PARTIAL: Final = ".partial"
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Deliver SIGINT and SIGTERM to this thread after the block, not within it; where the system cannot, do nothing."""
+    """Delay SIGINT and SIGTERM until the end of the block, on systems that support it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -43,12 +43,12 @@ def interrupts_held() -> Iterator[None]:
 
 
 def write_text(path: Path, text: str, *, force: bool) -> None:
-    """Write a text file as UTF-8, names of files that are none with escapes; raises what `write_bytes` raises."""
+    """Write a text file as UTF-8, with escapes for file names in other encodings; raises what `write_bytes` raises."""
     write_bytes(path, text.encode(errors="backslashreplace"), force=force)
 
 
 def is_utf8(path: Path) -> bool:
-    """Whether the whole name of a file is UTF-8, as DuckDB needs it: the system takes any bytes."""
+    """Return whether the absolute path of a file is UTF-8, as DuckDB requires."""
     try:
         str(path.absolute()).encode()
     except UnicodeEncodeError:
@@ -64,10 +64,10 @@ def write_bytes(path: Path, data: bytes, *, force: bool) -> None:
 
 @contextmanager
 def whole(path: Path, *, force: bool) -> Iterator[Path]:
-    """Yield the name of a new file or folder to be written, which takes the name of `path` when the block is done.
+    """Yield a temporary path for a new file or folder, which is renamed to `path` at the end of the block.
 
-    Raises what `check_output` raises, and `OutputError` where the disk does not take it. Where the block fails or is
-    interrupted, what was there stays, and no part of the new one does.
+    If the block fails or is interrupted, `path` stays as it was. Raises what `check_output` raises, and `OutputError`
+    if the file cannot be written.
     """
     check_output(path, force=force)
     try:
@@ -82,10 +82,9 @@ def whole(path: Path, *, force: bool) -> Iterator[Path]:
 
 @contextmanager
 def place_beside(path: Path) -> Iterator[Path]:
-    """Yield a name for what is to become `path`, in a new folder beside it that goes away with all that is left in it.
+    """Yield a temporary path for `path` in a new folder beside it, which is removed after the block with its contents.
 
-    The folder has a random name and belongs to this user alone: nobody can put a link there for us to write through,
-    whoever opens the file, and whatever he writes beside it.
+    The folder has a random name and private permissions, so that other users cannot place links in it.
     """
     prefix = f".{path.name}."
     # File systems take names of 255 bytes, of which `tempfile` draws eight.
@@ -99,9 +98,9 @@ def place_beside(path: Path) -> Iterator[Path]:
 
 
 def take_name(partial: Path, path: Path) -> None:
-    """Give a new file or folder its name; a folder that had it goes away with the place beside it.
+    """Rename a new file or folder to `path`; a folder of that name is replaced.
 
-    Raises `RecordingError` where that folder holds what the new one does not replace.
+    Raises `RecordingError` if that folder has files that the new one does not have.
     """
     if path.is_dir() and not path.is_symlink():
         for place in path.rglob("*"):
@@ -115,7 +114,7 @@ def take_name(partial: Path, path: Path) -> None:
 
 
 def new_file(path: Path, *, force: bool) -> TextIO:
-    """Open a text file that grows under its own name: a new one, never what a link leads to.
+    """Create a text file that is written under its own name; links are not followed.
 
     Raises `OutputError`, and what `check_output` raises.
     """
@@ -130,9 +129,9 @@ def new_file(path: Path, *, force: bool) -> TextIO:
 
 @contextmanager
 def made_folder(folder: Path) -> Iterator[None]:
-    """Make a folder, and those above it, where they are missing; where the block fails, what was made goes away empty.
+    """Create a folder and missing parents; if the block fails, the new folders are removed again if they are empty.
 
-    Raises `OutputError` where it cannot be made.
+    Raises `OutputError` if a folder cannot be created.
     """
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
@@ -149,7 +148,7 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 
 def write_files(folder: Path, files: Mapping[str, bytes], *, force: bool) -> None:
-    """Write files by their names into a folder, which is made where it is missing: all of them, or none.
+    """Write files by name into a folder, which is created if necessary: all of them, or none.
 
     Raises what `whole` and `made_folder` raise.
     """
@@ -159,7 +158,7 @@ def write_files(folder: Path, files: Mapping[str, bytes], *, force: bool) -> Non
 
 
 def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ()) -> None:
-    """Raise `ArgumentError` where one output would be written over another, or over what is read.
+    """Raise `ArgumentError` if an output is the same file as another output or as an input.
 
     `outputs` are files and folders by the parameter that names them.
     """
@@ -177,9 +176,9 @@ def check_apart(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = ())
 
 
 def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
-    """Raise the one clear error if `path` cannot be written to; writes nothing.
+    """Raise an error if `path` cannot be written; writes nothing.
 
-    A `recording` may not have the name of another kind of file: who reads a table would be handed a database.
+    A `recording` must not have the suffix of another format.
     """
     tables = (".csv", ".tsv", ".txt", ".gz", ".parquet", ".json", ".jsonl", ".ndjson")
     others = (".bag", ".mcap", ".db3", ".toml", ".html", ".pdf")
@@ -201,9 +200,9 @@ def check_output(path: Path, *, force: bool, recording: bool = False) -> None:
 
 
 def check_folder(path: Path, names: Iterable[str] = (), *, force: bool = False) -> None:
-    """Raise `OutputError` where a folder can neither be used nor made.
+    """Raise `OutputError` if a folder can be neither used nor created.
 
-    `names` are files to be written there: raises what `check_output` raises for those.
+    `names` are files to be written there; raises what `check_output` raises for them.
     """
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file, expected a folder")

@@ -1,4 +1,4 @@
-"""Tables that strangers add rows to: at run time, or from another distribution by an entry point.
+"""Tables to which programs add rows at run time, and other distributions by entry points.
 
 An entry point of the table's group names one row, or a list of rows:
 
@@ -19,7 +19,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 from uwblink.errors import ArgumentError, PluginWarning, UwblinkError
 
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9-]{0,40}")
-"""What a row can be called: people type it, and it stands in files."""
+"""Names of rows, which are typed on command lines and stored in files."""
 
 
 def check_row(kind: str, row: Any, of: type[Any], fields: Mapping[str, tuple[Callable[[Any], object], str]]) -> None:
@@ -42,7 +42,7 @@ def is_text(value: Any) -> bool:
 
 
 class Named(Protocol):
-    """What a row of a table needs: the name that people choose it by."""
+    """A row of a table has a name."""
 
     @property
     def name(self) -> str:
@@ -54,10 +54,10 @@ Row = TypeVar("Row", bound=Named)
 
 
 class Registry(Mapping[str, Row], Generic[Row]):
-    """Rows by name: the project's own, those a program adds, and those of installed distributions.
+    """Rows by name: the project's own, those that programs add, and those of installed distributions.
 
-    Entry points of `group` are loaded once, when a name is not among the rows so far or all rows are asked for. One
-    that cannot be loaded is left out with a `PluginWarning`. `check` raises for a row that cannot be used.
+    Entry points of `group` are loaded once: on the first unknown name, or when all rows are listed. Entry points that
+    cannot be loaded cause a `PluginWarning`. `check` raises `ArgumentError` for a row that cannot be used.
     """
 
     def __init__(self, kind: str, group: str, rows: Iterable[Row], check: Callable[[Any], None]) -> None:
@@ -68,7 +68,7 @@ class Registry(Mapping[str, Row], Generic[Row]):
         self._loaded = False
 
     def register(self, row: Row, *, replace: bool = False) -> None:
-        """Add a row; `replace` allows one that was added before to be put in its place.
+        """Add a row; with `replace` it may replace one that was added before.
 
         Raises `ArgumentError` for a row that cannot be used, a name that is taken, and for every name of the project.
         """
@@ -88,12 +88,12 @@ class Registry(Mapping[str, Row], Generic[Row]):
         del self._rows[name]
 
     def known(self) -> list[Row]:
-        """Return the rows so far, without looking for those of other distributions."""
+        """Return the loaded rows, without loading entry points."""
         return list(self._rows.values())
 
     @contextmanager
     def calling(self, name: str, error: type[Exception]) -> Iterator[None]:
-        """Turn what a row of somebody else raises in the block into one line that names it; `error` makes it."""
+        """Convert exceptions of rows that are not the project's own into `error`, with the name of the row."""
         try:
             yield
         except UwblinkError:
@@ -126,7 +126,7 @@ class Registry(Mapping[str, Row], Generic[Row]):
     def _load(self) -> None:
         if self._loaded:
             return
-        # Before the work, so that a plug-in which asks for the table while it is loaded finds it as it is.
+        # Set first: a plug-in may use the table while it is loaded.
         self._loaded = True
         from importlib.metadata import entry_points
 
@@ -135,7 +135,7 @@ class Registry(Mapping[str, Row], Generic[Row]):
                 found = entry.load()
                 for row in found if isinstance(found, list | tuple) else (found,):
                     self.register(row)
-            except Exception as error:  # whatever a stranger's module raises is no reason to stop the project's own
+            except Exception as error:  # a plug-in must not stop the project
                 origin = entry.dist.name if entry.dist else "an unnamed distribution"
                 warnings.warn(
                     f"plug-in {entry.name!r} of {origin} (group {self._group}) is left out: {_line(error)}",

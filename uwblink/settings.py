@@ -1,4 +1,4 @@
-"""Fields of settings that Python and the command line share: what each means, and how it is typed."""
+"""Fields of settings that are shared by Python and the command line."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ def setting(
 ) -> Any:
     """Return a field of a dataclass of settings.
 
-    `help` is the sentence that the command line prints. `flag` is the option where it is not the field's name with
-    dashes. `kind` is the type of the option where it is not the field's type, and `parse` makes the field's value of
-    it. `names` are the values to choose from, with those that `more` returns for a shell to complete; `tags` is how a
-    shell completes the tags of the recordings on the line ("{}="). `shown` is passed on to `typer.Option`: `metavar`,
-    `min`, `max`, `rich_help_panel`.
+    `help` is the help text of the option. `flag` is the option if it differs from the field's name with dashes. `kind`
+    is the type of the option if it differs from the field's, and `parse` converts it. `names` are the possible values,
+    to which `more` adds some for completion; `tags` is the format ("{}=") in which a shell completes tags of the
+    recordings on the command line. `shown` is passed to `typer.Option`: `metavar`, `min`, `max`, `rich_help_panel`.
     """
     typed = {"flag": flag, "kind": kind, "parse": parse, "names": names, "more": more, "tags": tags, "shown": shown}
     metadata = {"help": help, **typed}
@@ -35,5 +34,5 @@ def setting(
 
 
 def flags_of(settings: Any) -> Mapping[str, str]:
-    """Return the options of the fields whose option is not their name with dashes."""
+    """Return the options of fields whose option differs from their name with dashes."""
     return {one.name: one.metadata["flag"] for one in fields(settings) if one.metadata.get("flag")}

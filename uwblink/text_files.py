@@ -1,7 +1,4 @@
-"""Reads text and TOML files: whatever is wrong with one is one line in the caller's own error.
-
-The line names the file, and in a TOML file the key.
-"""
+"""Reading of text and TOML files, with errors of the caller's type that name the file and the key."""
 
 from __future__ import annotations
 
@@ -19,10 +16,9 @@ __all__ = ["FileKey", "TomlReader", "heads", "is_number", "read_text", "require_
 def require_regular(
     path: str | os.PathLike[str], error: Callable[[str], Exception], what: str = "file", *, folders: bool = False
 ) -> None:
-    """Raise what `error` makes of a line that names the path, where there is no regular file.
+    """Raise `error` with a line of text if a path is not a regular file; directories pass with `folders`.
 
-    Opening a FIFO waits until somebody writes into it, and a device may never end, so neither is opened. A directory
-    passes only with `folders`.
+    FIFOs and devices must not be opened: reading them may never end.
     """
     try:
         mode = os.stat(path).st_mode
@@ -42,7 +38,7 @@ def require_regular(
 def read_text(path: str | os.PathLike[str], error: Callable[[str], Exception], what: str = "file") -> str:
     """Return the text of a file in UTF-8.
 
-    Raises what `error` makes of a line that names the path: no such `what`, no regular file, no text, or not readable.
+    Raises `error` with a line of text if there is no such `what`, or if it is not a readable text file.
     """
     require_regular(path, error, what)
     try:
@@ -54,7 +50,7 @@ def read_text(path: str | os.PathLike[str], error: Callable[[str], Exception], w
 
 
 class FileKey(NamedTuple):
-    """A key of a file, for readers and for the reference: dotted below tables, in capitals where people choose it."""
+    """A key of a file, for the reference: dotted in tables, in capitals if the user chooses it."""
 
     name: str
     kind: str
@@ -63,12 +59,12 @@ class FileKey(NamedTuple):
 
 
 def heads(keys: Iterable[FileKey]) -> tuple[str, ...]:
-    """Return the keys and tables of the first level, each once, in order."""
+    """Return the keys and tables of the first level, in order."""
     return tuple(dict.fromkeys(key.name.split(".")[0] for key in keys))
 
 
 class TomlReader:
-    """Reads one file and checks its values; raises `error`, whose text begins with the path and the key."""
+    """Reads one file and checks its values; raises `error` with a text that begins with path and key."""
 
     def __init__(self, path: Path, error: Callable[[str], Exception], what: str = "file") -> None:
         """Read `path`, which holds a `what`."""
@@ -93,7 +89,7 @@ class TomlReader:
         return dict(found)
 
     def rows(self, name: str, keys: Iterable[str] | None) -> list[dict[str, Any]]:
-        """Return an array of tables, which may be absent; raises for a key that is none of `keys` (None: any)."""
+        """Return an array of tables, which may be absent; raises for a key that is not in `keys` (None: any)."""
         found = self.table.get(name, [])
         good = isinstance(found, list) and all(isinstance(row, dict) for row in found)
         self.check(name, found, good, f"tables [[{name}]]" + (f" with {', '.join(keys)}" if keys else ""))
@@ -102,7 +98,7 @@ class TomlReader:
         return list(found)
 
     def choice(self, key: str, value: Any, allowed: Iterable[Any]) -> Any:
-        """Return a value that is one of `allowed`; None among them stands for a key that is not there."""
+        """Return a value that is one of `allowed`; None among them allows a missing key."""
         listed = list(allowed)
         if not any(type(value) is type(one) and value == one for one in listed):
             names = ", ".join(str(a) for a in listed if a is not None)
@@ -110,11 +106,11 @@ class TomlReader:
         return value
 
     def check(self, key: str, value: Any, good: bool, expected: str) -> None:
-        """Raise where a value is not good."""
+        """Raise `error` if a value is not good."""
         if not good:
             raise self.error(f"{self.path}: {key}: found {value!r}, expected {expected}")
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value of a TOML file is a finite number, and no whole one that a float cannot hold."""
+    """Return whether a value is a finite number within the range of floats."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -1,4 +1,4 @@
-"""Two-way ranging: exchanges as columns, and the ranges that their stamps say.
+"""Two-way ranging: exchanges as columns, and ranges by their stamps.
 
 Stamps are those of Shalaby et al., ICRA 2023, Fig. 2: t1..t6 = tx1, rx1, tx2, rx2, tx3, rx3, so
 dt41 = rx2 - tx1, dt32 = tx2 - rx1, dt53 = tx3 - tx2, dt64 = rx3 - rx2. tx1, rx2 and the initiator's
@@ -31,7 +31,7 @@ class Exchanges(ColumnTable):
     `protocol` holds keys of `PROTOCOLS`. Stamps are ticks modulo 2**`bits`, zero where the protocol
     has no third message. `fpp1_dbm` is measured at the target on message 1, `fpp2_dbm` at the
     initiator on message 2; skews are positive when the receiver's clock is the faster one.
-    `truth_m` is a measured distance that came with the exchange, NaN where there is none.
+    `truth_m` is a distance that was measured independently, NaN if unknown.
     """
 
     time_ns: Ints
@@ -76,11 +76,11 @@ class Exchanges(ColumnTable):
         truth_m: ArrayLike | None = None,
         bits: int = REPORT_BITS,
     ) -> Exchanges:
-        """Return exchanges from the columns one has, each a list, an array, a data-frame column, or one value for all.
+        """Return exchanges from columns, each a list, an array, a data-frame column, or one value for all rows.
 
-        `tx1` gives the number of rows n. What is not given is neutral: `protocol` is "ds" where `tx3` and `rx3` are
-        given and "ss" where not, `time_ns` is 0, `reporter` the initiator, `range_m` the range by the protocol's
-        formula, powers, skews and `truth_m` are NaN. Stamps of a third message are zeros where the protocol has none.
+        `tx1` gives the number of rows n. Defaults: `protocol` is "ds" if `tx3` and `rx3` are given and "ss" otherwise,
+        `time_ns` is 0, `reporter` the initiator, `range_m` the range by the protocol's formula, and powers, skews and
+        `truth_m` are NaN. Stamps of a third message are 0 if the protocol has none.
         `bits` is 32 or 40. Raises `ArgumentError`, which names the column and the row.
 
         >>> from uwblink import Exchanges
@@ -154,7 +154,7 @@ def _protocol_of(protocol: ArrayLike | None, tx3: ArrayLike | None, rx3: ArrayLi
 
 
 def names_in(words: NDArray[np.str_]) -> list[str]:
-    """Return the words that occur in a column (n,), in order."""
+    """Return the distinct words of a column (n,), sorted."""
     coded = arrays.few_words(words)
     return sorted(map(str, np.unique(words) if coded is None else coded[0]))
 
@@ -182,15 +182,15 @@ def intervals(exchanges: Exchanges) -> Intervals:
 
 
 def middle_ns(exchanges: Exchanges) -> Ints:
-    """Return the middle of the first two messages (n,) in ns: the time that a range belongs to."""
+    """Return the middle between the first two messages (n,) in ns, which is the time of a range."""
     return exchanges.time_ns + np.rint(intervals(exchanges).dt41 * (TICK_S * 5e8)).astype(np.int64)
 
 
 def time_of_flight(exchanges: Exchanges) -> Floats:
     """Raw time of flight in seconds, shape (n,): each row by the formula of its protocol.
 
-    NaN or infinite where the stamps of a double-sided row are degenerate (dt53 = 0). A row without stamps (all of the
-    first four are zero), as of a device that tells ranges only, has that of its reported range.
+    NaN or infinite if the stamps of a double-sided row are degenerate (dt53 = 0). Rows without stamps (the first four
+    are zero), as of devices that report ranges only, have the time of flight of the reported range.
     """
     spans = intervals(exchanges)
     flight = np.full(len(exchanges), np.nan)
@@ -245,7 +245,7 @@ def truncate4(values: Floats) -> Floats:
 
 
 def _rows_by_protocol(names: NDArray[np.str_]) -> list[tuple[RangingProtocol, Bools]]:
-    """Return each protocol that occurs and its rows; looks for plug-ins only where a name is not known so far."""
+    """Return the protocols that occur and their rows; plug-ins are loaded only for unknown names."""
     found = []
     for name in names_in(names):
         if name not in PROTOCOLS:
