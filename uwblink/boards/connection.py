@@ -29,13 +29,13 @@ from uwblink.wire.messages import (
 )
 
 FENCE: Final = SetIdle()
-"""The command whose answer shows that no earlier answer can come any more."""
+"""A command after whose answer no late answers can come."""
 
 ANSWER_S: Final = 0.15
 """Longest wait for a reply: six failing tries take 50 ms, and the rest is USB and the host."""
 
 PATIENT_S: Final = 1.0
-"""How long a board that has not answered may take to answer a fence, before it is called dead."""
+"""Longest wait for the answer to a fence, after which the board is considered dead."""
 
 QUIET_AFTER_CIR_S: Final = 0.030
 """How long an initiator is left alone after the report of an exchange whose impulse response was asked for: it prints
@@ -44,7 +44,7 @@ for 22 to 28 ms (firmware wire format, 1.4)."""
 QUIET_TARGET_S: Final = 0.040
 """The same for the target, which prints its own before its report, if it was asked to report."""
 
-DEAD: Final = "is this a ranging board, and has it power? A board that hangs must be unplugged"
+NO_ANSWER_HINT: Final = "is this a ranging board, and has it power? A board that hangs must be unplugged"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Connection:
     """The conversation with the board at one port. Bytes and times go in, bytes, events and outcomes come out."""
 
     def __init__(self, name: str, answer_s: float = ANSWER_S) -> None:
-        """Begin; `name` is the port's, for the texts of errors."""
+        """`name` is the name of the port, for error messages."""
         self.name = name
         self.decoder = Decoder(REPORTS)
         self.doubtful = False
@@ -87,17 +87,17 @@ class Connection:
 
     def ready_s(self, now_s: float) -> float:
         """Return how long to wait until the board may be asked again."""
-        if self.decoder.begun == Cir.KEY:  # somebody else asked for the impulse response that is coming in
-            # Its pieces come a millisecond apart; one that stays away for five never comes.
+        if self.decoder.begun == Cir.KEY:  # an impulse response that another command requested
+            # Its pieces come a millisecond apart; after five without one it is incomplete.
             return max(self._quiet_until_s, self._heard_s + 0.005) - now_s
         return max(self._quiet_until_s - now_s, 0.0)
 
-    def leave_alone(self, until_s: float) -> None:
-        """Have the board not asked anything before a time, because it is printing an impulse response."""
+    def keep_quiet(self, until_s: float) -> None:
+        """Send no command before a time, because the board is printing an impulse response."""
         self._quiet_until_s = max(self._quiet_until_s, until_s)
 
     def deadline_s(self) -> float | None:
-        """Return when the outstanding command runs out of time."""
+        """Return the time at which the outstanding command times out, None without one."""
         return self._pending.until_s if self._pending else None
 
     def send(self, command: Message, now_s: float) -> bytes:
@@ -135,7 +135,7 @@ class Connection:
         sent = encode(pending.command)
         text = f"{self.name}: no answer to {sent!r} within {pending.answer_s * 1e3:.0f} ms; heard {heard}"
         if not pending.heard and pending.answer_s >= PATIENT_S:
-            text += f"; {DEAD}"
+            text += f"; {NO_ANSWER_HINT}"
         return CommandOutcome(pending.command, None, NoAnswerError(text))
 
     def _ended_by(self, pending: _Pending, event: Event, now_s: float) -> CommandOutcome | None:
@@ -169,7 +169,7 @@ class Connection:
 
 
 def checked(command: Message) -> bytes:
-    """Return a command's bytes, or raise `RefusedError`: boards do not check what they are told."""
+    """Return the bytes of a command; raises `RefusedError` for values that boards do not check."""
     kind = type(command).__name__
     if COMMANDS.get(command.KEY) is not type(command):
         raise RefusedError(f"{kind} is not a command")

@@ -1,7 +1,7 @@
-"""Recording from boards into a file: who is there, what the file says of it, and the thread that writes it.
+"""Recording from boards into a file: identification of boards, metadata, and the thread that writes the file.
 
-The recorder's loop collects what was heard, and a thread of the writer's own commits it every `FLUSH_S`: so a slow disk
-never makes the loop miss bytes, and what was handed over is in the file after that time and the commit itself.
+The recorder's loop collects messages and a separate thread commits them every `FLUSH_S` seconds, so that a slow disk
+does not make the loop miss bytes.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from uwblink.wire.bulk import exchanges_of
 from uwblink.wire.messages import Cir, Overheard, RangeReport
 
 FILE_MB: Final = 64
-"""Memory for the file; without a limit all of it would be kept, and a recording of hours is long."""
+"""Memory limit for the file; by default DuckDB would cache all of it."""
 
 FLUSH_S: Final = 0.1
-"""How often rows are committed: what a power cut loses is no longer than this."""
+"""Time between commits, and the longest stretch that a power cut loses."""
 
 LONGEST_BACKLOG_S: Final = 20.0
-"""How far behind a disk may fall: much longer than the second or two for which a busy one does not answer."""
+"""Longest delay of the disk that is tolerated; busy disks take a second or two."""
 
 LONG_LOG: Final = 8 * 2**20
 """Half of the bytes at which DuckDB puts its log into the file within a commit, which takes a second on a busy machine.
@@ -65,11 +65,11 @@ def record(  # noqa: PLR0913 - the settings of a recording, by keyword
 ) -> Progress:
     """Record from boards until `stop` says so or the time is over; returns what was done.
 
-    `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are told what the file gets
-    (see `uwblink.boards.listeners`), and `using` are other ports than this computer's serial ones (`VirtualPorts`).
-    `arrangement` names the places of boards that stand still meanwhile, `known` to be on a "line" or a "plane", and
-    `order` says in which order their ids lie along a line; it is marked in the recording, for a survey.
-    What is programmed into boards as antenna delays is what `plan` says of it, and goes into the recording.
+    `ports` are names or pyserial URLs, `watch` is called four times a second, `listeners` are called with everything
+    that the file gets (see `uwblink.boards.listeners`), and `using` are ports other than this computer's serial ports
+    (`VirtualPorts`). `arrangement` is a name for the places of boards that stand still, for a survey; `known` says that
+    they are on a "line" or a "plane", and `order` is the order of their ids along the line. The antenna delays of
+    `plan` are stored in the recording.
     `KeyboardInterrupt` ends a recording like `stop`, with everything in the file. Raises the errors of `Board.open`,
     `PlanError` (a tag of plan or order is absent, two boards have one id, a duration that is none, stamps of other
     antenna delays than the plan's, whose recording is removed), and
@@ -142,7 +142,7 @@ def _check_arrangement(mark: Arrangement) -> None:
 
 
 def _check_boards(found: Mapping[int, str], plan: RangingPlan, mark: Arrangement) -> None:
-    """Raise `PlanError` where an order or the places of tags are of other boards than those at the ports."""
+    """Raise `PlanError` if an order or places of tags are for other boards than those at the ports."""
     there, seats = ", ".join(map(str, sorted(found))), {tag.tag for tag in plan.tags}
     if mark.order and sorted(mark.order) != sorted(found):
         text = f"found {', '.join(map(str, mark.order))}, expected each of the boards at the ports, {there}"
@@ -194,7 +194,7 @@ class Batch:
         return bool(self.frames or self.exchanges or self.overheard or self.cirs or self.faults)
 
     def add(self, heard: Heard) -> None:
-        """Put a message into the list of its table; what belongs to none is in the bytes."""
+        """Add a message to the list of its table; other messages are stored as bytes only."""
         row = heard.time_ns, heard.board
         if isinstance(heard.message, RangeReport):
             self.exchanges.append((*row, heard.message))
@@ -284,8 +284,7 @@ class RecordingWriter(Listener):
         if self._error:
             raise self._error
         now_s = time.monotonic()
-        # A loop that did not check for two seconds was stopped with its process (Ctrl-Z, a suspended computer), and no
-        # disk is to blame.
+        # If the loop did not check for two seconds, the process was stopped (Ctrl-Z, a suspended computer).
         if now_s - self._checked_s > 2.0:
             self._stopped_s += now_s - self._checked_s
         self._checked_s = now_s
@@ -313,7 +312,7 @@ class RecordingWriter(Listener):
                 self._check_file()
             except RecordingError as error:
                 self._error = error
-            except Exception as error:  # whatever it is: nobody else sees what ends this thread
+            except Exception as error:  # an exception would end the thread unnoticed
                 self._error = RecordingError(
                     f"{self._recording.path}: cannot be written any more ({type(error).__name__}: {error}). "
                     "What was written before is kept"
@@ -327,7 +326,7 @@ class RecordingWriter(Listener):
             self._shortening.join()
 
     def _shorten_log(self) -> None:
-        """Have a long log put into the file by another thread, while this one goes on committing."""
+        """Checkpoint a long log in another thread, while this one continues to commit."""
         if self._shortening and self._shortening.is_alive():
             return
         try:
@@ -336,7 +335,7 @@ class RecordingWriter(Listener):
             return
 
         def put_away() -> None:
-            with suppress(RecordingError):  # what is wrong with the disk, the next commit reports
+            with suppress(RecordingError):  # the next commit reports problems of the disk
                 self._recording.shorten_log()
 
         if long:
@@ -344,14 +343,14 @@ class RecordingWriter(Listener):
             self._shortening.start()
 
     def _check_file(self) -> None:
-        """Raise `RecordingError` where the file has no name any more: what is written to it then is lost."""
+        """Raise `RecordingError` if the file was removed or replaced."""
         path = self._recording.path
         if _identity(path) != self._file:
             raise RecordingError(f"{path}: was removed or replaced while it was being recorded; what it held is lost")
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from another of the same name, None where there is none."""
+    """Return device and inode of a file, None if there is none."""
     try:
         found = path.stat()
     except OSError:
@@ -366,8 +365,7 @@ class _Withdrawn(RecordingError):  # noqa: N818 - nothing is wrong
 def check_writing(recording: Recording) -> None:
     """Raise `RecordingError` unless a row of each kind comes back as it was written; leaves nothing behind.
 
-    `recording` is a new one, with nothing in it. Another version of a library may write otherwise, and an hour later
-    is too late to know.
+    `recording` is new and empty. This detects incompatible versions of libraries before a long recording.
     """
     probe = Batch(
         frames=[FrameRow(1, "probe", "in", bytes(range(256)))],

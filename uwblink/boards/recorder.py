@@ -1,4 +1,4 @@
-"""The recorder: plays a ranging plan on boards and tells its listeners everything that was said, by either side.
+"""The recorder: executes a ranging plan on boards and passes all traffic to its listeners.
 
 One loop waits for bytes from all ports and for the next turn of the plan; exchanges take turns, because two at once
 would collide on the air. A board that is unplugged leaves the others running and is taken back when it returns.
@@ -22,11 +22,11 @@ from uwblink.wire.codec import LONGEST_LINE, Event
 from uwblink.wire.messages import GetId, IdReport, Message, RangeCommand, RangeReport, SetPassive, Skipped, TextLine
 
 LONGEST_WAIT_S: Final = 0.05
-"""How often the loop looks whether it is to stop, if nothing comes in."""
+"""Longest time between two checks whether to stop."""
 
 
 class Station:
-    """A board's port as the recorder sees it; `port` is None while it is unplugged."""
+    """State of a board's port; `port` is None while it is unplugged."""
 
     def __init__(self, board: int, name: str, ports: Ports, *, passive: bool) -> None:
         """Open the port; raises `PortError`. A `passive` board is told to listen, again whenever it comes back."""
@@ -45,21 +45,21 @@ class Station:
         return self.port is not None and not waits and now_s >= self._pause_until_s
 
     def next_command(self, now_s: float) -> Message | None:
-        """Return what the board is to be told besides the plan's turns, None if nothing is due."""
+        """Return the next set-up command of the board, None if there is none."""
         if self.port is None or self.connection.busy or not self._todo or self.connection.ready_s(now_s) > 0:
             return None
         return self._todo.popleft()
 
-    def rest_after(self, outcome: CommandOutcome, now_s: float) -> None:
-        """Leave a board alone for a second that did not even answer a fence."""
+    def pause_after(self, outcome: CommandOutcome, now_s: float) -> None:
+        """Pause a board for a second if it did not answer a fence."""
         if isinstance(outcome.error, TimeoutError) and outcome.command is FENCE:
             self._pause_until_s = now_s + 1.0
 
     def damage(self, events: list[Event], now_s: float) -> str | None:
         """Gather bytes that are no message; returns a description of them when a damaged line is over.
 
-        One damaged line is skipped in many pieces, because it comes in many, and because a message could start in it.
-        It is over with a message, a line end, too many bytes, or 50 ms of silence.
+        The decoder skips a damaged line in several pieces. The line ends with a message, a line end, too many bytes, or
+        after 50 ms of silence.
         """
         text = None
         for event in [*events, None]:
@@ -80,7 +80,7 @@ class Station:
         self.port, self._retry_s = None, now_s + 0.2
 
     def plug_again(self, now_s: float) -> bool:
-        """Try to take the board back, under another name if its device has one now; True when it is back."""
+        """Try to reopen the port, under a new name if its device has one; returns whether it is open."""
         if self.port is not None or now_s < self._retry_s:
             return False
         self._retry_s = now_s + 0.2  # the system needs time to find a device that was plugged in
@@ -91,7 +91,7 @@ class Station:
         return self.port is not None
 
     def _plug(self, name: str) -> None:
-        """Open the port; the board's power may have been gone, so it must be told again what it was told before."""
+        """Open the port and repeat the set-up commands, because the board may have lost power."""
         self.port = self._ports.open(name)
         self.name, self.connection = name, Connection(name)
         self._todo.clear()
@@ -174,12 +174,12 @@ class Recorder:
                 self._ports.close(station.port)
 
     def _step(self, end_s: float) -> None:
-        """Wait for what comes first, and deal with it."""
+        """Wait for the next event and handle it."""
         for listener in self._listeners:
             listener.check()
         self._begin()
         for port in self._ports.wait(self._wait_s(end_s)):
-            self._hear(self._by_port[id(port)])
+            self._receive(self._by_port[id(port)])
         now_s = self._ports.now_s()
         for station in self._stations.values():
             if station.plug_again(now_s):
@@ -188,7 +188,7 @@ class Recorder:
             if station.port is None:
                 continue
             if outcome := station.connection.expire(now_s):
-                self._ended(station, outcome)
+                self._finish_command(station, outcome)
             if damage := station.damage([], now_s):
                 self._fault(station, "garbage", damage)
 
@@ -201,11 +201,11 @@ class Recorder:
         return max(min(ends) - now_s, 0.0)
 
     def _begin(self) -> None:
-        """Ask whoever has something to be asked: set-up first, then the next turn of the plan."""
+        """Send due commands: set-up commands first, then the next turn of the plan."""
         now_s = self._ports.now_s()
         for station in self._stations.values():
             if command := station.next_command(now_s):
-                self._say(station, command)
+                self._send(station, command)
         if self._active or not self._turns or now_s < self._next_s:
             return
         found = self._next_turn(now_s)
@@ -213,16 +213,16 @@ class Recorder:
             self._next_s = now_s + 0.005
         elif found[0].connection.doubtful:
             self._turn -= 1
-            self._say(found[0], FENCE)
+            self._send(found[0], FENCE)
         else:
-            # A turn that comes late does not make the next ones come in a burst.
+            # A late turn is not followed by a burst.
             self._next_s = max(self._next_s + (1 / self._plan.rate_hz if self._plan.rate_hz else 0.0), now_s)
             self._active = station, pair = found
             plan = self._plan
-            self._say(station, RangeCommand(pair[1], plan.target_reports, plan.protocol == "ds", plan.get_cir))
+            self._send(station, RangeCommand(pair[1], plan.target_reports, plan.protocol == "ds", plan.get_cir))
 
     def _next_turn(self, now_s: float) -> tuple[Station, Pair] | None:
-        """Return the next pair of the plan that can range, passing over those of which a board is busy or away."""
+        """Return the next pair of the plan that can range; pairs with a busy or missing board are skipped."""
         for _ in range(len(self._turns)):
             pair = self._turns[self._turn % len(self._turns)]
             self._turn += 1
@@ -230,42 +230,42 @@ class Recorder:
                 return self._stations[pair[0]], pair
         return None
 
-    def _say(self, station: Station, command: Message) -> None:
+    def _send(self, station: Station, command: Message) -> None:
         data = station.connection.send(command, self._ports.now_s())
-        self._tell_bytes(station, "out", data)
+        self._notify_of_bytes(station, "out", data)
         try:
             if station.port is not None:
                 station.port.write(data)
         except PortLostError as error:
-            self._lost(station, error)
+            self._report_lost(station, error)
 
-    def _hear(self, station: Station) -> None:
+    def _receive(self, station: Station) -> None:
         try:
             data = station.port.read(0.0) if station.port is not None else b""
         except PortLostError as error:
-            self._lost(station, error)
+            self._report_lost(station, error)
             return
         if not data:
             return
-        time_ns, now_s = self._tell_bytes(station, "in", data), self._ports.now_s()
+        time_ns, now_s = self._notify_of_bytes(station, "in", data), self._ports.now_s()
         events, outcome = station.connection.receive(data, now_s)
         if damage := station.damage(events, now_s):
             self._fault(station, "garbage", damage)
         for event in events:
-            self._tell(station, time_ns, event)
+            self._notify(station, time_ns, event)
         if outcome:
-            self._ended(station, outcome)
+            self._finish_command(station, outcome)
 
-    def _tell_bytes(self, station: Station, direction: str, data: bytes) -> int:
+    def _notify_of_bytes(self, station: Station, direction: str, data: bytes) -> int:
         time_ns = self._ports.host_ns()
         for listener in self._listeners:
             listener.on_bytes(time_ns, station.name, direction, data)
         return time_ns
 
-    def _tell(self, station: Station, time_ns: int, event: Event) -> None:
+    def _notify(self, station: Station, time_ns: int, event: Event) -> None:
         if isinstance(event, Skipped):
             return
-        # The lines that every ranging brings are no faults; any other one is.
+        # Lines that accompany failed exchanges are expected; all others are faults.
         expected = ("WARNING", "COMMANDED TASK FAILED", "TWR FAIL")
         if isinstance(event, TextLine) and not event.text.startswith(expected):
             self._fault(station, "text", event.text.strip())
@@ -275,29 +275,29 @@ class Recorder:
         for listener in self._listeners:
             listener.on_message(heard)
 
-    def _ended(self, station: Station, outcome: CommandOutcome) -> None:
+    def _finish_command(self, station: Station, outcome: CommandOutcome) -> None:
         now_s = self._ports.now_s()
         if outcome.error:
             kind = "time-out" if isinstance(outcome.error, TimeoutError) else "failed exchange"
             ranged = outcome.command if isinstance(outcome.command, RangeCommand) else None
             self._fault(station, kind, str(outcome.error), ranged)
-            station.rest_after(outcome, now_s)
+            station.pause_after(outcome, now_s)
         if isinstance(outcome.reply, IdReport) and outcome.reply.board != station.board:
             self._fault(station, "wrong board", f"board {outcome.reply.board} where {station.board} was")
-            self._drop(station)
+            self._unplug(station)
         if self._active and self._active[0] is station and isinstance(outcome.command, RangeCommand):
             if self._plan.get_cir:
-                self._leave_alone(self._active[1], now_s)
+                self._keep_quiet(self._active[1], now_s)
             self._end_turn(outcome.reply if isinstance(outcome.reply, RangeReport) else None)
 
-    def _leave_alone(self, pair: Pair, now_s: float) -> None:
-        """Keep quiet while the two boards of an exchange, and passive ones, print their impulse responses."""
+    def _keep_quiet(self, pair: Pair, now_s: float) -> None:
+        """Send nothing while the two boards of an exchange, and passive ones, print their impulse responses."""
         both = self._plan.target_reports or self._passive
         until_s = now_s + (QUIET_TARGET_S if both else QUIET_AFTER_CIR_S)
         self._next_s = max(self._next_s, until_s)
         for board, station in self._stations.items():
             if board in pair or self._passive:
-                station.connection.leave_alone(until_s)
+                station.connection.keep_quiet(until_s)
 
     def _end_turn(self, report: RangeReport | None) -> None:
         if self._active is None:
@@ -307,13 +307,13 @@ class Recorder:
         for listener in self._listeners:
             listener.on_turn(turn)
 
-    def _lost(self, station: Station, error: PortLostError) -> None:
+    def _report_lost(self, station: Station, error: PortLostError) -> None:
         self._fault(station, "unplugged", str(error))
-        self._drop(station)
+        self._unplug(station)
         if self._active and self._active[0] is station:
             self._end_turn(None)
 
-    def _drop(self, station: Station) -> None:
+    def _unplug(self, station: Station) -> None:
         self._by_port.pop(id(station.port), None)
         station.unplug(self._ports.now_s())
 

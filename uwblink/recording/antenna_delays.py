@@ -1,4 +1,4 @@
-"""Antenna delays that are programmed into devices: in files people write, in a recording's `meta`, and compared.
+"""Antenna delays that are programmed into devices: TOML files, a recording's `meta`, and comparisons.
 
 ```toml
 [antenna_delays]           # of all devices that are not named
@@ -12,9 +12,9 @@ rx = 16449
 reply = 16446
 ```
 
-The chip adds `tx` to the stamps of what it sends, and takes `rx` from those of what it receives. A reply that is sent
-at a time chosen before carries its own stamp: the firmware works it out, with a constant of its build (`TX_ANT_DLY`),
-and the chip's register has no part in it. Where both differ, stamps of one device carry two delays.
+The chip adds `tx` to stamps of transmission and subtracts `rx` from stamps of reception. A delayed reply contains its
+own stamp of transmission, which the firmware computes with a constant of its build (`TX_ANT_DLY`) instead of the
+register. If the two differ, the stamps of a device have two different transmit delays.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FILE_KEYS: Final = tuple(
 
 
 class AntennaDelay(NamedTuple):
-    """What is programmed into one device, in ticks: both registers, and the firmware's constant for replies."""
+    """Antenna delays of one device in ticks: both registers, and the firmware's constant for replies."""
 
     tx: int = ANTENNA_DELAY_TICKS
     rx: int = ANTENNA_DELAY_TICKS
@@ -59,24 +59,24 @@ class AntennaDelay(NamedTuple):
 
 
 AntennaDelays = Mapping[int | None, AntennaDelay]
-"""Delays by device, under None those of devices that are not named; a device may have none."""
+"""Delays by device; None is the key for devices that are not named. A device may have none."""
 
 
 def delay_of(delays: AntennaDelays, tag: int) -> AntennaDelay | None:
-    """Return what is programmed into a device; None where that is not known."""
+    """Return the delays of a device, None if unknown."""
     return delays.get(tag, delays.get(None))
 
 
 def known_delays(delays: AntennaDelays, tags: Iterable[int]) -> AntennaDelays:
-    """Return what is programmed into some devices, each by its id, without those of which it is not known."""
+    """Return the known delays of some devices by id."""
     found = {tag: delay_of(delays, tag) for tag in tags}
     return {tag: delay for tag, delay in found.items() if delay is not None}
 
 
 def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
-    """Return what a recording's `meta` says was programmed, which may be nothing; raises `ValueError`.
+    """Return the delays in a recording's `meta`, which may be empty; raises `ValueError`.
 
-    Devices of which no constant for replies is told have that of their transmitter.
+    The default of the constant for replies is the transmitter's delay.
     """
     found: dict[int | None, AntennaDelay] = {}
     rows: dict[int | None, Any] = {None: meta[ALL]} if ALL in meta else {}
@@ -90,7 +90,7 @@ def delays_in_meta(meta: Mapping[str, Any]) -> AntennaDelays:
 
 
 def meta_of_delays(delays: AntennaDelays) -> dict[str, Any]:
-    """Return the entries of a recording's `meta` that say what was programmed."""
+    """Return the entries of a recording's `meta` for delays."""
     rows = {tag: one._asdict() for tag, one in delays.items()}
     for row in rows.values():
         if row["reply"] == row["tx"]:
@@ -104,8 +104,8 @@ def read_antenna_delays(
 ) -> dict[int | None, AntennaDelay]:
     """Return the `[antenna_delays]` of a file, none where there is none; raises the file's error, with the key.
 
-    A device whose registers are not the boards' 16436 needs its `reply`: which constant its firmware was built with
-    cannot be told from its registers. With `ticks_per_unit` the section is that of another maker's devices: it has only
+    `reply` is required for devices whose register is not 16436, because the firmware's constant does not follow from
+    the registers. With `ticks_per_unit` the section is that of another maker's devices: it has only
     `tx` and `rx`, which are 0 where they are not given, and a `unit`, one of these names.
     """
     section, scale = file.section("antenna_delays"), None
@@ -162,10 +162,10 @@ def text_of_delays(delays: AntennaDelays) -> str:
 
 
 def delays_differ(then: AntennaDelays, now: AntennaDelays, tags: Iterable[int]) -> str:
-    """Say where other delays are programmed `now` than `then` in some tags, as far as both are known; "" for nowhere.
+    """Describe differences between known delays `then` and `now` of some tags; "" for none.
 
-    A calibration that was fitted to what was measured then is wrong now by half of the sum, in ranges of such a tag.
-    How a sum is divided between the two registers makes no difference.
+    A calibration fitted with other delays makes a range wrong by half of the difference of a tag's sum. The division of
+    the sum between the two registers has no effect.
     """
     pairs = {tag: (delay_of(then, tag), delay_of(now, tag)) for tag in sorted(tags)}
     told, far_m = [], 0.0

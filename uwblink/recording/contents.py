@@ -1,4 +1,4 @@
-"""What a recording holds, in memory: all at once, cut and written again; or in pieces of time, for long recordings."""
+"""Contents of a recording in memory: as a whole, for selecting and saving, or in pieces of time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Pairs = Iterable[tuple[int, int]]
 Row = TypeVar("Row", CirRow, FrameRow, Fault)
 
 READING_MB: Final = 300
-"""Memory for a file that is read in pieces; without a limit, it would be the size of the file."""
+"""Memory limit for files that are read in pieces; by default DuckDB would cache the whole file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,10 +66,11 @@ class Contents:
         tags: Collection[int] | None = None,
         pairs: Pairs | None = None,
     ) -> Contents:
-        """Return what lies from `start_s` until before `stop_s`, in seconds since the first exchange, of some tags.
+        """Return the contents from `start_s` to before `stop_s`, in seconds since the first exchange, for some tags.
 
-        `tags` keeps exchanges between these tags; `pairs` those of (initiator, target). Poses stay as far as the span
-        needs them, tags stay all. Readings, bytes and faults are cut in time only. `meta` says what was selected.
+        `tags` selects exchanges between these tags, `pairs` those of (initiator, target). Poses are kept as far as the
+        span needs them, tags completely. Readings, bytes and faults are selected by time only. `meta` describes the
+        selection.
         Raises `ArgumentError`.
         """
         first_ns, end_ns = self._bounds(start_s, stop_s)
@@ -163,9 +164,9 @@ _COLUMNS: Final = ("overheard", "imu", "height", "powers", "temperature", "corre
 
 
 def load(path: str | os.PathLike[str]) -> Contents:
-    """Read everything that a recording holds; raises what `Recording.open` raises.
+    """Read a whole recording; raises what `Recording.open` raises.
 
-    Bytes and impulse responses are read, too: 2 kB a response. `Recording.open` reads table by table.
+    This includes bytes and impulse responses, 2 kB each. `Recording.open` reads table by table.
 
     >>> import tempfile, pathlib, uwblink
     >>> folder = pathlib.Path(tempfile.mkdtemp())
@@ -184,13 +185,13 @@ def load(path: str | os.PathLike[str]) -> Contents:
 
 
 def _around(poses: Poses, first_ns: int, end_ns: int) -> Poses:
-    """Return each body's poses in a span of time, and the ones next to it, between which it is interpolated."""
+    """Return each body's poses in a span of time, and the adjacent ones, which interpolation needs."""
     keep = np.zeros(len(poses), dtype=bool)
     for body in np.unique(poses.body):
         rows = np.flatnonzero(poses.body == body)
         before = int(np.searchsorted(poses.time_ns[rows], first_ns, side="right")) - 1
         after = int(np.searchsorted(poses.time_ns[rows], end_ns, side="left")) + 1
-        # A body with one pose does not move, whenever that was.
+        # A body with a single pose does not move.
         keep[rows[max(before, 0) : after] if len(rows) > 1 else rows] = True
     return poses[keep]
 
@@ -213,10 +214,9 @@ def _pairs(pairs: Pairs | None) -> list[tuple[int, int]] | None:
 
 
 def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
-    """Yield what has a time, piece by piece, about so many rows of a table each: later rows are in later pieces.
+    """Yield consecutive pieces of time with about `rows` rows of each table.
 
-    Bytes, impulse responses and total powers are left out, and so is `corrected` where it is not that of the exchanges,
-    row by row.
+    Bytes, impulse responses and total powers are left out, and `corrected` if its rows are not those of the exchanges.
     """
     fitting = recording.corrected_is_of_exchanges()
     edges = {-LATEST_NS, LATEST_NS}
@@ -235,9 +235,9 @@ def pieces(recording: Recording, rows: int = 50_000) -> Iterator[Contents]:
 
 
 def distances_by_poses_m(recording: Recording, blocks: Iterable[Exchanges]) -> Iterator[Floats]:
-    """Yield the distances (n,) at which the antennas of each block of exchanges were by the poses; NaN without poses.
+    """Yield the distances (n,) between the antennas of each block of exchanges by the poses; NaN without poses.
 
-    A distance is that in the middle of the first two messages, to which a range belongs.
+    They are distances at the middle between the first two messages, which is the time of a range.
     """
     tracks, tags = recording.pose_windows().tracks, recording.tags()
     for some in blocks:
@@ -245,9 +245,9 @@ def distances_by_poses_m(recording: Recording, blocks: Iterable[Exchanges]) -> I
 
 
 def exchanges_with_poses(recording: Recording) -> Iterator[tuple[Exchanges, Poses]]:
-    """Yield all exchanges in the order of their rows, some at a time, and the poses between which they are.
+    """Yield blocks of all exchanges in the order of their rows, and the poses around them.
 
-    Distances at the exchanges' times, and at the middles of their messages, are what they are with all poses.
+    The poses suffice for distances at the times of exchanges and at the middle between their messages.
     """
     windows = recording.pose_windows()
     for block in recording.exchange_blocks():

@@ -44,7 +44,7 @@ ROWS_AT_ONCE: Final = 131_072
 class Tables:
     """Reads and appends; each method raises `RecordingError` where it cannot.
 
-    What needs no memory for all rows at once takes `start_ns` and `end_ns`: rows from the one until before the other.
+    Methods with `start_ns` and `end_ns` return the rows from the first until before the second.
     """
 
     _store: Store
@@ -182,7 +182,7 @@ class Tables:
             listed = " or ".join(map(str, BITS))
             raise RecordingError(f"{self.path}: meta timestamp_bits is {printable(bits):.40}, expected {listed}")
         plain = ", ".join(name for name in COLUMNS if name != "protocol")
-        # Protocols of other distributions are looked for only where the known ones do not suffice.
+        # Plug-ins are loaded only for unknown protocols.
         for names in ([row.name for row in PROTOCOLS.known()], PROTOCOLS):
             known = list(names)
             code = f"list_position({known}, protocol)::TINYINT"
@@ -197,7 +197,7 @@ class Tables:
         return Exchanges(protocol=protocol, bits=int(bits), **found), numbers
 
     def stretches(self, rows: int) -> list[tuple[int, int]]:
-        """Return spans of time (from, until before, in ns), one after the other, with about so many exchanges each."""
+        """Return consecutive spans of time (start, end in ns) with about `rows` exchanges each."""
         time = np.sort(filled(self._store.read("SELECT time_ns FROM exchanges")["time_ns"]), kind="stable")
         edges = sorted({*time[:: max(rows, 1)].tolist(), *(time[-1:] + 1).tolist()})
         return list(pairwise(edges))
@@ -220,7 +220,7 @@ class Tables:
         if self._store.rows("SELECT 1 FROM poses WHERE body IS NULL OR time_ns IS NULL LIMIT 1"):
             raise RecordingError(f"{self.path}: table poses: a body without a name, or a pose without a time")
         tracks: dict[str, Columns] = {}
-        # By hashes instead of words: words of millions of rows take longer than everything else.
+        # By hash, because reading millions of words would take longer than everything else.
         for body, code in self._store.rows("SELECT body, hash(body) FROM poses GROUP BY body ORDER BY body"):
             query = f"SELECT time_ns, {', '.join(POSE)} FROM poses WHERE hash(body) = {code}::UBIGINT ORDER BY rowid"  # noqa: S608 - a number
             tracks[body] = {name: filled(column) for name, column in self._store.read(query).items()}
@@ -240,7 +240,7 @@ class Tables:
         return self._store.read(f"SELECT {names} FROM {table} {_within(start_ns, end_ns)} ORDER BY rowid")  # noqa: S608 - keys of TABLES
 
     def _readings(self, table: str, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
-        """Return a table in the order of its rows: no word is "", no flag is false, no number is NaN or 0."""
+        """Return a table in the order of its rows; missing values are "", False, NaN or 0."""
         found = self.columns(table, start_ns, end_ns)
         for name, column in found.items():
             kind = TABLES[table][name]
@@ -269,7 +269,7 @@ class Tables:
         return self._by_time("imu", start_ns, end_ns)
 
     def heights(self, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
-        """Return what height sensors read as columns of the table `height`, in order of time."""
+        """Return the readings of height sensors as columns of the table `height`, in order of time."""
         return self._by_time("height", start_ns, end_ns)
 
     def powers(self) -> Columns:
@@ -277,7 +277,7 @@ class Tables:
         return self._by_time("powers")
 
     def temperatures(self, start_ns: int | None = None, end_ns: int | None = None) -> Columns:
-        """Return what tags read of themselves as columns of the table `temperature`, in order of time.
+        """Return temperatures and supply voltages of tags as columns of the table `temperature`, in order of time.
 
         Temperature in degrees Celsius and supply voltage in volts; NaN where there is none.
         """
@@ -291,7 +291,7 @@ class Tables:
         return self._readings("corrected", start_ns, end_ns)
 
     def corrected_is_of_exchanges(self) -> bool:
-        """Whether the table `corrected` has rows, and they are those of the exchanges, row by row."""
+        """Return whether the rows of the table `corrected` are those of the exchanges; False if it is empty."""
         if not self.count("corrected"):
             return False
         differs = " OR ".join(f"e.{n} IS DISTINCT FROM c.{n}" for n in ("time_ns", "initiator", "target"))
@@ -299,7 +299,7 @@ class Tables:
         return not self._store.rows(query)
 
     def times_apart(self, table: str, rows: int) -> list[int]:
-        """Return times between which one of `TABLES` has about so many `rows`; none where it has fewer."""
+        """Return times that divide one of `TABLES` into parts of about `rows` rows; none if it has fewer."""
         parts = self.count(table) // rows
         shares = [part / (parts + 1) for part in range(1, parts + 1)]
         found = self._store.rows(f"SELECT quantile_disc(time_ns, {shares}) FROM {table}") if shares else [([],)]  # noqa: S608 - a key of TABLES
@@ -325,7 +325,7 @@ class Tables:
     def arrangements(self) -> list[Arrangement]:
         """Return the stretches of time in which boards stood still, in order of time; none in older files.
 
-        Raises `RecordingError` where what is known of one is neither a shape nor a line with the order of its tags.
+        Raises `RecordingError` for unknown shapes, and for orders of tags that are not on a line.
         """
         found = []
         for start_ns, end_ns, name, known in self._rows("arrangements", "start_ns"):

@@ -1,7 +1,7 @@
-"""Two reports of one exchange: where targets report too, each exchange stands in a recording twice.
+"""Second reports of exchanges: if targets report too, a recording has each exchange twice.
 
-Both boards print the same stamps, so the pair and a stamp of either clock tell which two belong together. One of them
-is the exchange; what the other says otherwise is a fault, because the boards cannot disagree about the same frames.
+Both boards report the same stamps, so that pair and a stamp of either clock identify two reports of one exchange. The
+first report is used. Differences of the second one are faults, because both are of the same frames.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from uwblink.recording.tables import ROWS_AT_ONCE, Tables
 from uwblink.twr import STAMPS, Exchanges, without_stamps
 
 APART_NS: Final = 60_000_000
-"""Reports of one exchange are nearer than this, and equal stamps of another one further: they wrap after 67 ms."""
+"""Largest time between reports of one exchange; stamps of others can be equal after the wrap, 67 ms."""
 
 COMPARED: Final = (*STAMPS, "range_m", "fpp1_dbm", "fpp2_dbm", "skew1_ppm", "skew2_ppm")
-"""What both reports say of an exchange."""
+"""Columns that both reports have in common."""
 
 
 @dataclass(frozen=True, slots=True)
 class SingleReports:
-    """Exchanges with one row each, in their order: `repeated` second reports are left out, `differing` say otherwise.
+    """Exchanges without second reports, in their order; `repeated` is the number of those.
 
-    `differing` (k, 2) has the rows of the given exchanges at which the two reports stand, the initiator's first;
-    `seconds` (repeated,) those of the second reports.
+    `differing` (k, 2) are the rows of reports that differ, the initiator's first; `seconds` (repeated,) are the rows of
+    all second reports. Rows are those of the given exchanges.
     """
 
     exchanges: Exchanges
@@ -38,13 +38,13 @@ class SingleReports:
 
 
 def single_reports(exchanges: Exchanges) -> SingleReports:
-    """Return each exchange once: the initiator's report where there is one, otherwise the target's."""
+    """Return each exchange once: the initiator's report if there is one, else the target's."""
     by_target = np.flatnonzero(from_targets(exchanges))
     if not len(by_target):
         return SingleReports(exchanges, 0, np.empty((0, 2), dtype=np.int64))
     by_initiator = np.flatnonzero(exchanges.reporter == exchanges.initiator)
     partner = np.full(len(by_target), -1, dtype=np.int64)
-    for name in ("tx1", "tx2"):  # a stamp of each board's clock: where one is damaged, the other still tells
+    for name in ("tx1", "tx2"):  # a stamp of each clock, in case that one is damaged
         alone = partner < 0
         partner[alone] = _partners(exchanges, name, by_target[alone], by_initiator)
     known = partner >= 0
@@ -58,9 +58,9 @@ def single_reports(exchanges: Exchanges) -> SingleReports:
 
 
 def repeated_rows(exchanges: Exchanges) -> Bools:
-    """Return which exchanges (n,) say again what another row of their pair and reporter said: all stamps and readings.
+    """Return which exchanges (n,) repeat another row of the same pair and reporter in all stamps and readings.
 
-    Ranges without stamps say little, so that theirs must be of nearly one time, too.
+    Ranges without stamps must also have nearly the same time.
     """
     e = exchanges
     columns = [e.initiator, e.target, e.reporter, *(getattr(e, name) for name in COMPARED)]
@@ -76,12 +76,12 @@ def repeated_rows(exchanges: Exchanges) -> Bools:
 
 
 def from_targets(exchanges: Exchanges) -> Bools:
-    """Return which exchanges (n,) the target reported; one of a tag with itself is no second report of itself."""
+    """Return which exchanges (n,) were reported by the target; exchanges of a tag with itself are not."""
     return np.asarray((exchanges.reporter == exchanges.target) & (exchanges.initiator != exchanges.target))
 
 
 def single_report_blocks(recording: Tables) -> Iterator[tuple[SingleReports, Exchanges]]:
-    """Yield what `single_reports` returns of a recording, some of it at a time, and what that was made of."""
+    """Yield the result of `single_reports` and its input for blocks of a recording."""
     if not _has_target_reports(recording):
         for block in recording.exchange_blocks(ROWS_AT_ONCE):
             yield single_reports(block), block
@@ -91,7 +91,7 @@ def single_report_blocks(recording: Tables) -> Iterator[tuple[SingleReports, Exc
 
 
 def single_exchange_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Iterator[Exchanges]:
-    """Yield the exchanges of `single_reports` of a recording, in the order of their rows, about so many at once."""
+    """Yield blocks of about `rows` exchanges of a recording without second reports, in the order of their rows."""
     if not _has_target_reports(recording):
         yield from recording.exchange_blocks(rows)
         return
@@ -102,7 +102,7 @@ def single_exchange_blocks(recording: Tables, rows: int = ROWS_AT_ONCE) -> Itera
 
 
 def _has_target_reports(recording: Tables) -> bool:
-    """Return whether targets reported exchanges, too, of which each may then be there twice."""
+    """Return whether some exchanges were reported by their targets."""
     ends = recording.tally("exchanges", "initiator", "target", "reporter")
     return any(reporter == target != initiator for initiator, target, reporter in ends)
 
@@ -110,8 +110,8 @@ def _has_target_reports(recording: Tables) -> bool:
 def _by_stretches(recording: Tables) -> Iterator[tuple[SingleReports, Exchanges, Ints]]:
     """Yield single reports by stretches of time, the exchanges they are from, and the numbers of these rows.
 
-    A stretch is read together with what is around it, for both reports of an exchange may lie on either side of an
-    edge; what is found there is left out.
+    Each stretch is read with a margin, because the two reports of an exchange can be on either side of its edge. The
+    results within the margin are left out.
     """
     for start_ns, end_ns in recording.stretches(ROWS_AT_ONCE):
         both, numbers = recording.numbered_between(start_ns - APART_NS, end_ns + APART_NS)
@@ -125,7 +125,7 @@ def _by_stretches(recording: Tables) -> Iterator[tuple[SingleReports, Exchanges,
 
 
 def differences(exchanges: Exchanges, first: int, second: int) -> list[str]:
-    """Return what two reports say otherwise, a phrase a column: "range_m 3.0122 and 3.0177"."""
+    """Return the differences of two reports, one text for each column: "range_m 3.0122 and 3.0177"."""
     pairs = [(name, getattr(exchanges, name)) for name in COMPARED]
     rows = np.array([first]), np.array([second])
     return [f"{name} {column[first]} and {column[second]}" for name, column in pairs if _unequal(column, *rows)[0]]
@@ -139,7 +139,7 @@ def _unequal(column: Ints, first: Ints, second: Ints) -> Bools:
 def _partners(e: Exchanges, name: str, wanted: Ints, among: Ints) -> Ints:
     """Return for each of the rows `wanted` the row of `among` with its pair and stamp, the nearest in time, else -1."""
     stamps = getattr(e, name)
-    # Ids and stamp in one number; a stamp of 40 bits loses its highest, which the time makes up for.
+    # Ids and the low 32 bits of the stamp as one number; the time resolves ambiguities of the stamp.
     key = ((e.initiator.astype(np.uint64) << 16 | e.target.astype(np.uint64)) << 32) | (stamps & 0xFFFFFFFF).astype(
         np.uint64
     )

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.uwblink.boards.test_connection import OTHER, REPORT, asked
-from uwblink.boards.connection import ANSWER_S, DEAD, FENCE, PATIENT_S, Connection, checked
+from uwblink.boards.connection import ANSWER_S, FENCE, NO_ANSWER_HINT, PATIENT_S, Connection, checked
 from uwblink.errors import NoAnswerError, RangingFailedError, RefusedError
 from uwblink.wire import messages as m
 from uwblink.wire.codec import encode
@@ -46,10 +46,10 @@ def test_a_command_is_waited_for_150_ms_and_a_fence_in_doubt_a_second():
     connection.send(FENCE, 10.0)
     assert connection.deadline_s() == 10.0 + PATIENT_S
     silent = connection.expire(11.0)
-    assert str(silent.error).endswith(f"within 1000 ms; heard nothing; {DEAD}")
+    assert str(silent.error).endswith(f"within 1000 ms; heard nothing; {NO_ANSWER_HINT}")
     connection.send(m.GetId(), 12.0)
     assert connection.deadline_s() == 12.0 + ANSWER_S
-    assert DEAD not in str(connection.expire(13.0).error)
+    assert NO_ANSWER_HINT not in str(connection.expire(13.0).error)
 
 
 def test_a_patient_connection_stays_patient():
@@ -110,7 +110,7 @@ def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
     assert connection.ready_s(2.004) == pytest.approx(0.001), "nothing came"
     connection.receive(CIR[400:800], 2.004)
     assert connection.ready_s(2.004) == pytest.approx(0.005)
-    connection.leave_alone(2.5)
+    connection.keep_quiet(2.5)
     assert connection.ready_s(2.4) == pytest.approx(0.1)
     connection.receive(CIR[800:], 2.41)
     assert connection.ready_s(2.41) == pytest.approx(0.003)
@@ -118,8 +118,8 @@ def test_an_impulse_response_of_others_is_waited_out_piece_by_piece():
 
 def test_being_left_alone_is_never_cut_short():
     connection = Connection("port")
-    connection.leave_alone(3.0)
-    connection.leave_alone(2.0)
+    connection.keep_quiet(3.0)
+    connection.keep_quiet(2.0)
     assert connection.ready_s(2.5) == pytest.approx(0.5)
     assert connection.ready_s(3.5) == 0.0
 
