@@ -130,6 +130,10 @@ places: setup ## fits where errors belong to places, into docs/accuracy.md (20 m
 surveys: setup ## survey worlds of standing boards, 50 seeds each, into docs/accuracy.md (10 minutes)
 	$(BIN)/python -m benchmarks.surveys --write
 
+sound: setup ## false alarms of the checks on 200 sound recordings, then planted faults (15 minutes)
+	$(BIN)/python -W ignore -m benchmarks.sound_recordings
+	$(BIN)/python -W ignore -m benchmarks.sound_recordings --planted --seeds 4
+
 doctor-table: setup ## write docs/doctor.md's table: planted faults, hits and false alarms (15 minutes)
 	$(BIN)/python -W ignore -m benchmarks.doctor
 

@@ -6,30 +6,29 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
+from scipy import sparse
 
-from calib.checks.levels import DOF, OF_MEDIAN, medians
 from calib.checks.limits import told
-from calib.checks.plausibility import robust_slope
-from calib.checks.recording_view import RecordingView, pair_ids
-from calib.data.clocks import corrected, left_skew
-from calib.findings import BUDGET, Candidate, exceeds
+from calib.checks.quick_fit import quick_fit
+from calib.checks.recording_view import RecordingView, chosen, pair_ids
+from calib.data.clocks import PPM_TO_METRES, corrected, left_skew
+from calib.estimator.score_tests import Family
+from calib.findings import Candidate, exceeds
 from calib.spread import robust_spread
 from uwblink.arrays import Floats
 from uwblink.protocols.table import single_sided
 from uwblink.recording import clock_skews
-from uwblink.ticks import SPEED_OF_LIGHT, TICK_S
-from uwblink.twr import Exchanges, intervals, without_stamps
+from uwblink.ticks import TICK_S
+from uwblink.twr import intervals, without_stamps
 
-FEWEST: Final = 100
+RANGES_OF_A_SLOPE: Final = 100
 SPREAD_M: Final = 0.03
-"""Skew must be expected to change ranges of a pair by more, for it to be seen in them."""
+"""Skew must be expected to change ranges by more, for it to be seen in them."""
 
 ONE_WAY_M: Final = 0.05
 """By how much ranges of a sound pair may differ by who initiates: the powers of both ways are not quite alike."""
 
-FEWEST_PAIRS: Final = 4
-MORE_THAN_DELAYS_M: Final = 0.15
-FEWEST_A_WAY: Final = 15
+RANGES_A_WAY: Final = 15
 NEAR: Final = 0.5
 """A slope is that of a fault, of 1 or of 2, or none: halfway lies the edge."""
 
@@ -46,35 +45,48 @@ NORMAL: Final = 1e6
 def skew(view: RecordingView) -> Iterator[Candidate]:
     """Errors that follow the carriers' readings: skew that was not taken out, or was with the wrong sign."""
     e = view.exchanges
-    rows = np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e)
-    if np.count_nonzero(rows) < FEWEST:
+    single = chosen(view, np.isin(e.protocol, single_sided()) & np.isfinite(view.error_m) & ~without_stamps(e))
+    taken = {corrected(name) for name in np.unique(single.exchanges.protocol).tolist()}
+    if len(single.raw_m) < RANGES_OF_A_SLOPE or len(taken) > 1:
         return
-    some, error = e[rows], view.error_m[rows]
-    taken = np.array([corrected(name) for name in np.unique(some.protocol).tolist()])
-    if taken.any() != taken.all():
-        return
+    some = single.exchanges
     known = np.isfinite(some.skew2_ppm) & (some.skew2_ppm != 0)
-    if np.count_nonzero(known) < FEWEST:
-        yield from _by_direction(some, error)
+    if np.count_nonzero(known) < RANGES_OF_A_SLOPE:
+        yield from _by_direction(single)
         return
-    some, error = some[known], error[known]
+    # Delays are the same both ways, and do not follow skews, so that pairs that range one way tell of it as well.
+    fit = quick_fit([chosen(single, known)], constants="tag")
+    if fit is None:
+        return
+    some = some[known][fit.rows]
     # A target's reply lasts longer by the clock of a faster initiator, and so does the range.
-    expected = 0.5 * SPEED_OF_LIGHT * 1e-6 * some.skew2_ppm * intervals(some).dt32 * TICK_S
-    ways, variance = _both_ways(some, [expected, error])
-    if len(ways) and np.max(np.abs(ways[:, 0])) > SPREAD_M:
-        # Delays of a pair are the same both ways.
-        slope, std = _line(ways[:, 0], ways[:, 1], variance[:, 1])
-        reach, dof = float(np.max(np.abs(ways[:, 0]))), NORMAL
-    else:
-        found = _one_way(some, expected, error)
-        if found is None:
-            return
-        slope, std, dof, reach = found
-    p_value = exceeds(slope, std, dof, tolerance=NEAR)
-    evidence = f"errors grow by {slope:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
-    for at, fault, remedy in SLOPES[bool(taken.all())]:
-        if abs(slope - at) < NEAR:
+    expected = PPM_TO_METRES * some.skew2_ppm * intervals(some).dt32 * TICK_S
+    slope, _, std, dof = fit.offsets(Family(kind="skew", names=[LEFT], derivative=sparse.csr_matrix(expected[:, None])))
+    reach = float(np.ptp(np.percentile(expected, (5, 95))))
+    if reach < SPREAD_M:
+        return
+    p_value = exceeds(float(slope[0]), float(std[0]), dof, tolerance=NEAR)
+    evidence = f"errors grow by {slope[0]:.2f} m in a metre of c/2 times carrier's skew times reply, over {reach:.2f} m"
+    for at, fault, remedy in SLOPES[taken.pop()]:
+        if abs(slope[0] - at) < NEAR:
             yield Candidate(fault, evidence, p_value, {"more": remedy})
+
+
+def _by_direction(single: RecordingView) -> Iterator[Candidate]:
+    """Where carriers were not read: skew makes ranges of a pair longer one way, and as much shorter the other way."""
+    fit = quick_fit([single])
+    if fit is None:
+        return
+    e = single.exchanges[fit.rows]
+    forth = np.where(e.initiator < e.target, 0.5, -0.5)
+    by_pair = sparse.csr_matrix((forth, (np.arange(len(forth)), fit.pair)))
+    names = [fit.named(pair) for pair in range(len(fit.ends))]
+    ways, _, std, dof = fit.offsets(Family(kind="way", names=names, derivative=by_pair))
+    worst = int(np.argmax((np.abs(ways) - ONE_WAY_M) / std))
+    told = f"ranges of pair {names[worst]} differ by {100 * abs(ways[worst]):.0f} cm by who initiates, the most of all"
+    p_value = exceeds(float(ways[worst]), float(std[worst]), dof, tolerance=ONE_WAY_M, tried=len(ways))
+    remedy = "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"
+    yield Candidate(LEFT, told, p_value, {"more": remedy})
 
 
 def _line(x: Floats, y: Floats, variance: Floats) -> tuple[float, float]:
@@ -85,78 +97,6 @@ def _line(x: Floats, y: Floats, variance: Floats) -> tuple[float, float]:
     slope = float(np.sum(x * y / variance)) / square
     left = float(np.mean((y - slope * x) ** 2 / variance))
     return slope, float(np.sqrt(max(left, 1.0) / square))
-
-
-def _one_way(some: Exchanges, expected: Floats, error: Floats) -> tuple[float, float, float, float] | None:
-    """Return slope, its error and degrees of freedom, and reach, where pairs range one way only.
-
-    Among pairs, as delays are smaller than skew, or within.
-
-    None where skew is too small to be seen.
-    """
-    place = np.unique(pair_ids(some), return_inverse=True)[1]
-    levels = [medians(values, place, int(place.max()) + 1) for values in (expected, error)]
-    x, y = (level - level.mean() for level in levels)
-    spread = float(np.std(x))
-    if len(x) >= FEWEST_PAIRS and spread > MORE_THAN_DELAYS_M:
-        slope = float(x @ y / (x @ x))
-        dof = len(x) - 2
-        std = float(np.sqrt(np.sum((y - slope * x) ** 2) / dof / (x @ x)))
-        if exceeds(slope, std, dof, tolerance=NEAR) < BUDGET:
-            return slope, std, dof, float(np.ptp(x))
-    x, y = _within(some, expected), _within(some, error)
-    reach = float(np.ptp(np.percentile(x, (5, 95))))
-    if reach < SPREAD_M:
-        return None
-    slope = robust_slope(x, y)
-    # Tukey's line rests on medians of thirds.
-    std = float(np.sqrt(2 * OF_MEDIAN * 3 / len(x))) * robust_spread(y - slope * x) / max(_between_thirds(x), 1e-9)
-    return slope, std, NORMAL, reach
-
-
-def _between_thirds(x: Floats) -> float:
-    low, high = np.percentile(x, (100 / 6, 500 / 6))
-    return float(high - low)
-
-
-def _by_direction(some: Exchanges, error: Floats) -> Iterator[Candidate]:
-    """Where carriers were not read: skew makes ranges of a pair longer one way, and as much shorter the other way."""
-    ways, variance = _both_ways(some, [error])
-    if len(ways):
-        std = np.sqrt(variance[:, 0])
-        worst = int(np.argmax(np.abs(ways[:, 0]) / std))
-        size = float(np.max(np.abs(ways[:, 0])))
-        told = f"ranges of a pair differ by up to {100 * size:.0f} cm by who initiates"
-        p_value = exceeds(float(ways[worst, 0]), float(std[worst]), DOF, tolerance=ONE_WAY_M, tried=len(ways))
-        remedy = "record the carrier integrator, or use double-sided ranging; until then take the mean of both ways"
-        yield Candidate(LEFT, told, p_value, {"more": remedy})
-
-
-def _both_ways(some: Exchanges, columns: list[Floats]) -> tuple[Floats, Floats]:
-    """Return by how much medians of columns (n,) differ between the two ways of each pair, and their variances.
-
-    Both are (pairs, columns).
-    """
-    pair, forth = pair_ids(some), some.initiator < some.target
-    found, variance = list[list[float]](), list[list[float]]()
-    for p in np.unique(pair):
-        ways = [(pair == p) & (forth == way) for way in (True, False)]
-        if min(np.count_nonzero(way) for way in ways) >= FEWEST_A_WAY:
-            found.append([float(np.median(c[ways[0]]) - np.median(c[ways[1]])) for c in columns])
-            variance.append([sum(OF_MEDIAN * _square(c[way]) / len(c[way]) for way in ways) for c in columns])
-    shape = len(found), len(columns)
-    return np.array(found).reshape(shape), np.array(variance).reshape(shape)
-
-
-def _square(values: Floats) -> float:
-    return max(robust_spread(values), 1e-4) ** 2
-
-
-def _within(some: Exchanges, values: Floats) -> Floats:
-    """Return values (n,) less the median of their pair and way."""
-    way = pair_ids(some) * 2 + (some.initiator < some.target)
-    _, place = np.unique(way, return_inverse=True)
-    return np.asarray(values - medians(values, place, int(place.max()) + 1)[place])
 
 
 def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
@@ -172,10 +112,14 @@ def swapped_roles(view: RecordingView) -> Iterator[Candidate]:
     pairs = pair_ids(e[double])
     first = e.initiator[double] < e.target[double]
     groups = [
-        (float(np.median(target_faster[rows])), float(np.median(told[rows])), OF_MEDIAN * _square(told[rows]) / count)
+        (
+            float(np.median(target_faster[rows])),
+            float(np.median(told[rows])),
+            np.pi / 2 * max(robust_spread(told[rows]), 1e-4) ** 2 / count,
+        )
         for p in np.unique(pairs)
         for way in (True, False)
-        if (count := np.count_nonzero(rows := (pairs == p) & (first == way))) > FEWEST_A_WAY
+        if (count := np.count_nonzero(rows := (pairs == p) & (first == way))) > RANGES_A_WAY
     ]
     if not groups:
         return
@@ -215,7 +159,9 @@ def carriers(view: RecordingView) -> Iterator[Candidate]:
     if without_stamps(view.exchanges).all():
         return
     found = clock_skews(view.exchanges)
-    known = [(one.residual_ppm, one.count, one.pair) for one in found if one.residual_ppm and one.count >= FEWEST]
+    known = [
+        (one.residual_ppm, one.count, one.pair) for one in found if one.residual_ppm and one.count >= RANGES_OF_A_SLOPE
+    ]
     if not known:
         return
     # That of most pairs: one board that scatters is not the unit of all.

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.checks import clocks, closures, geometry, pairs, reflected, several, stamps, steps, surveys, units
+from calib.checks import clocks, geometry, offsets, pairs, reflected, stamps, surveys, units
 from calib.checks.recording_view import Looked, RecordingView, chosen, looked_at
 from calib.checks.table import BETWEEN, CHECKS, GEOMETRY, GROSS, LEVEL, RADIO, ROWS, STRUCTURE, SURVEYS
 from calib.data.sources import Data, each, opened
@@ -46,9 +46,9 @@ def examine(data: Data | Iterable[Data]) -> list[Finding]:
         if view is not None and not {finding.fault for finding in found} & GROSS_FAULTS:
             views.append(view)
     if len(views) > 1:
-        between = BETWEEN.findings(several.compared(views, LEVEL), LEVEL)
+        between = BETWEEN.findings(offsets.compared(views, LEVEL), LEVEL)
         # What moved between two recordings is no fault of either one.
-        moved = any(finding.fault == several.MOVED_ANCHOR for finding in between)
+        moved = any(finding.fault == offsets.MOVED_ANCHOR for finding in between)
         findings = [one for one in findings if not (moved and one.fault == geometry.ELSEWHERE)] + between
     if views and len(views) == len(recordings) and all(view.standing for view in views):
         findings += SURVEYS.findings(surveys.surveyed(recordings), LEVEL)
@@ -130,16 +130,16 @@ SAME_M: Final = 0.001
 """Distances that are written down and those of the poses are the same if they differ by rounding."""
 
 ORDER: Final = (EMPTY, *(fault for check in CHECKS for fault in check.remedies))
-CHANGED: Final = {closures.OPEN, reflected.MANY, reflected.LASTING}
+CHANGED: Final = {offsets.OPEN, reflected.MANY, reflected.LASTING}
 IMPLIED: Final = (
     # Where nothing moves, every pair has one distance and one power, and the one explains the other.
     (pairs.STATIC, {pairs.CONFOUNDED}),
-    (geometry.ELSEWHERE, {closures.OPEN}),
-    (steps.MOVED, CHANGED),
-    (steps.DRIFTED, CHANGED),
-    (closures.ASTRAY, {*CHANGED, steps.MOVED, steps.DRIFTED}),
-    (clocks.LEFT, {*CHANGED, closures.ASTRAY}),
-    (clocks.WRONG_SIGN, {*CHANGED, closures.ASTRAY}),
+    (geometry.ELSEWHERE, {offsets.OPEN}),
+    (offsets.MOVED, CHANGED),
+    (offsets.DRIFTED, CHANGED),
+    (offsets.ASTRAY, {*CHANGED, offsets.MOVED, offsets.DRIFTED}),
+    (clocks.LEFT, {*CHANGED, offsets.ASTRAY}),
+    (clocks.WRONG_SIGN, {*CHANGED, offsets.ASTRAY}),
     (units.POWER, {"no powers"}),
     (units.REPORTED, {"corrupted exchanges"}),
 )

@@ -17,6 +17,7 @@ from calib.checks.places import OfPlaces, of_places
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.range_rows import Mixture
 from calib.estimator.score_tests import Family, FoundOffset, Slopes, Tested, search, widening
+from calib.estimator.time_blocks import FEWEST_STRETCHES
 from calib.estimator.to_calibration import bias_curves
 from calib.findings import OF_A_FIT
 from uwblink.arrays import Floats, Ints
@@ -41,9 +42,6 @@ SUGGESTED = 2.5
 
 READINGS = ("readings",)
 """The finding that powers are read with noise: the curve is right for the powers that are read."""
-
-FEWEST_STRETCHES = 20.0
-"""Of fewer independent stretches of time an interval is a guess."""
 
 FAR_M, MOSTLY, OFTEN, FOUR = 0.12, 0.8, 0.45, 4
 """Detours of less may as well be an error that wanders. A pair, or all pairs of a tag, with such shares of reflected

@@ -8,14 +8,15 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from scipy import special
+from scipy import optimize, sparse, special
 
-from calib.checks.levels import DOF, Levels, levels, variance_of_sum
 from calib.checks.pairs import standing_still
+from calib.checks.quick_fit import QuickFit, quick_fit
 from calib.checks.recording_view import RecordingView, chosen, less_pairs, spread_m
+from calib.estimator.score_tests import Family
 from calib.findings import Candidate, positive, stretches
 from calib.spread import robust_spread
-from uwblink.arrays import Bools, Floats, Ints
+from uwblink.arrays import Floats, Ints
 from uwblink.errors import ImportTableError
 from uwblink.recording.distances import antennas_m, distances_m, find_offset
 from uwblink.recording.schema import Poses, Tag
@@ -108,24 +109,28 @@ ELSEWHERE: Final = "anchor stands elsewhere"
 TOLERANCE_M: Final = 0.05
 """What a place by tape or markers is off by, with the antenna beside the marker."""
 
-LARGEST_M: Final = 50.0
-FEWEST: Final = 200
-ROUNDS: Final = 20
-LONGEST_STEP_M: Final = 1.0
+RANGES_OF_A_PLACE: Final = 200
+"""Ranges from which three coordinates are told, and how errors of them last."""
+
 ASTRAY_M: Final = 0.3
 """Spread of an anchor's ranges beyond which its place is wrong by more than power and noise explain."""
 
-STILL_M: Final = 0.02
+ANCHOR_STANDS_M: Final = 0.02
+"""What motion capture says of the place of a body that does not move."""
+
 SAME_PLACE_M: Final = 0.3
 """A place nearer to another anchor's is that anchor's."""
 
-SURE: Final = 0.1
-"""Part of a displacement that is not known: powers, that other distances have, are not taken off."""
+EXPLAINED: Final = 1.5
+"""Times the spread of other ranges that are left where another place explains an anchor's ranges."""
+
+HELD: Final = 1e-3
+"""Share of a range that holds a place where ranges do not: robots that move in a plane do not see its height."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Displaced:
-    """By how much an anchor stands elsewhere (3,), its ranges' spreads in metres, p-value and gain; see `Candidate`.
+    """An anchor that stands elsewhere, by `away_m` (3,), its ranges' spreads in metres, p-value and gain.
 
     `instead` are the bodies that the recording has at the place, or below or above it.
     """
@@ -157,11 +162,10 @@ def anchors(view: RecordingView) -> Iterator[Candidate]:
 def displaced(view: RecordingView) -> list[Displaced]:
     """Return the anchors that may stand elsewhere."""
     # Where nothing moves, each pair has a level that is its own.
-    known = levels(view) if view.posed and standing_still(view) is None else None
-    if known is None:
+    if not view.posed or standing_still(view) is not None or view.quick_fit is None:
         return []
     places = {body: place_m(view, body) for body in standing(view)}
-    found = [_displaced(view, known, body, places) for body in places]
+    found = [_displaced(view, view.quick_fit, body, places) for body in places]
     return [one for one in found if one is not None and one.p_value < 1]
 
 
@@ -169,7 +173,7 @@ def standing(view: RecordingView) -> list[str]:
     """Return the bodies that carry tags and do not move."""
     bodies = sorted({tag.body for tag in view.tags} & set(np.unique(view.poses.body).tolist()))
     spans = {body: np.ptp(view.poses.position_m[view.poses.body == body], axis=0).max() for body in bodies}
-    return [body for body in bodies if spans[body] < STILL_M]
+    return [body for body in bodies if spans[body] < ANCHOR_STANDS_M]
 
 
 def place_m(view: RecordingView, body: str) -> Floats:
@@ -177,39 +181,43 @@ def place_m(view: RecordingView, body: str) -> Floats:
     return np.asarray(np.median(view.poses.position_m[view.poses.body == body], axis=0))
 
 
-def _displaced(view: RecordingView, known: Levels, body: str, places: dict[str, Floats]) -> Displaced | None:
+def _displaced(view: RecordingView, fit: QuickFit, body: str, places: dict[str, Floats]) -> Displaced | None:
+    """Return where ranges fit an anchor best, tested by the slopes of its distances at that place."""
     tags = [tag.tag for tag in view.tags if tag.body == body]
-    e = view.exchanges[known.rows]
+    e = view.exchanges[fit.rows]
     mine = np.isin(e.initiator, tags) != np.isin(e.target, tags)
-    if np.count_nonzero(mine) < FEWEST:
+    e, time_ns = e[mine], e.time_ns[mine]
+    own = np.isin(e.initiator, tags)
+    ids = np.where(own, e.initiator, e.target), np.where(own, e.target, e.initiator)
+    here, there = (antennas_m(view.poses, view.tags, ends, time_ns) for ends in ids)
+    apart, pair = here - there, np.unique(fit.pair[mine], return_inverse=True)[1]
+    if len(apart) < RANGES_OF_A_PLACE or not np.isfinite(apart).all():
         return None
-    some, pair = e[mine], known.pair[mine]
-    own = np.where(np.isin(some.initiator, tags), some.initiator, some.target)
-    other = np.where(np.isin(some.initiator, tags), some.target, some.initiator)
-    here, there = (antennas_m(view.poses, view.tags, ids, some.time_ns) for ids in (own, other))
-    apart = here - there
     # Where anchors are metres off, what power does is not known, and small beside that.
-    left = known.rest[mine]
-    if robust_spread(left) > ASTRAY_M:
-        left = view.error_m[known.rows][mine]
-    measured = left + np.linalg.norm(apart, axis=1)
-    good = np.isfinite(measured)
-    if np.count_nonzero(good) < FEWEST:
+    loud = robust_spread(fit.residual[mine]) > ASTRAY_M
+    measured = np.linalg.norm(apart, axis=1) + (view.error_m[fit.rows] if loud else fit.residual)[mine]
+    tried = [_place(apart, measured, pair, place - places[body]) for place in places.values()]
+    spreads = [robust_spread(_left(apart + away, measured, pair)) for away in tried]
+    away, after = tried[int(np.argmin(spreads))], min(spreads)
+    before, size = robust_spread(_left(apart, measured, pair)), float(np.linalg.norm(away))
+    # The ranges of this anchor alone, at its other place: their noise is theirs, whatever else is wrong.
+    rows, there_m = fit.rows[mine], np.linalg.norm(apart + away, axis=1)
+    truth_m, direction = view.truth_m.copy(), np.zeros((len(view.truth_m), 3))
+    truth_m[rows] += there_m - np.linalg.norm(apart, axis=1)
+    direction[rows] = (apart + away) / there_m[:, None]
+    only = np.isin(np.arange(len(truth_m)), rows)
+    moved = quick_fit([chosen(replace(view, truth_m=truth_m), only)])
+    gain = narrower(view, view.error_m, view.raw_m - truth_m)[1]
+    explains = after < min(before, EXPLAINED * robust_spread(fit.residual[~mine])) if (~mine).any() else after < before
+    if size <= TOLERANCE_M or gain <= 0 or not explains or moved is None:
         return None
-    apart, measured, time_s = apart[good], measured[good], known.time_s[mine][good]
-    ends = np.unique(pair[good], return_inverse=True)[1]
-    starts = [place - places[body] for place in places.values()]
-    tried = [place for start in starts if (place := _fitted(apart, measured, ends, start)) is not None]
-    if not tried:
-        return None
-    away = min(tried, key=lambda d: robust_spread(_linear(apart + d, measured, ends)[1]))
-    before, after = (robust_spread(_linear(apart + d, measured, ends)[1]) for d in (np.zeros(3), away))
-    gain = _undone(view, known.rows[_within(mine, good)], apart, away)
-    if gain <= 0 or after > before:
-        return None
-    p_value = _beyond_tolerance(*_linear(apart + away, measured, ends), away, time_s, after)
-    # A robot that moves in a plane does not see heights, so that places above and below each other are alike.
-    at = [name for name, place in places.items() if name != body and _near(place - places[body], away)]
+    derivative = sparse.csr_matrix(direction[only][moved.rows])
+    tested = moved.slopes.test(Family(kind="place", names="xyz", derivative=derivative))
+    slope = tested.information @ away * (1 - TOLERANCE_M / size)
+    square = float(slope @ np.linalg.lstsq(tested.covariance, slope, rcond=1e-12)[0])
+    p_value = float(special.fdtrc(3, tested.blocks - 3.0, square / 3))
+    # Places above and below each other are alike to robots that move in a plane; a displacement is known to a tenth.
+    near = {name: float(np.hypot(*(place - places[body] - away)[:2])) for name, place in places.items()}
     return Displaced(
         body=body,
         away_m=away,
@@ -217,65 +225,37 @@ def _displaced(view: RecordingView, known: Levels, body: str, places: dict[str, 
         after_m=after,
         p_value=min(1.0, p_value * len(places)),
         gain=gain,
-        instead=tuple(at),
+        instead=tuple(name for name in places if name != body and near[name] < SAME_PLACE_M + 0.1 * size),
     )
 
 
-def _within(rows: Bools, good: Bools) -> Ints:
-    return np.flatnonzero(rows)[good]
+def _place(apart: Floats, measured: Floats, pair: Ints, start: Floats) -> Floats:
+    """Return the displacement (3,) that ranges ask for, beside a constant of each pair, by robust least squares."""
+    every = slice(None, None, max(len(apart) // 2000, 1))
+    apart, measured, pair = apart[every], measured[every], pair[every]
+    count = int(pair.max()) + 1
+
+    def residuals(x: Floats) -> Floats:
+        rest = measured - np.linalg.norm(apart + x[:3], axis=1) - x[3:][pair]
+        return np.append(rest, HELD * len(rest) ** 0.5 * x[:3])
+
+    constants = medians(measured - np.linalg.norm(apart + start, axis=1), pair, count)
+    found = optimize.least_squares(residuals, np.append(start, constants), loss="soft_l1", f_scale=0.1)
+    return np.asarray(found.x[:3])
 
 
-def _near(first: Floats, second: Floats) -> bool:
-    return float(np.hypot(*(first - second)[:2])) < SAME_PLACE_M + SURE * float(np.linalg.norm(second))
+def _left(apart: Floats, measured: Floats, pair: Ints) -> Floats:
+    """Return what is left of ranges (n,) at distances (n, 3), each less its pair's median."""
+    rest = measured - np.linalg.norm(apart, axis=1)
+    return np.asarray(rest - medians(rest, pair, int(pair.max()) + 1)[pair])
 
 
-def _fitted(apart: Floats, measured: Floats, ends: Ints, start: Floats) -> Floats | None:
-    """Return the displacement (3,) that ranges ask for, from a start, by Huber's weights."""
-    away = start
-    for _ in range(ROUNDS):
-        line, rest = _linear(apart + away, measured, ends)
-        reach = 2 * max(robust_spread(rest), 1e-4)
-        weight = np.minimum(1, reach / np.maximum(np.abs(rest), 1e-9))
-        square = (line * weight[:, None]).T @ line
-        if np.linalg.eigvalsh(square)[0] < 1e-3 * len(rest) / 100:
-            square = square + 1e-3 * len(rest) * np.eye(3)
-        step = np.linalg.solve(square, line.T @ (weight * rest))
-        away = away + step * min(1.0, LONGEST_STEP_M / max(float(np.linalg.norm(step)), 1e-9))
-        if np.linalg.norm(away) > LARGEST_M:
-            return None
-    return np.asarray(away)
-
-
-def _undone(view: RecordingView, rows: Ints, apart: Floats, away: Floats) -> float:
-    """Return what ranges gain (see `Candidate`) with the anchor at another place."""
-    some = chosen(view, np.isin(np.arange(len(view.raw_m)), rows))
-    order = np.argsort(np.argsort(rows))
-    shift = np.linalg.norm(apart + away, axis=1) - np.linalg.norm(apart, axis=1)
-    back = np.empty(len(rows))
-    back[order] = shift
-    return narrower(some, some.error_m, some.error_m - back)[1]
-
-
-def _beyond_tolerance(line: Floats, rest: Floats, away: Floats, time_s: Floats, spread: float) -> float:
-    """Return the p-value of a displacement (3,) beyond the tolerance, by Wald's F."""
-    size = float(np.linalg.norm(away))
-    if size <= TOLERANCE_M:
-        return 1.0
-    lasting = variance_of_sum(np.clip(rest, -3 * spread, 3 * spread), time_s)
-    over = away * (1 - TOLERANCE_M / size)
-    square = line.T @ line + 1e-9 * np.eye(3)
-    return float(special.fdtrc(3, DOF, float(over @ square @ over) / lasting / 3))
-
-
-def _linear(apart: Floats, measured: Floats, ends: Ints) -> tuple[Floats, Floats]:
-    """Return directions (n, 3) and what is left of ranges (n,), each less its pair's median."""
-    length = np.linalg.norm(apart, axis=1)
-    line, rest = apart / np.maximum(length, 1e-9)[:, None], measured - length
-    for k in range(int(ends.max()) + 1):
-        rows = ends == k
-        rest[rows] -= np.median(rest[rows])
-        line[rows] -= line[rows].mean(axis=0)
-    return line, rest
+def medians(values: Floats, place: Ints, count: int) -> Floats:
+    """Return the median of values (n,) at each place (count,), which all have some."""
+    order = np.argsort(place, kind="stable")
+    return np.array(
+        [np.median(part) for part in np.split(values[order], np.searchsorted(place[order], range(1, count)))]
+    )
 
 
 def narrower(view: RecordingView, before_m: Floats, after_m: Floats, *, tried: float = 1) -> tuple[float, float]:

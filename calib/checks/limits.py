@@ -8,17 +8,29 @@ from typing import Final
 import numpy as np
 
 from calib.calibration.power_curves import ALPHA_DBM, equal_bins, lifted_power
-from calib.checks.confounding import explained_by_distance, some_of
+from calib.checks.pairs import LOOKED_AT, RANGES_OF_A_SHARE, SHORTEST_M, share_by_distance
 from calib.data.clocks import LeftSkew, corrected
-from calib.data.ranges import NO_STAMPS, Ranges
+from calib.data.ranges import NO_STAMPS, STATIC, Ranges
 from calib.estimator.known_distances import KnownDistances
 from calib.estimator.pairs import pairs_of
 from uwblink.arrays import Floats
 from uwblink.protocols.table import is_single_sided
+from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 from uwblink.twr import names_in
 
-FEWEST: Final = 20
+RANGES_A_MEDIAN: Final = 20
+"""Ranges at one power from which their median error is told."""
+
+LEFT_BY_DISTANCE: Final = 0.215
+"""Share of the lifted power's variance that distance must leave unexplained.
+
+Tags on turning quadcopters leave a third and more, an anchor on a pole and a board on a tripod, outdoors, a fifth.
+"""
+
+MANY_MISSING: Final = 0.05
+MANY_OUTLIERS: Final = 0.4
+SHORT_S: Final = 25.0
 SPREAD: Final = (5, 95)
 """Percent of the powers between which errors are compared."""
 
@@ -44,7 +56,7 @@ def limits(found: KnownDistances, ranges: Ranges, residuals_m: Floats, fixed: Ma
             f"{_pairs(len(model.pairs.ends))}: antenna delays stay unknown, other pairs cannot be corrected, and "
             "what else is constant in the ranges of a pair (an obstacle, a wrong lever arm) is in its constant"
         )
-    some = ranges[some_of(len(ranges))]
+    some = ranges[slice(None, None, max(len(ranges) // LOOKED_AT, 1))]
     share = explained_by_distance(_lifted(some), some.truth_m) if model.curve is not None else None
     if share is not None:
         yield (
@@ -133,7 +145,9 @@ def _change_with_power(ranges: Ranges, residuals_m: Floats) -> float:
     lifted = _lifted(ranges)
     known = np.isfinite(lifted)
     number, error = equal_bins(lifted[known]).number, residuals_m[known]
-    medians = [np.median(error[number == k]) for k in np.unique(number) if np.count_nonzero(number == k) >= FEWEST]
+    medians = [
+        np.median(error[number == k]) for k in np.unique(number) if np.count_nonzero(number == k) >= RANGES_A_MEDIAN
+    ]
     return float(np.ptp(np.percentile(medians, SPREAD))) if medians else 0.0
 
 
@@ -144,3 +158,46 @@ def _pinned(ranges: Ranges, residuals_m: Floats) -> str:
         "curve only: the delays are those that were given; what they have in common that is wrong is in the curve, "
         f"where they differ it stays in the ranges (medians of pairs lie within {_length(float(np.ptp(medians)))})"
     )
+
+
+def explained_by_distance(lifted: Floats, truth_m: Floats) -> float | None:
+    """Return the share of the variance of lifted powers (n,) that distance explains, where it is too much, else None.
+
+    A curve over power then learns what belongs to distance.
+    """
+    good = np.isfinite(lifted) & np.isfinite(truth_m) & (truth_m > 0)
+    if np.count_nonzero(good) < RANGES_OF_A_SHARE or np.ptp(truth_m[good]) < SHORTEST_M:
+        return None
+    # Lifted powers near the antennas outweigh all others, their decibels do not; either way is too much.
+    share = max(share_by_distance(power, truth_m[good]) for power in (lifted[good], np.log(lifted[good])))
+    return share if share > 1 - LEFT_BY_DISTANCE else None
+
+
+def warnings_of(ranges: Ranges, inliers: float, free: list[list[int]], seconds: float) -> list[str]:
+    """Return sentences, the gravest first.
+
+    `inliers` is the share of ranges within three sigmas, `seconds` the time that ranges cover.
+    """
+    found = []
+    if free:
+        groups = "; ".join(", ".join(map(str, group)) for group in free)
+        found.append(
+            f"the data leave the delays of tags {groups} free; those written are the smallest that agree with the data"
+        )
+    delays = known_delays(ranges.antenna_delays, ranges.tags())
+    apart = [f"{tag} ({one})" for tag, one in delays.items() if tag is not None and one.reply != one.tx]
+    if apart:
+        found.append(
+            f"the stamps of tag{'s' * (len(apart) > 1)} {', '.join(apart)} carry two antenna delays, the register's "
+            "and another constant in those of delayed replies: no delay of a tag fits both; program the firmware's "
+            "constants, too (`calib export --to firmware`), and record anew"
+        )
+    everything = len(ranges) + sum(ranges.excluded.values())
+    for reason, count in ranges.excluded.items():
+        if reason != STATIC and count > MANY_MISSING * everything:
+            found.append(f"{100 * count / everything:.0f} % of the exchanges were left out: {reason}")
+    if 1 - inliers > MANY_OUTLIERS:
+        found.append(f"{100 * (1 - inliers):.0f} % of the ranges lie beyond three sigmas of the calibrated errors")
+    if seconds < SHORT_S:
+        found.append(f"only {seconds:.0f} s of data: errors that persist are few, so intervals may be too narrow")
+    return found

@@ -94,8 +94,8 @@ FROM_DISTANCE: Final = 0.5
 SHORTEST_M: Final = 0.5
 """Distances that vary less than this cannot explain a power."""
 
-FEWEST: Final = 300
-ENOUGH: Final = 5000
+RANGES_OF_A_SHARE: Final = 300
+LOOKED_AT: Final = 5000
 """Of more ranges, only every so many are looked at."""
 
 GROUPS: Final = 40
@@ -119,22 +119,22 @@ def confounded(view: RecordingView) -> Iterator[Candidate]:
     lifted = lifted_power(e.fpp1_dbm, e.fpp2_dbm, "mean-of-lifted", ALPHA_DBM)
     rows = np.flatnonzero(np.isfinite(lifted) & np.isfinite(view.truth_m) & (view.truth_m > 0))
     rows = rows[np.argsort(e.time_ns[rows], kind="stable")]
-    if len(rows) < FEWEST or np.ptp(view.truth_m[rows]) < SHORTEST_M:
+    if len(rows) < RANGES_OF_A_SHARE or np.ptp(view.truth_m[rows]) < SHORTEST_M:
         return
-    every, shares = rows[:: max(len(rows) // ENOUGH, 1)], []
+    every, shares = rows[:: max(len(rows) // LOOKED_AT, 1)], []
     seconds = e.time_ns[rows] // round(TURNED_S * 1e9)
     alone = len(np.unique(np.column_stack([pair_ids(e)[rows], seconds]), axis=0))
     # Lifted powers near the antennas outweigh all others, their decibels do not; either way is too much.
     for power in (lifted, np.log(lifted)):
         noise = _noise(view, power, rows)
-        share = _explained(power[every], view.truth_m[every], noise)
-        if _explained(power[every], view.truth_m[every], 0.0) > FROM_DISTANCE:
+        share = share_by_distance(power[every], view.truth_m[every], noise)
+        if share_by_distance(power[every], view.truth_m[every]) > FROM_DISTANCE:
             shares.append(1 - (1 - share) * (alone - 1) / max(alone - GROUPS, 1))
     if max(shares, default=0.0) > EXPLAINED:
         yield Candidate(CONFOUNDED, f"distance explains {100 * max(shares):.0f} % of the power's variance")
 
 
-def _explained(power: Floats, truth_m: Floats, noise: float) -> float:
+def share_by_distance(power: Floats, truth_m: Floats, noise: float = 0.0) -> float:
     """Return the share of the variance of powers (n,), without that of their noise, between groups of one distance."""
     groups = np.array_split(power[np.argsort(truth_m, kind="stable")], GROUPS)
     within = float(np.mean([np.var(group) for group in groups]))
@@ -148,7 +148,7 @@ def _noise(view: RecordingView, power: Floats, rows: Ints) -> float:
     pair, time_s = pair_ids(e), e.time_ns * 1e-9
     order = np.lexsort((time_s, pair))
     together = (np.diff(pair[order]) == 0) & (np.diff(time_s[order]) < AT_ONCE_S)
-    if np.count_nonzero(together) < FEWEST // 3:
+    if np.count_nonzero(together) < RANGES_OF_A_SHARE // 3:
         return 0.0
     return float(np.mean(np.diff(power[rows][order])[together] ** 2)) / 2
 

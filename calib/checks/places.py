@@ -21,10 +21,10 @@ from uwblink.arrays import Floats, Ints
 TOGETHER_S = 1.0
 """Bodies are in the same places for about so long."""
 
-ASKED, SURELY = 2.3, 3.1
+WIDENING_DEVIATION, CERTAIN_DEVIATION = 2.3, 3.1
 """Deviations that no more than 1 % and 0.1 % of sound flights show: the first widens intervals, the second is said."""
 
-ALIKE = 0.8
+SIZE_FOLDS = 0.8
 """What stays is as large as what comes and goes, to so many logarithms (a factor of 2.2): a judgement.
 
 In rooms of the simulator it was 1.2 to 4 times as large, in smooth fields of errors a sixth to two thirds.
@@ -33,7 +33,7 @@ In rooms of the simulator it was 1.2 to 4 times as large, in smooth fields of er
 WALLS_M = 0.02
 """What stays, to a factor of e, where nothing comes and goes: a partition or two that are always in between."""
 
-LEFT = 0.03
+INFORMATION_LEFT = 0.03
 """Share of an offset's information that delays must leave: of less, slopes say nothing of its size."""
 
 SIZES_M = np.geomspace(3e-4, 0.2, 60)
@@ -76,15 +76,15 @@ def of_places(found: KnownDistances, slopes: Slopes, pairs: Tested) -> OfPlaces:
     values, reach = _staying(pairs, sums)
     square = float(values @ values)
     variance, deviation = _moving(found, slopes, sums)
-    moves = deviation > ASKED
-    if not moves and square <= _of_chi_square(len(values), ASKED):
+    moves = deviation > WIDENING_DEVIATION
+    if not moves and square <= _of_chi_square(len(values), WIDENING_DEVIATION):
         return nothing
     spread = 1 + reach[:, None] * SIZES_M**2
     likely = -0.5 * np.sum(np.log(spread) + values[:, None] ** 2 / spread, axis=0)
-    middle, width = (np.sqrt(variance), ALIKE) if moves else (WALLS_M, 1.0)
+    middle, width = (np.sqrt(variance), SIZE_FOLDS) if moves else (WALLS_M, 1.0)
     likely -= 0.5 * (np.log(SIZES_M / middle) / width) ** 2
     size, effects = _as_one(likely), pairs.effects @ sums.T
-    certain = deviation > SURELY or square > _of_chi_square(len(values), SURELY)
+    certain = deviation > CERTAIN_DEVIATION or square > _of_chi_square(len(values), CERTAIN_DEVIATION)
     return OfPlaces(widening_ns2=size**2 * effects @ effects.T, certain=certain)
 
 
@@ -114,7 +114,7 @@ def _staying(pairs: Tested, sums: Floats) -> tuple[Floats, Floats]:
     """
     total, information = sums @ pairs.total, sums @ pairs.information @ sums.T
     values, vectors = np.linalg.eigh(information)
-    base = vectors[:, values > LEFT * pairs.whole]
+    base = vectors[:, values > INFORMATION_LEFT * pairs.whole]
     variances, turned = np.linalg.eigh(base.T @ sums @ pairs.covariance @ sums.T @ base)
     sure = variances > 1e-9 * variances.max(initial=0.0)
     root = base @ turned[:, sure] / np.sqrt(variances[sure])
@@ -146,7 +146,7 @@ def _moving(found: KnownDistances, slopes: Slopes, sums: Floats) -> tuple[float,
     )
     # Of a robust loss, a pair of which most ranges lie far out may know less than nothing.
     whole = known.sum(axis=0)
-    some = whole > LEFT * whole.max()
+    some = whole > INFORMATION_LEFT * whole.max()
     slope, known, sums = slope[:, some], known[:, some], sums[:, some]
     slope = slope - known * (slope.sum(axis=0) / whole[some])
     product, expected = (((of @ sums.T) ** 2 - of**2 @ sums.T) / 2 for of in (slope, known))

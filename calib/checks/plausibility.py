@@ -20,7 +20,7 @@ MOST_LEFT_OUT: Final = 0.5
 SCALE: Final = (0.75, 1.35)
 """How many metres a range may grow in a metre of true distance: a foot is 0.305 m, a yard 0.914."""
 
-ENOUGH: Final = 100_000
+RANGES_ASKED: Final = 100_000
 """Of more ranges, only every so many are asked for their scale and their clocks."""
 
 UNITS: Final = {0.001: "millimetres", 0.01: "centimetres", 0.3048: "feet"}
@@ -34,11 +34,11 @@ LONGEST_NS: Final = 2.5
 """Boards of one kind differ by less in their antenna delays (published ones by 0.6 ns)."""
 
 ONE_WAY_M: Final = 0.05
-SURELY: Final = 8.0
+WAYS_DIFFER: Final = 8.0
 MEDIAN: Final = 1.2533
 """Standard error of a median over that of a mean."""
 
-FEWEST_WAYS: Final = 20
+RANGES_A_WAY: Final = 20
 LOUD_M: Final = 0.5
 """Errors that spread by more are not those of a UWB range."""
 
@@ -77,7 +77,7 @@ def _mostly_left_out(ranges: Ranges) -> None:
 
 def _scale(ranges: Ranges) -> None:
     """Compare how ranges and true distances spread: a unit or two columns may be wrong."""
-    every = slice(None, None, max(len(ranges) // ENOUGH, 1))
+    every = slice(None, None, max(len(ranges) // RANGES_ASKED, 1))
     raw, truth = ranges.raw_m[every], ranges.truth_m[every]
     slope = robust_slope(truth, raw)
     rest = robust_spread(raw - slope * truth)
@@ -109,7 +109,7 @@ def robust_slope(x: Floats, y: Floats) -> float:
 
 def _clock_ratios(ranges: Ranges) -> None:
     """Refuse clock ratios that no crystals have: stamps that wrapped, or columns in the wrong order."""
-    every = slice(None, None, max(len(ranges) // ENOUGH, 1))
+    every = slice(None, None, max(len(ranges) // RANGES_ASKED, 1))
     weight = ranges.weight_target[every][ranges.protocol[every] == "ds"]
     if not len(weight):
         return
@@ -130,11 +130,11 @@ def one_way(ranges: Ranges) -> Iterator[str]:
     worst, said = 0.0, ""
     for number, part in parts.items():
         back = parts.get(number - 1, part[:0])
-        if number % 2 == 0 or min(len(part), len(back)) < FEWEST_WAYS:
+        if number % 2 == 0 or min(len(part), len(back)) < RANGES_A_WAY:
             continue
         differ = float(np.median(part) - np.median(back))
         std = MEDIAN * float(np.hypot(*(robust_spread(some) / np.sqrt(len(some)) for some in (part, back))))
-        if abs(differ) > max(ONE_WAY_M, SURELY * std, worst):
+        if abs(differ) > max(ONE_WAY_M, WAYS_DIFFER * std, worst):
             a, b = pairs.ends[number // 2]
             worst = abs(differ)
             way = "longer" if differ > 0 else "shorter"
@@ -159,7 +159,7 @@ def refuse_refuted(delays_ns: Mapping[int, float], residuals_m: Floats, ranges: 
     Delays beyond what registers hold, and errors as large as the ranges are: then true distances say nothing of the
     ranges, as they do in another unit where bodies move so little that how ranges grow with them is not seen.
     """
-    every = slice(None, None, max(len(ranges) // ENOUGH, 1))
+    every = slice(None, None, max(len(ranges) // RANGES_ASKED, 1))
     typical = float(np.median(np.abs(ranges.raw_m[every])))
     largest = max(map(abs, delays_ns.values()), default=0.0)
     spread = robust_spread(residuals_m[every])

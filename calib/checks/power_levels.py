@@ -20,19 +20,19 @@ from calib.spread import TWO_SIDED_95, robust_spread
 from uwblink.arrays import Floats, Ints
 from uwblink.ticks import SPEED_OF_LIGHT
 
-ENOUGH: Final = 6_000
+RANGES_LOOKED_AT: Final = 6_000
 """Of more ranges so many are looked at, spread over all."""
 
 GOLDEN: Final = 0.618034
 """What numbers are multiplied by whose fractions keep in step with no schedule of pairs."""
 
-FEWEST: Final = 20
+RANGES_A_LEVEL: Final = 20
 """Ranges a pair by which its levels are told."""
 
-ALIKE_DB: Final = 0.5
+SAME_LEVEL_DB: Final = 0.5
 """Levels of tags that differ by less are taken for the same; medians of a pair's ranges are known to a tenth of it."""
 
-SURELY: Final = 4.0
+LEVELS_DIFFER: Final = 4.0
 """Standard errors beyond which levels differ; readings of one place come together, so that these are a little small."""
 
 SMALLEST_NS: Final = 0.02
@@ -48,7 +48,7 @@ def unlike_powers(ranges: Ranges, calibration: Calibration) -> Iterator[str]:
         half_ns = TWO_SIDED_95 * calibration.delays_std_ns.get(tag, 0.0)
         if (
             half_ns > 0
-            and abs(level) > max(ALIKE_DB, SURELY * std)
+            and abs(level) > max(SAME_LEVEL_DB, LEVELS_DIFFER * std)
             and abs(level) * each_ns > max(half_ns, SMALLEST_NS)
         ):
             unlike[tag] = level
@@ -75,7 +75,7 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     tags, code = np.unique(np.concatenate([ranges.initiator[rows], ranges.target[rows]]), return_inverse=True)
     first, second = np.split(code, 2)
     pair, number, count = np.unique(first * len(tags) + second, return_inverse=True, return_counts=True)
-    enough = np.flatnonzero(count >= FEWEST)
+    enough = np.flatnonzero(count >= RANGES_A_LEVEL)
     if not len(enough):
         return {}
     parts = [apart[number == k] for k in enough]
@@ -84,7 +84,7 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
     inverse = np.linalg.pinv(np.subtract(*(np.equal.outer(end, told).astype(float) for end in ends)))
     std = np.array([MEDIAN * robust_spread(part) / np.sqrt(len(part)) for part in parts])
     levels: Floats = inverse @ np.array([np.median(part) for part in parts])
-    near = np.abs(np.subtract.outer(levels, levels)) < ALIKE_DB
+    near = np.abs(np.subtract.outer(levels, levels)) < SAME_LEVEL_DB
     levels -= levels[near[np.argmax(near.sum(axis=1))]].mean()
     spreads = np.sqrt(inverse**2 @ std**2)
     return dict(zip(tags[told].tolist(), zip(levels.tolist(), spreads.tolist(), strict=True), strict=True))
@@ -92,10 +92,10 @@ def power_levels_db(ranges: Ranges) -> dict[int, tuple[float, float]]:
 
 def _spread(count: int) -> Ints:
     """Return which of so many ranges are looked at, in their order."""
-    if count <= ENOUGH:
+    if count <= RANGES_LOOKED_AT:
         return np.arange(count)
-    number = np.arange(ENOUGH)
-    return np.asarray((number + number * GOLDEN % 1) * count / ENOUGH, dtype=np.int64)
+    number = np.arange(RANGES_LOOKED_AT)
+    return np.asarray((number + number * GOLDEN % 1) * count / RANGES_LOOKED_AT, dtype=np.int64)
 
 
 def _ns_a_decibel(ranges: Ranges, calibration: Calibration) -> float:

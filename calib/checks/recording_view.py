@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +23,13 @@ from uwblink.recording.schema import Arrangement, Fault, Poses, Tag
 from uwblink.ticks import TICK_S
 from uwblink.twr import Exchanges
 
+if TYPE_CHECKING:
+    from calib.checks.quick_fit import QuickFit
+
 PLAUSIBLE_M: Final = 1000.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class RecordingView:
     """A recording as the examinations see it; `truth_m` (n,) is NaN where nothing says it.
 
@@ -51,6 +55,13 @@ class RecordingView:
     def standing(self) -> bool:
         """Whether this was recorded to be surveyed: arrangements of boards, and nothing that says where they were."""
         return bool(self.arrangements) and not len(self.poses) and not np.isfinite(self.truth_m).any()
+
+    @cached_property
+    def quick_fit(self) -> QuickFit | None:
+        """A quick fit with constants of pairs; None where too few ranges have a true distance."""
+        from calib.checks.quick_fit import quick_fit
+
+        return quick_fit([self])
 
     @property
     def error_m(self) -> Floats:
@@ -94,10 +105,10 @@ def plausible_share(raw_m: Floats) -> float:
         return float(np.mean(np.abs(raw_m) < PLAUSIBLE_M))
 
 
-MOST: Final = 160_000
+EXAMINED_EXCHANGES: Final = 160_000
 """Exchanges of a recording that are looked at: four training flights' worth."""
 
-STRETCHES: Final = 40
+EXAMINED_STRETCHES: Final = 40
 MARGIN_NS: Final = 4_000_000_000
 """Poses are needed so far around exchanges: farther than the largest offset of clocks that is looked for."""
 
@@ -115,7 +126,7 @@ class Looked:
 
 def looked_at(source: Source) -> Looked:
     """Return what to look at of a source: everything, of a long recording stretches of it."""
-    if isinstance(source, RecordedSource) and source.recording.count("exchanges") > MOST:
+    if isinstance(source, RecordedSource) and source.recording.count("exchanges") > EXAMINED_EXCHANGES:
         return _stretches(source.recording)
     faults = list(getattr(source, "faults", ()))
     x = source.exchanges
@@ -129,14 +140,17 @@ def examined_part(recording: str | os.PathLike[str]) -> str:
     """
     with Recording.open(recording) as opened:
         count = opened.count("exchanges")
-    if count <= MOST:
+    if count <= EXAMINED_EXCHANGES:
         return ""
-    return f"about {MOST} of its {count} exchanges were looked at, in {STRETCHES} stretches over all of its time"
+    return (
+        f"about {EXAMINED_EXCHANGES} of its {count} exchanges were looked at, in {EXAMINED_STRETCHES} stretches over "
+        "all of its time"
+    )
 
 
 def _stretches(recording: Recording) -> Looked:
-    spans = recording.stretches(MOST // STRETCHES)
-    chosen = np.unique(np.linspace(0, len(spans) - 1, STRETCHES).round().astype(int)).tolist()
+    spans = recording.stretches(EXAMINED_EXCHANGES // EXAMINED_STRETCHES)
+    chosen = np.unique(np.linspace(0, len(spans) - 1, EXAMINED_STRETCHES).round().astype(int)).tolist()
     windows, parts, poses = recording.pose_windows(), list[Exchanges](), list[Poses]()
     for start_ns, end_ns in (spans[k] for k in chosen):
         part = recording.exchanges_between(start_ns, end_ns)

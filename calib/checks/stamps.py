@@ -122,11 +122,11 @@ def contradicting(view: RecordingView) -> Iterator[Candidate]:
 
 
 WIDTHS: Final = (32, 40)
-ENOUGH: Final = 0.5
-"""Another reading must make at least this share of the ranges possible, and by `GAIN` more than the recording's own."""
+POSSIBLE_SHARE: Final = 0.5
+"""Another reading must make at least this share of the ranges possible, and `MORE_POSSIBLE` more than its own."""
 
-GAIN: Final = 0.2
-GAIN_OF_WIDTH: Final = 0.01
+MORE_POSSIBLE: Final = 0.2
+MORE_BY_WIDTH: Final = 0.01
 SKEW_PPM: Final = 100.0
 TRIED: Final = 4000
 """Exchanges on which other protocols are tried."""
@@ -145,8 +145,8 @@ def another(view: RecordingView) -> Iterator[Candidate]:
         return
     name, bits = max(tried, key=lambda key: (round(tried[key], 2), key[1] == e.bits, key[0] == said))
     share, wider = tried[name, bits], bits != e.bits
-    gain = GAIN_OF_WIDTH if name == said else GAIN
-    if share < ENOUGH or share < own + gain:
+    gain = MORE_BY_WIDTH if name == said else MORE_POSSIBLE
+    if share < POSSIBLE_SHARE or share < own + gain:
         return
     numbers = f"{100 * share:.1f} % of the ranges are possible, {100 * own:.1f} % as the recording has it"
     if name == said:
@@ -163,7 +163,7 @@ def another(view: RecordingView) -> Iterator[Candidate]:
 
 def _others(e: Exchanges, said: str) -> Iterator[tuple[str, int]]:
     """Yield the protocols and widths that the stamps may be of, other than the recording's own."""
-    third = bool(np.mean((e.tx3 | e.rx3) != 0) > ENOUGH)
+    third = bool(np.mean((e.tx3 | e.rx3) != 0) > POSSIBLE_SHARE)
     highest = max(int(stamps.max(initial=0)) for stamps in (e.tx1, e.rx1, e.tx2, e.rx2))
     for name, row in PROTOCOLS.items():
         for bits in WIDTHS:

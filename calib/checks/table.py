@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from calib.checks import clocks, closures, geometry, pairs, reflected, several, stamps, steps, surveys, units
+from calib.checks import clocks, geometry, offsets, pairs, reflected, stamps, surveys, units
 from calib.findings import BUDGET, CERTAIN, OF_A_FIT, Check
 
 ALONE: Final = "Student's t over 16 stretches of time"
@@ -119,8 +119,8 @@ RADIO: Final = (
     Check(
         "Do ranges follow the true distances within 30 cm?",
         "mean absolute error of a pair, its median aside", f"{ALONE}, for all pairs",
-        {closures.ASTRAY: "see whether numbers of anchors belong to other places, and times to another clock"},
-        closures.astray,
+        {offsets.ASTRAY: "see whether numbers of anchors belong to other places, and times to another clock"},
+        offsets.astray,
     ),
     Check(
         "Do errors follow the clocks' skew?",
@@ -132,19 +132,19 @@ RADIO: Final = (
         "Do all pairs of a tag shift by more than 2 cm at one time, and no others?",
         "mean shift at the best of 60 times and all tags", BLOCKS,
         {
-            steps.MOVED: "look for a loose antenna or another voltage on tag {tag}; calibrate the two parts apart",
-            steps.DRIFTED: "let tag {tag} warm up, see to its supply; calibrate short parts apart",
+            offsets.MOVED: "look for a loose antenna or another voltage on tag {tag}; calibrate the two parts apart",
+            offsets.DRIFTED: "let tag {tag} warm up, see to its supply; calibrate short parts apart",
         },
-        steps.moved_delay,
+        offsets.changed_delays,
     ),
     Check(
         "Is a pair more than 4 cm off what delays of tags explain?",
         "a pair's own offset, the largest", f"{BLOCKS}, for all pairs",
         {
-            closures.OPEN: "look for a wall or a body between these two, and at their lever arms; record the pair "
+            offsets.OPEN: "look for a wall or a body between these two, and at their lever arms; record the pair "
             "anew, or fit with `constants` pair"
         },
-        closures.closures,
+        offsets.closures,
     ),
     Check(
         "Are more than a fifth of the ranges reflected, or of one tag more than of others, or do reflections last?",
@@ -245,11 +245,11 @@ BETWEEN: Final = Check(
     "Did an anchor or a delay change between recordings?",
     "displacement of an anchor; mean change of a tag's pairs above 2 cm", f"as above; {BLOCKS}, for all tags",
     {
-        several.MOVED_ANCHOR: "measure the place of {body} anew, and fit recordings apart until then",
-        several.OTHER_DELAY: "was the antenna of tag {tag} touched, or its board replaced? calibrate the recordings "
+        offsets.MOVED_ANCHOR: "measure the place of {body} anew, and fit recordings apart until then",
+        offsets.OTHER_DELAY: "was the antenna of tag {tag} touched, or its board replaced? calibrate the recordings "
         "apart",
     },
-    several.compared,
+    offsets.compared,
 )  # fmt: skip
 
 SURVEYS: Final = Check(

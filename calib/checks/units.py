@@ -30,7 +30,7 @@ POWERS: Final = {
 USUAL_DBM: Final = (-115.0, -55.0)
 """First-path powers of these radios, from their sensitivity to a metre apart."""
 
-FEWEST: Final = 20
+RANGES_OF_A_UNIT: Final = 20
 POSES: Final = "unit of the poses"
 TRUTH: Final = "unit of the true distances"
 RANGES: Final = "unit of the ranges"
@@ -47,7 +47,7 @@ def lengths(view: RecordingView) -> Iterator[Candidate]:
     good = np.isfinite(view.raw_m) & np.isfinite(view.truth_m)
     bare = bool(without_stamps(view.exchanges).mean() > 0.5)
     far = bool(np.median(np.abs(view.raw_m[np.isfinite(view.raw_m)])) > PLAUSIBLE_M) if len(view.raw_m) else False
-    if np.count_nonzero(good) < FEWEST:
+    if np.count_nonzero(good) < RANGES_OF_A_UNIT:
         if bare and far:
             told = f"half of the ranges are longer than {PLAUSIBLE_M:.0f} m, which no UWB radio measures"
             yield Candidate(RANGES, told, words={"unit": "mm"})
@@ -74,19 +74,19 @@ def _unit(metres: Floats, others: Floats) -> str | None:
     left = {name: robust_spread(metres - others / many) for name, many in LENGTHS.items()}
     best = min(left, key=lambda name: left[name])
     # Distances that say nothing are best when they are divided by most.
-    if left[best] < MUCH * min(robust_spread(metres - others), robust_spread(metres)):
+    if left[best] < SPREAD_BY_UNIT * min(robust_spread(metres - others), robust_spread(metres)):
         return best
     # Of one distance, the unit that makes both alike.
-    if robust_spread(metres) > STILL_M or np.median(others) < PLAUSIBLE_M:
+    if robust_spread(metres) > ONE_DISTANCE_M or np.median(others) < PLAUSIBLE_M:
         return None
     apart = {name: abs(float(np.median(metres - others / many))) for name, many in LENGTHS.items()}
     return min(apart, key=lambda name: apart[name])
 
 
-MUCH: Final = MATERIAL / 2
+SPREAD_BY_UNIT: Final = MATERIAL / 2
 """Feet taken for metres leave two thirds of the ranges' own spread, the right unit noise and delays."""
 
-STILL_M: Final = 0.5
+ONE_DISTANCE_M: Final = 0.5
 """Ranges that spread by less are of one distance."""
 
 
@@ -96,16 +96,16 @@ def reported(view: RecordingView) -> Iterator[Candidate]:
     with np.errstate(all="ignore"):
         ratio = e.range_m / view.raw_m
     good = np.isfinite(ratio) & (np.abs(view.raw_m) > 1) & ~without_stamps(e)
-    if np.count_nonzero(good) < FEWEST:
+    if np.count_nonzero(good) < RANGES_OF_A_UNIT:
         return
     found = float(np.median(ratio[good]))
     for unit, many in LENGTHS.items():
-        if abs(found / many - 1) < CLOSE:
+        if abs(found / many - 1) < UNIT_OFF:
             told = f"reported ranges are {found:.5g} times those from the stamps"
             yield Candidate(REPORTED, told, words={"unit": unit})
 
 
-CLOSE: Final = 0.05
+UNIT_OFF: Final = 0.05
 """By which delays of boards may change a range of some metres."""
 
 
@@ -114,7 +114,7 @@ def powers(view: RecordingView) -> Iterator[Candidate]:
     e = view.exchanges
     every = np.concatenate([e.fpp1_dbm, e.fpp2_dbm])
     every = every[np.isfinite(every) & (every != 0)]
-    if len(every) < FEWEST or np.mean(np.isfinite(measured_powers(every))) > 0.5:
+    if len(every) < RANGES_OF_A_UNIT or np.mean(np.isfinite(measured_powers(every))) > 0.5:
         return
     middle = float(np.median(every))
     near = [name for name, factor in POWERS.items() if USUAL_DBM[0] < factor * middle < USUAL_DBM[1]]

@@ -227,14 +227,18 @@ def search(tested: Sequence[Tested], rate: float) -> list[FoundOffset]:
     return sorted(found, key=lambda finding: finding.p_value)
 
 
-def findings(tested: Tested, several: int, rate: float) -> Iterator[FoundOffset]:
-    """Yield the alternatives of a family that stand out, one after the other, each beside those already found."""
+def findings(tested: Tested, several: int, rate: float, tolerance_m: float = 0.0) -> Iterator[FoundOffset]:
+    """Yield the alternatives of a family that stand out, one after the other, each beside those already found.
+
+    Offsets up to the tolerance are no finding.
+    """
     family, freedom = tested.family, max(tested.lasting.freedom, 3.0)
     total, covariance, information = tested.total.copy(), tested.covariance.copy(), tested.information.copy()
     for _ in range(MOST_NAMED):
         std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         known = np.diag(information) > REACHED * tested.whole
-        deviation = np.where(known, total / std, 0.0)
+        beyond = np.maximum(np.abs(total) - tolerance_m * np.diag(information), 0.0)
+        deviation = np.where(known, np.copysign(beyond, total) / std, 0.0)
         top = int(np.argmax(np.abs(deviation)))
         p_value = min(several * 2 * float(stdtr(freedom, -abs(float(deviation[top])))), 1.0)
         if p_value > rate:

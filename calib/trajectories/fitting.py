@@ -17,10 +17,9 @@ from calib.calibration.model import Calibration
 from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
-from calib.checks.limits import limits
+from calib.checks.limits import limits, warnings_of
 from calib.checks.plausibility import implausible, one_way, refuse_refuted
 from calib.checks.power_levels import unlike_powers
-from calib.checks.warnings import warnings_of
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described

@@ -100,7 +100,7 @@ def test_a_pair_that_does_not_close_is_named_with_its_size():
     assert "too long" in found
     # The median of a pair's errors lies above their core, so that the clipped mean beside it does not weigh the same.
     assert numbers(found.split("are")[1])[0] == pytest.approx(20, abs=3)
-    assert "around tags" in found
+    assert "closed loops" in found
 
 
 def test_an_anchor_elsewhere_is_named_with_its_place():

@@ -13,7 +13,7 @@ from uwblink import Contents, Recording
 from uwblink.recording.distances import distances_m
 
 PLAN = Plan(seconds=300, per_second=80)
-MOST, STRETCHES = 6_000, 12
+EXAMINED_EXCHANGES, EXAMINED_STRETCHES = 6_000, 12
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +23,8 @@ def flight():
 
 @pytest.fixture
 def written(tmp_path, monkeypatch):
-    monkeypatch.setattr(recording_view, "MOST", MOST)
-    monkeypatch.setattr(recording_view, "STRETCHES", STRETCHES)
+    monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", EXAMINED_EXCHANGES)
+    monkeypatch.setattr(recording_view, "EXAMINED_STRETCHES", EXAMINED_STRETCHES)
 
     def write(flight):
         Contents(exchanges=flight.exchanges, tags=flight.tags, poses=flight.poses).save(tmp_path / "long.uwb")
@@ -38,9 +38,9 @@ def test_stretches_are_over_all_of_the_time_and_their_distances_are_those_of_all
         looked = recording_view.looked_at(RecordedSource(recording))
     x, every = looked.exchanges, flight.exchanges
     assert looked.count == len(every) == 24_000
-    assert len(x) == pytest.approx(MOST, rel=0.02)
+    assert len(x) == pytest.approx(EXAMINED_EXCHANGES, rel=0.02)
     gaps = np.diff(x.time_ns) > 1_000_000_000
-    assert np.count_nonzero(gaps) == STRETCHES - 1
+    assert np.count_nonzero(gaps) == EXAMINED_STRETCHES - 1
     assert (x.time_ns[0], x.time_ns[-1]) == (every.time_ns[0], every.time_ns[-1])
     ends = x.initiator, x.target, x.time_ns
     np.testing.assert_array_equal(
@@ -65,7 +65,7 @@ def test_poses_that_are_late_are_found_by_how_much(flight, written):
 
 
 def test_a_short_recording_is_looked_at_as_a_whole(flight, written, monkeypatch):
-    monkeypatch.setattr(recording_view, "MOST", 24_000)
+    monkeypatch.setattr(recording_view, "EXAMINED_EXCHANGES", 24_000)
     path = written(flight)
     with Recording.open(path) as recording:
         assert len(recording_view.looked_at(RecordedSource(recording)).exchanges) == 24_000

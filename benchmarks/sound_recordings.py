@@ -1,0 +1,127 @@
+"""False alarms: what the checks of a recording and of its fit say of sound recordings of several worlds.
+
+`python -m benchmarks.sound_recordings --seeds 25` (`make sound`) simulates and draws recordings with nothing wrong,
+runs `calib.examine` and `calib.fit`, and prints how many have any finding or warning, and which. Seeds begin where no
+threshold has been chosen. `--planted` runs the plantings of `benchmarks.doctor` instead and prints by fault how many
+were found, and how many causes were named right.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final
+
+import calib
+import uwbsim
+from benchmarks import doctor
+from benchmarks.flights import Plan, fly
+
+FIRST_SEED: Final = 50_000
+"""Seeds from here on have chosen nothing, here or in `benchmarks.doctor`."""
+
+MINUTE: Final = Plan(seconds=60)
+
+
+def _simulated(name: str, seed: int) -> Any:
+    return uwbsim.simulate(uwbsim.load(name, {"run.duration_s": 60.0, "run.seed": seed}))
+
+
+def _flown(plan: Plan, seed: int) -> Any:
+    return fly(plan, seed)
+
+
+WORLDS: Final[dict[str, Callable[[int], Any]]] = {
+    "simulator, six robots": partial(_simulated, "six_robots/six_robots"),
+    "simulator, anchors and a tag": partial(_simulated, "anchors_and_tag/anchors_and_tag"),
+    "simulator, room": partial(_simulated, "room/room"),
+    "simulator, ICRA 2023 on day 30": partial(_simulated, "day30/train"),
+    "flight of three bodies": partial(_flown, MINUTE),
+    "flight of five tags": partial(_flown, replace(MINUTE, tags_a_body=1, bodies=5)),
+    "flight among four anchors": partial(_flown, replace(MINUTE, anchors=4, tags_a_body=1)),
+    "single-sided flight, corrected": partial(_flown, replace(MINUTE, protocol="ss-cfo")),
+}
+"""Worlds without a fault: four of the simulator, four of a generator that shares nothing with it."""
+
+
+def said_of_sound(job: tuple[str, int]) -> tuple[str, int, list[str], list[str]]:
+    """Return a world and seed with the faults that `examine` finds, and the warnings of a fit."""
+    name, seed = job
+    data = WORLDS[name](seed)
+    ranges = calib.Ranges.from_exchanges(data.exchanges, poses=data.poses, tags=data.tags).usable()
+    try:
+        warnings = calib.fit(ranges).warnings
+    except calib.UnanswerableError as error:
+        warnings = [f"refused: {error}"]
+    return name, seed, [finding.fault for finding in calib.examine(data)], warnings
+
+
+def said_of_planted(job: tuple[int, int]) -> tuple[str, int, bool, list[str]]:
+    """Return a planted fault and seed, whether it was found, and what else was said that is not true."""
+    number, seed = job
+    case = doctor.FAULTS[number]
+    found = doctor.said(case, seed)
+    return case.name, seed, bool(found & case.expected), sorted(found - case.expected - case.also)
+
+
+def sound(seeds: int, workers: int) -> str:
+    """Return a summary of false alarms by world and by finding."""
+    jobs = [(name, FIRST_SEED + k) for k in range(seeds) for name in WORLDS]
+    alarms, kinds, start = Counter[str](), Counter[str](), time.monotonic()
+    fits, any_of = Counter[str](), 0
+    with ProcessPoolExecutor(workers) as pool:
+        for done, (name, seed, faults, warnings) in enumerate(pool.map(said_of_sound, jobs), 1):
+            alarms[name] += bool(faults)
+            fits[name] += bool(warnings)
+            any_of += bool(faults or warnings)
+            kinds.update(faults)
+            kinds.update(f"fit: {text[:60]}" for text in warnings)
+            if faults or warnings:
+                print(f"{name}, seed {seed}: {faults} {warnings}", file=sys.stderr)
+            if done % 20 == 0:
+                print(f"{done} of {len(jobs)} in {time.monotonic() - start:.0f} s", file=sys.stderr)
+    lines = ["| world | recordings | findings | warnings of the fit |", "|---|---|---|---|"]
+    lines += [f"| {name} | {seeds} | {alarms[name]} | {fits[name]} |" for name in WORLDS]
+    lines += ["", *(f"- {kind}: {count}" for kind, count in kinds.most_common())]
+    share = 100 * alarms.total() / len(jobs)
+    return "\n".join([
+        f"{alarms.total()} of {len(jobs)} sound recordings have a finding ({share:.1f} %), {fits.total()} a warning of "
+        f"their fit, {any_of} either.", "", *lines,
+    ])  # fmt: skip
+
+
+def planted(seeds: int, workers: int) -> str:
+    """Return a summary of planted faults: found, and named right (found, and nothing else that is not true)."""
+    jobs = [(number, FIRST_SEED + k) for k in range(seeds) for number in range(len(doctor.FAULTS))]
+    found, right = Counter[str](), Counter[str]()
+    with ProcessPoolExecutor(workers) as pool:
+        for name, seed, hit, wrong in pool.map(said_of_planted, jobs):
+            found[name] += hit
+            right[name] += hit and not wrong
+            if wrong or not hit:
+                print(f"{name}, seed {seed}: {'found' if hit else 'missed'}; besides {wrong}", file=sys.stderr)
+    lines = [f"| {case.name} | {found[case.name]} | {right[case.name]} |" for case in doctor.FAULTS]
+    return "\n".join([
+        f"{found.total()} of {len(jobs)} planted faults found, {right.total()} named right.", "",
+        f"| planted, {seeds} seeds | found | named right |", "|---|---|---|", *lines,
+    ])  # fmt: skip
+
+
+def main(argv: list[str]) -> None:
+    """Print one of the summaries."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=25, help="recordings of each world, or of each planted fault")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--planted", action="store_true", help="plant faults instead")
+    given = parser.parse_args(argv)
+    print((planted if given.planted else sound)(given.seeds, given.workers))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

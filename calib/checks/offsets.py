@@ -1,0 +1,283 @@
+"""Checks of delays and pairs: score tests of a quick fit for an offset of a pair, or of a tag from some time on.
+
+The quick fit is a robust fit of a curve over power, and of constants of pairs, or delays of tags. Its residuals are
+tested for one more unknown (`calib.estimator.score_tests`). Errors that last widen the standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from scipy import sparse
+
+from calib.checks.geometry import Displaced, displaced, place_m, standing
+from calib.checks.pairs import standing_still
+from calib.checks.quick_fit import QuickFit, quick_fit
+from calib.checks.recording_view import RecordingView, chosen
+from calib.estimator.score_tests import Family, findings
+from calib.findings import BUDGET, Candidate, exceeds, positive, stretches
+from uwblink.arrays import Bools, Floats
+from uwblink.ticks import SPEED_OF_LIGHT
+
+MOVED: Final = "delay changed mid-flight"
+DRIFTED: Final = "delay drifts"
+OPEN: Final = "pairs that do not close"
+ASTRAY: Final = "ranges that do not follow the distances"
+MOVED_ANCHOR: Final = "anchor moved between recordings"
+OTHER_DELAY: Final = "delay changed between recordings"
+
+DELAY_M: Final = 0.02
+"""What temperature does to the delay of a sound board: 2.15 mm a degree (DW1000 user manual), ten degrees."""
+
+PAIR_M: Final = 0.04
+"""What lever arms by a ruler and phase centres of antennas do to a pair: 2 cm at either end."""
+
+CURVE_M: Final = 0.2
+"""How far the biases by power of two pairs may differ (published curves span so much), if powers of pairs do not vary,
+so that pairs do not share one curve."""
+
+LARGEST_M: Final = 0.75
+"""Of 5 ns: no antenna and no voltage does more."""
+
+LOUD_M: Final = 0.3
+"""Mean absolute error of a pair, about its median, that reflections may explain: half of the ranges by 60 cm."""
+
+CUTS: Final = 47
+"""Times at which a delay is tested for a change: so close that a step between two of them loses 1 % of its size."""
+
+MOST_COLUMNS: Final = 2500
+"""Shifts of pairs at several times that are tested together: their covariance takes 50 MB."""
+
+SHORTEST_S: Final = 10.0
+MIN_RANGES_A_SIDE: Final = 12
+"""Ranges of a pair before and after a change, so that its mean change is known to half of their spread."""
+
+OTHERS: Final = 0.4
+"""Share of a tag's shift by which other pairs may shift: an antenna, or a voltage, is one tag's."""
+
+MOST_NAMED: Final = 3
+"""Tags of a recording that are named: faults are few."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shift:
+    """The ranges of a tag from some time on (`late`, n) are longer by `size_m`; `pairs` are how many show it."""
+
+    tag: int
+    size_m: float
+    late: Bools
+    p_value: float
+    pairs: int
+
+    @property
+    def pairs_alike(self) -> str:
+        """The size as a delay, and which ranges of the tag show it."""
+        delay = f"({2e9 * abs(self.size_m) / SPEED_OF_LIGHT:.2f} ns in its delay)"
+        return f"{delay}, {'all its pairs alike' if self.pairs > 1 else 'its only pair'}"
+
+
+def closures(view: RecordingView) -> Iterator[Candidate]:
+    """Pairs with an offset that the delays of their tags do not explain; those that explain it as well are named."""
+    fit = quick_fit([view], constants="tag")
+    if fit is None:
+        return
+    names = [fit.named(pair) for pair in range(len(fit.ends))]
+    one_each = sparse.csr_matrix((np.ones(len(fit.pair)), (np.arange(len(fit.pair)), fit.pair)))
+    family = Family(kind="pair", names=names, derivative=one_each)
+    tolerance = PAIR_M + (CURVE_M if standing_still(view) is not None else 0.0)
+    for one in findings(fit.slopes.test(family), len(names), BUDGET, tolerance):
+        pair = names.index(one.names[0])
+        # A slope at no offset says too little of a large one, so that it is taken again.
+        rest = fit.less(np.where(fit.pair == pair, one.offset_m, 0.0))
+        offset_m = one.offset_m + float(rest.offsets(family)[0][pair])
+        yield Candidate(
+            OPEN,
+            f"ranges of pair {' or '.join(one.names)} are {100 * abs(offset_m):.1f} cm too "
+            f"{'long' if offset_m > 0 else 'short'} for the delays of their tags, by closed loops of the other pairs",
+            one.p_value,
+        )
+
+
+def astray(view: RecordingView) -> Iterator[Candidate]:
+    """Pairs whose ranges and true distances have little to do with each other."""
+    fit = view.quick_fit
+    if fit is None:
+        return
+    found = list[tuple[float, str]]()
+    for pair in range(len(fit.ends)):
+        rest = np.minimum(np.abs(fit.residual[fit.pair == pair]), 10 * LOUD_M)
+        means = np.array([float(np.mean(rest[s])) for s in stretches(len(rest))])
+        p_value = positive(means - LOUD_M, tried=len(fit.ends))
+        if p_value < BUDGET:
+            found.append((p_value, f"{fit.named(pair)} by {np.mean(means):.2f} m"))
+    if found:
+        told = ", ".join(name for _, name in found[:6]) + (f" and {len(found) - 6} pairs more" if found[6:] else "")
+        yield Candidate(ASTRAY, f"ranges of pairs {told} differ on average, each pair's median aside", min(found)[0])
+
+
+def changed_delays(view: RecordingView) -> Iterator[Candidate]:
+    """Tags whose delay changes during a recording: all of their pairs shift alike, others do not."""
+    fit = view.quick_fit
+    if fit is None or fit.time_s[-1] < SHORTEST_S:
+        return
+    cuts = np.linspace(0, fit.time_s[-1], min(CUTS, MOST_COLUMNS // len(fit.ends)) + 2)[1:-1]
+    for shift in shifts(fit, fit.time_s[:, None] >= cuts):
+        mine = fit.of_tag(shift.tag)
+        time_s, rest, late = fit.time_s[mine], fit.clipped[mine], shift.late[mine]
+        drifts = np.corrcoef(rest, time_s)[0, 1] ** 2 > 1.15 * np.corrcoef(rest, late)[0, 1] ** 2
+        if drifts or _stays(time_s, rest, late):
+            when = "over the recording" if drifts else f"{fit.host_s[np.argmax(shift.late)]:.0f} s after the start"
+            yield Candidate(
+                DRIFTED if drifts else MOVED,
+                f"ranges of tag {shift.tag} {'drift' if drifts else 'shift'} by {100 * shift.size_m:+.1f} cm {when} "
+                f"{shift.pairs_alike}, others do not",
+                shift.p_value,
+                {"tag": shift.tag},
+            )
+
+
+def _stays(time_s: Floats, rest: Floats, late: Bools) -> bool:
+    """Return whether both parts keep their level: a body in the way goes again."""
+    levels = []
+    for side in (~late, late):
+        middle = np.median(time_s[side])
+        levels += [float(np.mean(rest[side & half])) for half in (time_s < middle, time_s >= middle)]
+    step = abs(levels[2] + levels[3] - levels[0] - levels[1]) / 2
+    return max(abs(levels[1] - levels[0]), abs(levels[3] - levels[2])) < 0.6 * step
+
+
+def shifts(fit: QuickFit, late: Bools) -> Iterator[Shift]:
+    """Yield shifts of tags at one of several times, each beside those before; ranges after are `late` (n, cuts)."""
+    found = set[int]()
+    while len(found) < MOST_NAMED:
+        shift = next(_likely_shifts(fit, late), None)
+        if shift is None or shift.tag in found:
+            return
+        yield shift
+        found.add(shift.tag)
+        fit = fit.less(np.where(fit.of_tag(shift.tag) & shift.late, shift.size_m, 0.0))
+
+
+def _likely_shifts(fit: QuickFit, late: Bools) -> Iterator[Shift]:
+    """Yield shifts of single tags, at the time that explains most, those first that explain more."""
+    size, weight = _of_pairs(fit, late)[:2]
+    tags, noise = np.unique(fit.ends), _noise(fit)
+    weight = weight / noise[:, None]
+    mine = np.array([(fit.ends == tag).any(axis=1) for tag in tags], dtype=np.float64)
+    whole = np.maximum(mine @ weight, 1e-12)
+    mean = mine @ (weight * size) / whole
+    explained = np.maximum(np.abs(mean) - DELAY_M, 0.0) ** 2 * whole
+    for k in np.argsort(-explained.max(axis=1)).tolist():
+        cut = int(np.argmax(explained[k]))
+        if explained[k, cut] > 0:
+            yield from _shift_of(fit, int(tags[k]), late[:, cut], size[:, cut], float(mean[k, cut]), mean.size)
+
+
+def _of_pairs(fit: QuickFit, late: Bools) -> tuple[Floats, Floats, Floats, float]:
+    """Return for each pair and time (k, cuts) what `QuickFit.offsets` does of a shift at that time."""
+    count, cuts = len(fit.ends), late.shape[1]
+    rows, cut = np.nonzero(late)
+    columns = fit.pair[rows] * cuts + cut
+    derivative = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(late), count * cuts))
+    names = [fit.named(pair) for pair in range(count) for _ in range(cuts)]
+    *found, dof = fit.offsets(Family(kind="shift", names=names, derivative=derivative))
+    size, weight, std = (one.reshape(count, cuts) for one in found)
+    return size, weight, std, dof
+
+
+def _noise(fit: QuickFit) -> Floats:
+    """Return how many times the variance of each pair's mean (k,) is that of independent ranges, as errors last."""
+    _, weight, std, _ = _of_pairs(fit, fit.time_s[:, None] > np.median(fit.time_s))
+    return np.where(weight[:, 0] > 0, np.maximum(std[:, 0] ** 2 * weight[:, 0], 1e-9), np.inf)
+
+
+def _shift_of(fit: QuickFit, tag: int, late: Bools, size: Floats, mean: float, tried: int) -> Iterator[Shift]:
+    """Yield the shift of a tag where its pairs shift alike, by about `mean`, and others do not."""
+    mine = (fit.ends == tag).any(axis=1)
+    sides = np.array([np.bincount(fit.pair[side], minlength=len(mine)) for side in (~late, late)])
+    known = sides.min(axis=0) >= MIN_RANGES_A_SIDE
+    own, others = known & mine, known & ~mine
+    # A tag with one pair needs others, for the pair to be its own matter.
+    needed = 2 if mine.sum() > 1 or others.sum() < 3 else 1
+    if own.sum() < needed or np.median(np.abs(size[own] - mean)) > abs(mean):
+        return
+    medians = [
+        float(np.median(fit.residual[rows & late]) - np.median(fit.residual[rows & ~late]))
+        for rows in (fit.pair == pair for pair in np.flatnonzero(own))
+    ]
+    shift = float(np.average(medians, weights=1 / (1 / sides[:, own]).sum(axis=0)))
+    # What the shift itself leaves in residuals is no noise: standard errors are those without it.
+    rest = fit.less(np.where(fit.of_tag(tag) & late, shift, 0.0))
+    _, _, errors, dof = _of_pairs(rest, late[:, None])
+    std = errors[:, 0]
+    weight = std**-2.0
+    mean = float(np.average(size[own], weights=weight[own]))
+    quiet = not others.any() or (
+        abs(float(np.average(size[others], weights=weight[others]))) < OTHERS * abs(mean)
+        and float(np.median(np.abs(size[others]))) < 0.6 * abs(mean)
+    )
+    apart = np.abs(size[own] - mean)
+    alike = (apart < 0.5 * abs(mean)) | (apart < 3.5 * std[own])
+    sure = (np.abs(size[own]) > 2 * std[own]) & (size[own] * mean > 0)
+    if quiet and alike.all() and sure.sum() >= needed and abs(shift) < LARGEST_M:
+        # Variances of pairs are known apart, to so many degrees of freedom (Welch and Satterthwaite).
+        whole = float(weight[own].sum())
+        dof *= whole**2 / float(np.sum(weight[own] ** 2))
+        p_value = exceeds(mean, whole**-0.5, dof, tolerance=DELAY_M, tried=tried)
+        yield Shift(tag=tag, size_m=shift, late=late, p_value=p_value, pairs=int(mine.sum()))
+
+
+def compared(views: Sequence[RecordingView], level: float) -> Iterator[Candidate]:
+    """What differs between recordings, each compared with the one before it; `level` is that of a check."""
+    moved = {view.name: {one.body: one for one in displaced(view) if one.p_value < level} for view in views}
+    for first, second in pairwise(views):
+        bodies = _moved(first, second, moved)
+        for body, (away, p_value) in bodies.items():
+            yield Candidate(
+                MOVED_ANCHOR,
+                f"{body} stands {np.linalg.norm(away):.2f} m elsewhere ({away[0]:+.2f} {away[1]:+.2f} {away[2]:+.2f} m"
+                f") in {second.name} than in {first.name}, by its ranges and the places that the recordings give it",
+                p_value,
+                {"body": body},
+            )
+        known = {*bodies, *moved[first.name], *moved[second.name]}
+        yield from _other_delays(first, second, [tag.tag for tag in (*first.tags, *second.tags) if tag.body in known])
+
+
+def _moved(
+    first: RecordingView, second: RecordingView, moved: dict[str, dict[str, Displaced]]
+) -> dict[str, tuple[Floats, float]]:
+    """Return the anchors of both recordings whose places differ by more than 8 cm, by how much, and the p-value."""
+    found = {}
+    for body in sorted(set(standing(first)) & set(standing(second))):
+        off = [moved[view.name].get(body) for view in (first, second)]
+        places = [
+            place_m(view, body) + (one.away_m if one else 0.0) for view, one in zip((first, second), off, strict=True)
+        ]
+        known = [one.p_value for one in off if one]
+        if known and np.linalg.norm(places[1] - places[0]) > 0.08:
+            found[body] = places[1] - places[0], min(known)
+    return found
+
+
+def _other_delays(first: RecordingView, second: RecordingView, but: list[int]) -> Iterator[Candidate]:
+    """Yield tags all of whose pairs read otherwise in the second recording, beside other pairs that do not."""
+    views = [
+        chosen(view, ~(np.isin(view.exchanges.initiator, but) | np.isin(view.exchanges.target, but)))
+        for view in (first, second)
+    ]
+    fit = quick_fit(views)
+    if fit is None:
+        return
+    for shift in shifts(fit, (fit.session == 1)[:, None]):
+        yield Candidate(
+            OTHER_DELAY,
+            f"ranges of tag {shift.tag} are {100 * shift.size_m:+.1f} cm longer in {second.name} than in {first.name} "
+            f"{shift.pairs_alike}, others are not",
+            shift.p_value,
+            {"tag": shift.tag},
+        )
