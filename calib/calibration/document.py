@@ -82,6 +82,12 @@ FILE_KEYS: Final = (
     FileKey(
         "errors.levels", "pairs of numbers, 0 to 1", "needed", "Shares, and the model's levels that held for them."
     ),
+    FileKey(
+        "errors.lasting.mean", "number", "no persistence", "Mean of errors within the gate of a filter, over sigma."
+    ),
+    FileKey("errors.lasting.own_variance", "number, above 0", "needed", "Variance of what each range has of its own."),
+    FileKey("errors.lasting.lasting_variance", "number, above 0", "needed", "Variance of what ranges of a pair share."),
+    FileKey("errors.lasting.time_s", "number, s", "needed", "Time in which that part forgets."),
     FileKey("errors.pairs.PAIR.noise", "number, above 0", "1", "Factor of a pair, as 1-2, on the noise."),
     FileKey("errors.pairs.PAIR.odds", "number, above 0", "1", "Its factor on the odds of a reflection."),
     FileKey("errors.pairs.PAIR.detour", "number, above 0", "1", "Its factor on the mean detour."),

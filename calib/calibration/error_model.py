@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from calib.calibration.document import Metres, Number, OpenShare, PairName, Positive, Share, StdM, joint
+from calib.calibration.lasting import LastingErrors
 from calib.calibration.power_curves import Curve
 from calib.errors import BadInputError
 from calib.range_errors.densities import ROOT_2PI, LongDetours, densities
@@ -54,6 +55,7 @@ class ErrorModel:
     the mean of both kinds of exponential detour; `long_share` of the reflections are `long_factor` times as long as the
     others. Without one there is one kind, as in calibrations of uwbcal up to 0.2.0. Of the noise `between_m` is what
     stays in the ranges of a pair for a recording, or a spell of it, and changes by the next.
+    `lasting` says how long errors within the gate of a filter last; None where that is not known.
     """
 
     lifted: tuple[Number, ...]
@@ -70,6 +72,7 @@ class ErrorModel:
     long_factor: Positive = 1.0
     between_m: StdM = 0.0
     pairs: dict[PairName, PairErrors] = field(default_factory=dict)
+    lasting: LastingErrors | None = None
 
     def between(self, between_m: float) -> ErrorModel:
         """Return the model of ranges of other recordings, whose pairs are off by so much more."""

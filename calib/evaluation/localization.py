@@ -7,7 +7,7 @@ with the variance of the sigma curve, and calibrated with all that a calibration
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -115,6 +115,14 @@ def filter_runs(flight: Flight, calibration: Calibration, fixed: FixedStd) -> li
         if calibration.errors is not None:
             noise, errors = range_errors(calibration, flight.ranges[rows])
             ranges["robust"] = FilterRanges(corrected - calibration.errors.location_m, noise, errors)
+            if lasting := calibration.errors.lasting:
+                own = np.sqrt(lasting.own_variance)
+                ranges["variance"] = FilterRanges(
+                    corrected - lasting.mean * sigma, own * sigma, lasting=lasting, sigma_m=sigma
+                )
+                # Reflections within the gate are in the mixture already, so the total stays that of the noise.
+                unit = noise / np.sqrt(lasting.own_variance + lasting.lasting_variance)
+                ranges["robust"] = replace(ranges["robust"], std_m=own * unit, lasting=lasting, sigma_m=unit)
         runs.append(Run(problem, ranges))
     return runs
 

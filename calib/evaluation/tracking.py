@@ -9,10 +9,12 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calib.calibration.lasting import LastingErrors
 from calib.data.sources import Flight
 from calib.errors import BadInputError
 from calib.evaluation.range_updates import Heard, RangeErrors, gated, multilaterate, weighed
@@ -22,7 +24,11 @@ from uwblink.recording.schema import Poses
 
 FILTERS: Final = ("raw", "calibrated", "variance", "robust")
 
-FEWEST_IN_WINDOW: Final = 12
+PATIENCE: Final = 3.0
+"""Times `reopen_s` that a filter which explained its ranges for as long is given. In a room (scenarios/room)
+reflections of half of the ranges last for one to two seconds, and a filter that begins anew by them is lost by metres."""
+
+MIN_RANGES_IN_WINDOW: Final = 12
 """Ranges by which a filter may be found lost: four for each coordinate."""
 
 
@@ -35,8 +41,9 @@ class Settings:
     but for noise of `initial_std_m` and an `initial_offset_m` that they do not know of. A range is taken when its
     squared innovation over its variance is below `gate` (chi-square with one degree of freedom; 10.83 is its 99.9 %
     quantile); the robust filter has no gate. A filter that cannot explain half of the ranges of the last `reopen_s`
-    begins anew where they say (`multilaterate`), so that it finds back from anywhere. `seeds` are runs with other
-    noise, each body and flight with its own; tracks are those of the first, `seed`.
+    begins anew where they say (`multilaterate`), so that it finds back from anywhere; one that explained them
+    for three times as long is given that time. `seeds` are runs with other noise, each body and flight with its own;
+    tracks are those of the first, `seed`.
     """
 
     velocity_std_mps: float = 0.3
@@ -88,7 +95,7 @@ class Track:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
     """What is known of one body at each of its ranges: rows of the flight, true place, own lever arm turned into the
-    world, and the other antenna's place, (n, 3) each."""
+    world, and the other antenna's place, (n, 3) each; numbers of its pairs of tags (n,), from 0."""
 
     body: str
     rows: Ints
@@ -97,10 +104,11 @@ class Problem:
     place: Floats
     arm: Floats
     other: Floats
+    pair: Ints
 
     def first(self, count: int) -> Problem:
         """Return its first ranges."""
-        columns = ("rows", "time_ns", "attitude", "place", "arm", "other")
+        columns = ("rows", "time_ns", "attitude", "place", "arm", "other", "pair")
         return replace(self, **{name: getattr(self, name)[:count] for name in columns})
 
     def velocity_spread(self, settings: Settings) -> Floats:
@@ -145,6 +153,7 @@ def problems(flight: Flight) -> list[Problem]:
                     place=place[known],
                     arm=(antenna - place)[known],
                     other=away[known],
+                    pair=np.unique(own[known] * 2**16 + other[known], return_inverse=True)[1],
                 )
             )
     return found
@@ -162,11 +171,16 @@ def nearest_attitude(poses: Poses, body: str, time_ns: Ints) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class FilterRanges:
-    """What a filter measures (n,), its standard deviation (n,), and what errors are made of if it reckons with it."""
+    """What a filter measures (n,), its standard deviation (n,), and what errors are made of if it reckons with it.
+
+    With `lasting`, ranges of a pair share errors that last, in units of `sigma_m` (n,), about zero.
+    """
 
     measured_m: Floats
     std_m: Floats
     errors: RangeErrors | None = None
+    lasting: LastingErrors | None = None
+    sigma_m: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +194,9 @@ class Run:
 def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[Track]]]:
     """Run filters with every noise; return the tracks of each run by filter, a noise each. All have the same filters.
 
+    A state is the position, and for each pair of tags the error that its ranges share: a Gauss-Markov process of first
+    order, in units of sigma (Bar-Shalom, Li and Kirubarajan 2001, section 8.2); zero without lasting errors.
+
     Bodies run side by side: arrays are by time, filter, and a column a body and noise. Runs that end before the
     longest one stand still then, and go on measuring what they measured last.
     """
@@ -187,7 +204,7 @@ def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[
         return []
     count, body = max(len(run.problem.rows) for run in runs), np.repeat(np.arange(len(runs)), settings.seeds)
 
-    def beside(parts: list[Floats]) -> Floats:
+    def beside(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Return arrays (some, ...) side by side (count, parts, ...), each with its last row where it has none."""
         return np.stack([part[np.minimum(np.arange(count), len(part) - 1)] for part in parts], axis=1)
 
@@ -200,36 +217,56 @@ def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[
     place, arm, other = (beside([getattr(run.problem, name) for run in runs]) for name in ("place", "arm", "other"))
     errors = [_errors_beside([run.ranges[name].errors for run in runs], count) for name in runs[0].ranges]
 
-    shape, eye = (len(errors), len(body)), np.eye(3)
-    x = np.tile([start for start, _ in noises], (shape[0], 1, 1))
-    p = np.tile(eye * settings.initial_std_m**2, (*shape, 1, 1))
+    sigma = beside([np.array([_shared_sigma(one) for one in run.ranges.values()]).T for run in runs])
+    known = [one.lasting for one in runs[0].ranges.values()]
+    shared = np.array([one.lasting_variance if one else 0.0 for one in known])
+    kept = np.exp(-beside([np.array([_steps(run, one) for one in known]).T for run in runs]))
+    pair = 3 + beside([run.problem.pair for run in runs])
+
+    shape, size = (len(errors), len(body)), int(pair.max()) + 1
+    every, of_filter = np.arange(len(body)), np.arange(len(errors))[:, None]
+    x, h, p = np.zeros((*shape, size)), np.zeros((*shape, size)), np.zeros((*shape, size, size))
+    x[..., :3] = [start for start, _ in noises]
+    diagonal = np.einsum("fsii->fsi", p)
+    diagonal[..., :3], diagonal[..., 3:] = settings.initial_std_m**2, shared[:, None, None]
     estimate, (std, nis, nees) = np.empty((count, *shape, 3)), np.empty((3, count, *shape))
     accepted, began = np.zeros((count, *shape), dtype=bool), np.zeros(shape, dtype=np.int64)
+    settled = np.zeros(shape, dtype=bool)
     for k in range(count):
-        x = x + moves[k]
-        p = p + spread[k][body][:, None, None] * eye
-        towards = x + arm[k][body] - other[k][body]
+        keep = kept[k].T[:, body][..., None]
+        x[..., 3:] *= keep
+        x[..., :3] += moves[k]
+        p[..., 3:] *= keep[..., None]
+        p[..., 3:, :] *= keep[..., None]
+        diagonal[..., :3] += spread[k][body][:, None]
+        diagonal[..., 3:] += shared[:, None, None] * (1 - keep**2)
+        towards = x[..., :3] + arm[k][body] - other[k][body]
         distance = np.sqrt(np.einsum("fsi,fsi->fs", towards, towards))
-        h = towards / np.maximum(distance, 1e-6)[..., None]
+        h[..., 3:], h[..., :3] = 0.0, towards / np.maximum(distance, 1e-6)[..., None]
+        own = of_filter, every, pair[k][body]
+        h[own] = sigma[k].T[:, body]
         ph = np.matmul(p, h[..., None])[..., 0]
-        innovation = measured[k].T[:, body] - distance
+        innovation = measured[k].T[:, body] - distance - h[own] * x[own]
         s = np.einsum("fsi,fsi->fs", h, ph) + variance[k].T[:, body]
         nis[k] = innovation**2 / s
-        heard = _heard(innovation, s, [known and known.at((k, body)) for known in errors], settings.gate)
+        heard = _heard(innovation, s, [one and one.at((k, body)) for one in errors], settings.gate)
         gain = ph / s[..., None]
-        x = x + gain * heard.noise_m[..., None]
-        p = p + gain[..., None] * gain[..., None, :] * (heard.variance_m2 - s)[..., None, None]
-        for f, one, first in _lost(nis[: k + 1], runs, body, settings, began) if k % 8 == 0 else ():
+        x += gain * heard.noise_m[..., None]
+        p += gain[..., None] * (gain * (heard.variance_m2 - s)[..., None])[..., None, :]
+        for f, one, first in _lost(nis[: k + 1], runs, body, settings, began, settled) if k % 8 == 0 else ():
             problem, rows = runs[body[one]].problem, slice(first, k + 1)
             # What the body moved since each range is known from its velocity, and counted to the anchors.
             since = np.vstack([moves[first + 1 : k + 1, one][::-1].cumsum(axis=0)[::-1], np.zeros(3)])
             anchors = problem.other[rows] - problem.arm[rows] + since
             fix = multilaterate(measured[rows, body[one], f], anchors, 0.0)
-            x[f, one], p[f, one] = fix.place_m, fix.covariance_m2
-            began[f, one] = k + 1
-        wrong = x - place[k][body]
-        estimate[k], accepted[k], std[k] = x, heard.believed, np.sqrt(np.trace(p, axis1=-2, axis2=-1))
-        nees[k] = np.einsum("fsi,fsi->fs", wrong, np.linalg.solve(p, wrong[..., None])[..., 0])
+            x[f, one, :3] = fix.place_m
+            p[f, one, :3], p[f, one, :, :3] = 0.0, 0.0
+            p[f, one, :3, :3] = fix.covariance_m2
+            began[f, one], settled[f, one] = k + 1, False
+        wrong, of_place = x[..., :3] - place[k][body], p[..., :3, :3]
+        estimate[k], accepted[k] = x[..., :3], heard.believed
+        std[k] = np.sqrt(np.trace(of_place, axis1=-2, axis2=-1))
+        nees[k] = np.einsum("fsi,fsi->fs", wrong, np.linalg.solve(of_place, wrong[..., None])[..., 0])
 
     def track(problem: Problem, f: int, column: int) -> Track:
         some = (slice(0, len(problem.rows)), f, column)
@@ -251,6 +288,17 @@ def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[
         }
         for k, run in enumerate(runs)
     ]
+
+
+def _shared_sigma(ranges: FilterRanges) -> Floats:
+    """Return the unit of the errors that last (n,), in metres; zeros where none do."""
+    return ranges.sigma_m if ranges.sigma_m is not None else np.zeros(len(ranges.measured_m))
+
+
+def _steps(run: Run, lasting: LastingErrors | None) -> Floats:
+    """Return the time since the range before (n,) in units of that in which lasting errors forget."""
+    time_s = np.diff(run.problem.time_ns, prepend=run.problem.time_ns[:1]) * 1e-9
+    return np.asarray(time_s / (lasting.time_s if lasting else np.inf))
 
 
 def _errors_beside(parts: Sequence[RangeErrors | None], count: int) -> RangeErrors | None:
@@ -275,20 +323,28 @@ def _heard(innovation: Floats, variance: Floats, errors: Sequence[RangeErrors | 
 
 
 def _lost(
-    nis: Floats, runs: Sequence[Run], body: Ints, settings: Settings, began: Ints
+    nis: Floats, runs: Sequence[Run], body: Ints, settings: Settings, began: Ints, settled: Bools
 ) -> Iterator[tuple[int, int, int]]:
     """Yield filters (filter, column) that cannot explain half of the latest ranges, and the first of these ranges.
 
     Half of them are off by more than three standard deviations. `nis` (n, filters, columns) are those of all ranges so
-    far; those before a filter `began` anew do not count, nor do windows that do not reach back for `reopen_s`.
+    far; those before a filter `began` anew do not count, nor do windows that do not reach back for `reopen_s`. Filters
+    are `settled` (filters, columns) when they explained their ranges for `PATIENCE` times as long, and are then given
+    that time.
     """
     last = len(nis) - 1
     for k, run in enumerate(runs):
         time_ns, mine = run.problem.time_ns, np.flatnonzero(body == k)
         if last >= len(time_ns):
             continue
-        since_ns = time_ns[last] - int(settings.reopen_s * 1e9)
-        first = int(np.searchsorted(time_ns, since_ns))
-        if time_ns[0] <= since_ns and last + 1 - first >= FEWEST_IN_WINDOW:
-            lost = (np.median(nis[first:, :, mine], axis=0) > 9.0) & (began[:, mine] <= first)
-            yield from ((int(f), int(mine[one]), first) for f, one in np.argwhere(lost))
+        for windows in (1.0, PATIENCE):
+            since_ns = time_ns[last] - int(windows * settings.reopen_s * 1e9)
+            first = int(np.searchsorted(time_ns, since_ns))
+            if time_ns[0] > since_ns or last + 1 - first < MIN_RANGES_IN_WINDOW:
+                continue
+            inside = began[:, mine] <= first
+            lost = inside & (np.median(nis[first:, :, mine], axis=0) > 9.0)
+            if windows == PATIENCE:
+                settled[:, mine] |= inside & ~lost
+            told = lost & (settled[:, mine] == (windows == PATIENCE))
+            yield from ((int(f), int(mine[one]), first) for f, one in np.argwhere(told))

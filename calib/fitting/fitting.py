@@ -14,6 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import uwblink
+from calib.calibration.lasting import lasting_errors
 from calib.calibration.model import Calibration
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
@@ -97,7 +98,10 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     given = set(fixed) - set(pinned)
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
     calibration = replace(calibration, delays_std_ns=stated | std_taken_over(source, given))
-    residuals, inliers = _left(calibration, ranges)
+    residuals, inliers, over_sigma = _left(calibration, ranges)
+    if calibration.errors is not None:
+        known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
+        calibration = replace(calibration, errors=known)
     warnings = [
         *limits(found, ranges, residuals, fixed),
         *_stopped(found, settings.loss),
@@ -126,12 +130,13 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     )
 
 
-def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools]:
-    """Return what a calibration leaves of the errors of ranges (n,), and which of them lie within three sigmas."""
+def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools, Floats]:
+    """Return the errors of ranges (n,) that a calibration leaves, which are within three sigmas, and all over sigma."""
     # What errors are made of is known, and of no use for this.
     applied = replace(calibration, errors=None).apply(ranges)
     left = applied.corrected_m - ranges.truth_m
-    return left, np.asarray(np.abs(left) < INLIER_SIGMAS * applied.sigma_m)
+    over_sigma = left / applied.sigma_m
+    return left, np.asarray(np.abs(over_sigma) < INLIER_SIGMAS), over_sigma
 
 
 def _lifted(power_dbm: float, alpha_dbm: float) -> float:

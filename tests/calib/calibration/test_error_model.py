@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from scipy.signal import lfilter
 from scipy.stats import exponnorm, norm
 
 import calib
@@ -134,6 +135,24 @@ def test_a_damaged_model_is_one_clear_error(fitted, key, value, said):
     document["errors"][key] = value
     with pytest.raises(calib.BadInputError, match=said):
         Calibration.from_json(json.dumps(document), "here")
+
+
+def test_a_fit_says_how_long_errors_of_a_pair_last():
+    """Half of the variance is a Gauss-Markov process of each pair that forgets in half a second."""
+    flight = calib.load_ranges(calib.sample_flight(9000))
+    rng, shared = np.random.default_rng(5), np.zeros(len(flight))
+    for pair in range(3):
+        keep = np.exp(-0.03 / 0.5)
+        steps = rng.normal(0, 0.03 * np.sqrt(1 - keep**2), len(flight) // 3)
+        shared[pair::3] = lfilter([1.0], [1.0, -keep], steps)
+    found = calib.fit(replace(flight, raw_m=flight.raw_m + shared)).calibration
+    lasting = found.errors.lasting
+    assert lasting.lasting_variance == pytest.approx(0.5, abs=0.1)
+    assert lasting.own_variance == pytest.approx(0.5, abs=0.1)
+    assert lasting.time_s == pytest.approx(0.5, rel=0.4)
+    assert abs(lasting.mean) < 0.1
+    assert Calibration.from_json(found.to_json()) == found
+    assert calib.fit(flight).calibration.errors.lasting.lasting_variance < 0.05
 
 
 @pytest.mark.parametrize("shares", [[], [0.0], [1.2], [[0.5]]])
