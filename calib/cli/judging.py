@@ -321,7 +321,7 @@ def print_table(evaluation: Evaluation, console: Console) -> None:
     table.add_column("pair", no_wrap=True)
     table.add_column("n", justify="right", no_wrap=True)
     for stage in CORRECTION_STAGES:
-        for what in ("mean", "std", "rob."):
+        for what in ("mean", "med.", "rob."):
             table.add_column(f"{short[stage]}\n{what}", justify="right", no_wrap=True)
     table.add_column("chi2\nout%", justify="right", no_wrap=True)
     for what in ("total\nz std", "in\n95%"):
@@ -341,6 +341,12 @@ def _remarks(evaluation: Evaluation) -> Iterator[str]:
     yield (
         f"95 % of the calibrated errors lie between {100 * group.full.low_m:+.1f} and {100 * group.full.high_m:+.1f} cm"
         f"; {100 * group.rejected:.1f} % lie beyond what sigma explains at 95 % (5 % without reflections)"
+    )
+    split = evaluation.split
+    yield (
+        f"of the calibrated errors, {100 * split.within_m:.1f} cm (standard deviation) are within pairs, "
+        f"{100 * split.between_pairs_m:.1f} cm between pairs"
+        + (f", {100 * split.between_sessions_m:.1f} cm between sessions" if split.sessions > 1 else "")
     )
     covered = ", ".join(f"{100 * share:.1f} % for {name} %" for name, share in group.coverage.items())
     yield f"sigma covers {covered}"
@@ -365,7 +371,7 @@ def _cells(group: ErrorStatistics) -> list[str]:
     cells = [str(group.raw.n)]
     for stage in CORRECTION_STAGES:
         stats = getattr(group, stage)
-        figures = (stats.mean_m, stats.std_m, stats.robust_std_m)
+        figures = (stats.mean_m, stats.median_m, stats.robust_std_m)
         cells += [f"{100 * figure:.1f}" for figure in figures]
     return [*cells, f"{100 * group.rejected:.1f}", _known(group.total_std, "{:.2f}"), _known(100 * group.inside_95)]
 

@@ -93,6 +93,20 @@ class PlantedComparison:
     correction_rms_m: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorSplit:
+    """Standard deviations of corrected errors in metres: within a pair and session, and of what is constant there.
+
+    `between_pairs_m` is what pairs differ by, `between_sessions_m` by what a pair differs from session to session (NaN
+    of one session, as for pairs of one pair).
+    """
+
+    within_m: float
+    between_pairs_m: float
+    between_sessions_m: float
+    sessions: int
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class Evaluation:
     """The outcome for all ranges and for each pair, named "smaller-larger".
@@ -102,6 +116,7 @@ class Evaluation:
 
     overall: ErrorStatistics
     pairs: dict[str, ErrorStatistics]
+    split: ErrorSplit
     planted: PlantedComparison | None
     seen: tuple[str, ...] = ()
 
@@ -128,6 +143,7 @@ class Evaluation:
             "seen_by_fit": list(self.seen),
             "overall": _plain(asdict(self.overall)),
             "pairs": {name: _plain(asdict(group)) for name, group in self.pairs.items()},
+            "split": _plain(asdict(self.split)),
         }
         return document | ({"planted": _plain(asdict(self.planted))} if self.planted else {})
 
@@ -168,6 +184,7 @@ def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluatio
     return Evaluation(
         _group(ranges, applied, everything, inside),
         {name: _group(ranges, applied, rows, inside) for name, rows in pair_rows(ranges).items()},
+        split_error(ranges, applied.corrected_m - ranges.truth_m),
         beside_planted(ranges, applied, calibration),
         _seen(ranges, calibration),
     )
@@ -217,6 +234,39 @@ def pair_rows(ranges: Ranges) -> dict[str, Bools]:
     high = np.maximum(ranges.initiator, ranges.target)
     found = sorted(set(zip(low.tolist(), high.tolist(), strict=True)))
     return {f"{a}-{b}": (low == a) & (high == b) for a, b in found}
+
+
+def split_error(ranges: Ranges, error_m: Floats) -> ErrorSplit:
+    """Split errors (n,) into what varies within a pair and session, and between them.
+
+    Groups are described by median and robust spread, so that reflections count little. What their medians vary more
+    than chance explains (1.57 s²/n of n errors of spread s) is the variance between (DerSimonian and Laird 1986).
+    Errors that last for seconds count as independent, so short sessions seem to differ. Groups of fewer than 5 ranges
+    are left out.
+    """
+    rows = []
+    for name, mine in pair_rows(ranges).items():
+        for session in np.unique(ranges.session[mine]).tolist():
+            own = error_m[mine & (ranges.session == session)]
+            if len(own) >= 5:
+                rows.append((name, session, float(np.median(own)), robust_spread(own) ** 2, len(own)))
+    if not rows:
+        return ErrorSplit(within_m=np.nan, between_pairs_m=np.nan, between_sessions_m=np.nan, sessions=0)
+    names, sessions, medians, squares, counts = (np.array(column) for column in zip(*rows, strict=True))
+    chance = 1.57 * squares / counts
+    pairs = [names == name for name in np.unique(names)]
+    centres = np.array([medians[mine].mean() for mine in pairs])
+    freedom = len(rows) - len(pairs)
+    apart = sum(float(np.sum((medians[mine] - medians[mine].mean()) ** 2)) for mine in pairs)
+    between_sessions = max(apart / freedom - float(chance.mean()), 0.0) if freedom else np.nan
+    within_centres = [float(np.nan_to_num(between_sessions) + chance[mine].mean()) / int(mine.sum()) for mine in pairs]
+    between_pairs = float(np.var(centres, ddof=1)) - float(np.mean(within_centres)) if len(pairs) > 1 else np.nan
+    return ErrorSplit(
+        within_m=float(np.sqrt(np.average(squares, weights=counts))),
+        between_pairs_m=float(np.sqrt(max(between_pairs, 0.0))) if len(pairs) > 1 else np.nan,
+        between_sessions_m=float(np.sqrt(between_sessions)),
+        sessions=len(np.unique(sessions)),
+    )
 
 
 def statistics(error_m: Floats) -> Stats:

@@ -25,8 +25,11 @@ from uwblink.recording.schema import Poses
 FILTERS: Final = ("raw", "calibrated", "variance", "robust")
 
 PATIENCE: Final = 3.0
-"""Times `reopen_s` that a filter which explained its ranges for as long is given. In a room (scenarios/room)
-reflections of half of the ranges last for one to two seconds, and a filter that begins anew by them is lost by metres."""
+"""Times `reopen_s` that a filter which explained its ranges for as long is given.
+
+In a room (scenarios/room) reflections of half of the ranges last for one to two seconds, and a filter that begins anew
+by them is lost by metres.
+"""
 
 MIN_RANGES_IN_WINDOW: Final = 12
 """Ranges by which a filter may be found lost: four for each coordinate."""

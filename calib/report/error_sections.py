@@ -62,7 +62,15 @@ def before_after(results: Results) -> list[Block]:
         return []
     evaluation, overall = results.evaluation, results.evaluation.overall
     groups = [*evaluation.pairs.items(), ("all", overall)]
-    header = ["pair", "n", *["mean", "std", "robust"] * len(CORRECTION_STAGES), "95 % |e|", "noise", "in 95 %", "new p"]
+    header = [
+        "pair",
+        "n",
+        *["mean", "median", "robust"] * len(CORRECTION_STAGES),
+        "95 % |e|",
+        "noise",
+        "in 95 %",
+        "new p",
+    ]
     above = [("", 2), *[(stage, 3) for stage in CORRECTION_STAGES], ("full", 3), ("", 1)]
     levels = list(overall.coverage)
     covered = [[name, *(f"{100 * group.coverage[level]:.0f} %" for level in levels)] for name, group in groups]
@@ -72,7 +80,8 @@ def before_after(results: Results) -> list[Block]:
         Heading("Before and after"),
         Table(header, [[name, *_error_cells(group)] for name, group in groups], above, total=True),
         Text(
-            "Errors in cm. Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
+            "Errors in cm. Means contain the reflections that remain, medians hardly do. "
+            "Robust is 1.4826 median absolute deviations; 95 % |e| is what 95 % of the calibrated errors "
             f"stay below in size (95 % of all lie between {low:+.1f} and {high:+.1f} cm). Noise: share of corrected "
             "ranges that their own sigma explains at 95 %, 95 % without reflections; the rest are mostly reflected. In "
             "95 %: share within the 95 % intervals that reckon with reflections. New p: share at powers the curves "
@@ -109,7 +118,7 @@ def _error_cells(group: ErrorStatistics) -> list[str]:
     cells = [str(group.raw.n)]
     for stage in CORRECTION_STAGES:
         stats = getattr(group, stage)
-        cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.std_m, stats.robust_std_m)]
+        cells += [f"{100 * v:.1f}" for v in (stats.mean_m, stats.median_m, stats.robust_std_m)]
     shares = ["–" if v != v else f"{100 * v:.1f} %" for v in (1 - group.rejected, group.inside_95, group.clamped)]
     return [*cells, f"{100 * group.full.abs95_m:.1f}", *shares]
 

@@ -47,11 +47,16 @@ def _summary(results: Results) -> str:
     group, where = results.evaluation.overall, ""
     if results.fit is not None:
         where = " of the tests" if results.tests else " of the recordings it was fitted from"
-    cm = {stage: (100 * getattr(group, stage).mean_m, 100 * getattr(group, stage).std_m) for stage in CORRECTION_STAGES}
+    stages = [getattr(group, stage) for stage in CORRECTION_STAGES]
+    medians, means = (
+        f"{100 * raw:+.1f} cm (raw) to {100 * delays:+.1f} cm (delays corrected) and {100 * full:+.1f} cm (fully "
+        "corrected)"
+        for raw, delays, full in ([one.median_m for one in stages], [one.mean_m for one in stages])
+    )
     return (
-        f"Over {group.raw.n} ranges{where} the mean error goes from {cm['raw'][0]:+.1f} cm (raw) to "
-        f"{cm['delays'][0]:+.1f} cm (delays corrected) and {cm['full'][0]:+.1f} cm (fully corrected); the standard "
-        f"deviation from {cm['raw'][1]:.1f} to {cm['full'][1]:.1f} cm, its robust estimate from "
+        f"Over {group.raw.n} ranges{where} the median error goes from {medians}. The mean, which contains the "
+        f"reflections that remain, goes from {means}; the standard "
+        f"deviation from {100 * group.raw.std_m:.1f} to {100 * group.full.std_m:.1f} cm, its robust estimate from "
         f"{100 * group.raw.robust_std_m:.1f} to {100 * group.full.robust_std_m:.1f} cm. "
         f"{100 * (1 - group.rejected):.1f} % of the corrected ranges are as near as noise alone explains (95 % would "
         f"be without reflections), with a mean of {100 * group.accepted.mean_m:+.1f} cm and a standard deviation of "

@@ -7,8 +7,11 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
+from scipy.stats import binomtest
 
 from calib.calibration.model import rests_on
+from calib.evaluation.statistics import Stats
 from calib.report.results import Results
 from calib.spread import TWO_SIDED_95
 from uwblink.pages.blocks import Block, Table, Text
@@ -95,19 +98,33 @@ def _gain(results: Results) -> Criterion:
 def _bias(results: Results) -> Criterion:
     most = 0.5  # of the spread of one range: so large a bias adds an eighth to the error of a single range
     pairs = {name: group.full for name, group in results.evaluation.pairs.items()}
-    ratios = {name: abs(full.median_m) / max(full.robust_std_m, 1e-9) for name, full in pairs.items()}
+    # What is sure of a bias: few ranges of a pair tell little of it.
+    ratios = {
+        name: max(abs(full.median_m) - _median_bound_m(full, len(pairs)), 0.0) / max(full.robust_std_m, 1e-9)
+        for name, full in pairs.items()
+    }
     name = max(ratios, key=lambda pair: ratios[pair])
     full, ratio = pairs[name], ratios[name]
     return Criterion(
         "Is no pair left with a bias?",
-        f"median of each pair within {most:g} of its spread",
-        f"worst: {name} with {100 * full.median_m:+.1f} cm, {ratio:.2f} of its spread of "
+        f"median of each pair, less what chance explains, within {most:g} of its spread",
+        f"worst: {name} with {100 * full.median_m:+.1f} cm of {full.n} ranges; for sure {ratio:.2f} of its spread of "
         f"{100 * full.robust_std_m:.1f} cm",
         _graded(ratio <= most, ratio <= 1.0),
-        f"no pair keeps a bias beyond {100 * abs(full.median_m):.1f} cm"
+        f"no pair is sure to keep a bias beyond {most:g} of its spread"
         if ratio <= most
         else f"pair {name} keeps a bias of {100 * full.median_m:+.1f} cm",
     )
+
+
+def _median_bound_m(stats: Stats, pairs: int) -> float:
+    """Return what a median of errors may be off by at 1 % for all pairs together (Bonferroni), in metres.
+
+    The standard error of a median is 1.2533 sigma / sqrt(n), and sigma is known to n - 1 degrees of freedom.
+    """
+    if stats.n < 2:
+        return math.inf
+    return float(1.2533 * stats.robust_std_m / math.sqrt(stats.n) * stdtrit(stats.n - 1, 1 - 0.005 / pairs))
 
 
 def _interval(results: Results) -> Criterion:
@@ -116,11 +133,14 @@ def _interval(results: Results) -> Criterion:
     share = overall.inside_95 if known else overall.coverage["95"]
     of_what = "reflections included" if known else "by sigma alone; the calibration does not describe reflections"
     low, high = 0.90, 0.985  # with less, a filter trusts the ranges too much; with more, too little
+    # 99 % interval of the share (Wilson's), as of independent ranges.
+    count = overall.full.n
+    least, most = map(float, binomtest(round(share * count), count).proportion_ci(0.99, "wilson"))
     return Criterion(
         "Does it say rightly how far ranges can be off?",
         f"{100 * low:.0f} to {100 * high:.1f} % of errors within their 95 % intervals",
         f"{100 * share:.1f} % ({of_what})",
-        _graded(low <= share <= high, share >= 0.80),
+        _graded(low <= most and least <= high, most >= 0.80),
         f"{100 * share:.0f} % of the errors lie within their 95 % intervals",
     )
 

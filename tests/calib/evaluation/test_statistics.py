@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rich.console import Console
+from scipy.stats import norm
 
 from calib.cli.judging import print_table
-from calib.evaluation.statistics import evaluate, pair_rows, statistics
+from calib.data.ranges import Ranges, concatenate
+from calib.evaluation.statistics import evaluate, pair_rows, split_error, statistics
 from calib.fitting.fitting import fit
 from tests.calib.synthetic import DELAYS_NS, bias_m, ranges
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -33,7 +35,7 @@ def test_json_has_stages_and_figures_for_all_and_each_pair():
     r = ranges()
     calibration = fit(r).calibration
     document = evaluate(r, calibration).to_dict()
-    assert set(document) == {"seen_by_fit", "overall", "pairs"}
+    assert set(document) == {"seen_by_fit", "overall", "pairs", "split"}
     for group in (document["overall"], *document["pairs"].values()):
         for stage in ("raw", "delays", "full"):
             assert {"n", "mean_m", "median_m", "std_m", "robust_std_m"} <= set(group[stage])
@@ -42,6 +44,32 @@ def test_json_has_stages_and_figures_for_all_and_each_pair():
     assert abs(unseen.full.mean_m) < abs(unseen.raw.mean_m)
     assert unseen.full.std_m < unseen.raw.std_m
     assert unseen.full.robust_std_m < unseen.raw.robust_std_m
+
+
+@pytest.mark.parametrize(("pairs_m", "sessions_m"), [(0.0, 0.0), (0.05, 0.0), (0.05, 0.04)])
+def test_errors_are_split_into_within_and_between_pairs_and_sessions(pairs_m, sessions_m):
+    rng = np.random.default_rng(7)
+    parts = []
+    by_pair = pairs_m * norm.ppf((np.arange(28) + 0.5) / 28)
+    for session in range(4):
+        first, second = np.triu_indices(8, 1)
+        pair = rng.integers(0, 28, 4000)
+        error = (
+            by_pair[pair] + sessions_m * rng.permutation(by_pair / max(pairs_m, 1e-9))[pair] + rng.normal(0, 0.04, 4000)
+        )
+        error[:200] += 2.0  # reflections
+        parts.append(
+            Ranges.from_arrays(
+                3.0 + error, initiator=first[pair], target=second[pair], fpp1_dbm=-85.0, truth_m=3.0,
+                time_ns=np.arange(4000) * 10_000_000 + session * 10**15, source=f"{session}",
+            )
+        )  # fmt: skip
+    joined = concatenate(parts)
+    found = split_error(joined, joined.raw_m - joined.truth_m)
+    assert found.sessions == 4
+    assert found.within_m == pytest.approx(0.04, rel=0.15)
+    assert found.between_pairs_m == pytest.approx(pairs_m, abs=0.015)
+    assert found.between_sessions_m == pytest.approx(sessions_m, abs=0.008)
 
 
 def test_coverage_is_nominal_on_clean_data_and_raw_rejection_is_its_own():

@@ -105,6 +105,18 @@ def test_what_changed_since_makes_it_unfit(known, unseen, change, question, word
     assert words in text.text
 
 
+def test_a_few_ranges_of_a_pair_do_not_make_it_unfit(known, unseen):
+    """Half a metre off in four ranges of a pair says little; in a hundred it is a fault."""
+    mine = np.flatnonzero((unseen.initiator + unseen.target == 10) & (abs(unseen.initiator - unseen.target) == 4))
+    for count, mark in ((4, "✓ yes"), (100, "✗ no")):
+        others = np.setdiff1d(np.arange(len(unseen)), mine[count:])
+        raw_m = unseen.raw_m.copy()
+        raw_m[mine] += 0.15
+        text, met = told(known, replace(unseen, raw_m=raw_m)[others])
+        assert met["Is no pair left with a bias?"] == mark
+        assert (text.kind == "bad") == (mark == "✗ no")
+
+
 def test_few_powers_that_were_not_fitted_are_a_reservation(known, unseen):
     assert told(*stronger(known, unseen, 0.12))[1]["Was the curve fitted at such powers?"] == "! in part"
 
