@@ -98,9 +98,9 @@ class Board(Closing):
     def request(self, command: Message) -> Message:
         """Send a command and return its reply.
 
-        A board that does not answer is given a second to come back, and is then asked once more. Raises `RefusedError`
-        (nothing was sent), `NoAnswerError`, `RangingFailedError` with the board's own line, or `PortLostError`. Other
-        reports that come meanwhile are kept for `reports`.
+        If a board does not answer, the command is repeated after up to a second. Raises `RefusedError` (nothing was
+        sent), `NoAnswerError`, `RangingFailedError` with the board's own line, or `PortLostError`. Other reports are
+        kept for `reports`.
         """
         self._settle()
         if self._connection.doubtful:
@@ -118,8 +118,8 @@ class Board(Closing):
     ) -> RangeReport:
         """Range with another board; `protocol` is "ss" or "ds". Raises what `request` raises.
 
-        With both `target_reports` and `get_cir` it returns when the target has printed its impulse response, too, so
-        that neither board is asked something meanwhile, which would damage what it prints.
+        With both `target_reports` and `get_cir` it waits until the target has printed its impulse response, because a
+        command would damage what a board prints.
         """
         if protocol not in ON_BOARDS:
             raise RefusedError(f"protocol {protocol!r}: the boards know {' and '.join(ON_BOARDS)}")
@@ -171,7 +171,7 @@ class Board(Closing):
                 return
 
     def _revive(self, error: NoAnswerError) -> None:
-        """Ask a silent board once more, with patience: firmware that listens in vain is deaf for a while, not dead."""
+        """Send a fence with a long time-out: firmware that waits for a frame in vain does not answer for a while."""
         try:
             self._exchange(FENCE)
         except NoAnswerError as still:
@@ -202,13 +202,13 @@ class Board(Closing):
         self._reports.extend(e for e in events if e is not reply and not isinstance(e, Skipped))
 
     def _settle(self) -> None:
-        """Wait until the board may be asked; an impulse response that comes in postpones that."""
+        """Wait until a command may be sent, which an incoming impulse response delays."""
         self._pass(0.0)
         while (wait_s := self._connection.ready_s(self._transport.now_s())) > 0:
             self._pass(wait_s)
 
     def _pass(self, seconds: float, *, until_report: bool = False) -> None:
-        """Let time pass, and keep what the board says meanwhile; even no time takes in what has come."""
+        """Wait, and keep reports that arrive; with 0 seconds, read what has arrived."""
         until_s = self._transport.now_s() + seconds
         while True:
             data = self._transport.read(max(until_s - self._transport.now_s(), 0.0))

@@ -1,4 +1,4 @@
-"""Listeners: the one way out of a recorder, and those that count, check and correct what it tells.
+"""Listeners of a recorder, among them those that count exchanges and check antenna delays.
 
 ```python
 import uwblink
@@ -14,9 +14,9 @@ live table and the user's callback are all listeners. They are called in the rec
 they must be quick: 0.1 ms a message is plenty, and what takes longer belongs into a thread of the listener's own, as
 the file writer's does. An exception that one raises ends the recording, with everything that came before in the file.
 
-Ranges are corrected by whatever distribution knows how to: uwblink stands below what calibrates, so it does not import
-it. An entry point of the group `uwbcal.corrections` names a function that takes the path of a calibration and returns
-the function which corrects exchanges.
+Ranges are corrected by other distributions, because uwblink does not import packages that depend on it. An entry point
+of the group `uwbcal.corrections` names a function that takes the path of a calibration and returns a function that
+corrects exchanges.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Turn:
 
 
 class Listener:
-    """What a recorder tells. Override what you want to know; as they are, the methods do nothing.
+    """Base of listeners: override the methods that you need; by default they do nothing.
 
     >>> import uwblink, uwbsim
     >>> ports = uwbsim.VirtualPorts(
@@ -131,7 +131,7 @@ class Listener:
         """Note that something went wrong."""
 
     def check(self) -> None:
-        """Raise if there is no point in going on; called often."""
+        """Raise to end the recording; called often."""
 
     def close(self) -> None:
         """End: nothing more will come."""
@@ -164,7 +164,7 @@ def as_listeners(listeners: Iterable[Listener | Callable[[Heard], object]]) -> l
 
 @dataclass(slots=True)
 class PairState:
-    """How a pair has done so far; `recent_s` are the times of its last successes, since the start."""
+    """Statistics of a pair; `recent_s` are the times of its last successes since the start."""
 
     tried: int = 0
     good: int = 0
@@ -181,7 +181,7 @@ class PairState:
 
 @dataclass(slots=True, kw_only=True)
 class Progress(Listener):
-    """Counts for whoever watches. Times in seconds since `start_ns` (host time).
+    """Counts of a recording. Times are in seconds since `start_ns` (host time).
 
     `waiting` pieces of bytes are not in the file yet, whose last commit ended `behind_s` seconds ago.
     """
@@ -231,10 +231,10 @@ class WrongDelayError(PlanError):
 
 
 class DelayCheck(Listener):
-    """Raises `WrongDelayError` where a board's first stamps are of another antenna delay than it is said to have.
+    """Raises `WrongDelayError` if the stamps of a board contradict its given antenna delay.
 
-    A frame leaves on a grid of 512 ticks, and its stamp is that time and the antenna delay: the stamp's rest is the
-    delay's. What is in the register of the receiver shows in no stamp.
+    Frames are sent on a grid of 512 ticks, and their stamp is this time plus the antenna delay, so that both have the
+    same remainder. The receive delay cannot be seen in stamps.
     """
 
     def __init__(self, delays: AntennaDelays) -> None:
@@ -274,14 +274,14 @@ class DelayCheck(Listener):
 
 
 class ReportCheck:
-    """Compares each report with the last one of its pair from the other end."""
+    """Compares each report with the last report of the other board of its pair."""
 
     def __init__(self) -> None:
         """Compare nothing yet."""
         self._last: dict[Pair, tuple[int, RangeReport]] = {}
 
     def add(self, board: int, report: RangeReport) -> str | None:
-        """Take in a board's report; returns what it says otherwise than the other end's, None where nothing."""
+        """Add a report; returns its differences from the report of the other board, None without any."""
         mine = isinstance(report, TargetRangeReport)
         pair = (report.neighbour, board) if mine else (board, report.neighbour)
         before = self._last.pop(pair, None)
@@ -306,9 +306,9 @@ Raises a `ValueError` for exchanges that it cannot correct, as of a tag that is 
 
 
 def load_correction(path: Path) -> Correction:
-    """Return the correction of a calibration's file; raises `PlanError` for what is none, or where nothing corrects.
+    """Return the correction of a calibration file; raises `PlanError`, also if no installed distribution corrects.
 
-    What the correction cannot correct is a `PlanError`, too.
+    The correction itself raises `PlanError`, too.
     """
     found = sorted(entry_points(group="uwbcal.corrections"), key=lambda entry: entry.name)
     if not found:
@@ -328,17 +328,17 @@ def _as_plan_errors() -> Iterator[None]:
 
 
 def delays_warning(correct: Correction | None, delays: AntennaDelays, tags: Iterable[int] | None = None) -> str:
-    """Say where a correction is of other antenna delays than are programmed now; "" where it is not, or not known.
+    """Return a warning if a correction is for other antenna delays than those programmed now; "" if not, or unknown.
 
-    A correction says what it is of by an attribute `antenna_delays`. `tags` are those that range, by default all that
-    it knows.
+    The attribute `antenna_delays` of a correction has its delays. `tags` are the ranging tags, by default all tags of
+    the correction.
     """
     then: AntennaDelays = getattr(correct, "antenna_delays", {})
     return delays_differ(then, delays, (tag for tag in then if tag is not None) if tags is None else tags)
 
 
 def check_pairs(correct: Correction | None, pairs: Sequence[tuple[int, int]]) -> None:
-    """Correct a range of each pair of initiator and target, for what the correction raises where it cannot."""
+    """Correct one range of each pair, so that the correction raises its error for pairs that it cannot correct."""
     if correct and pairs:
         initiator, target = zip(*pairs, strict=True)
         correct(Exchanges.from_arrays(initiator, target, tx1=[0] * len(pairs), rx1=0, tx2=0, rx2=0, range_m=1.0))

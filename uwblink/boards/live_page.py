@@ -29,7 +29,7 @@ from uwblink.recording.schema import Fault
 from uwblink.wire.bulk import exchanges_of
 
 IDLE_S: Final = 10.0
-"""A connection that sends no request for so long is closed: each has a thread."""
+"""Connections without a request for this time are closed, because each has a thread."""
 
 WIDTH, HEIGHT, MARGIN = 260, 44, 3
 """Size of a pair's picture, and of the margin around its lines, in pixels."""
@@ -52,7 +52,7 @@ class Point(NamedTuple):
 
 
 class LivePage(Closing, Listener):
-    """What is going on, as a page. A context manager: leaving it ends the server."""
+    """A page that shows the progress of a recording. A context manager: leaving it ends the server."""
 
     def __init__(self, path: Path, *, correct: Correction | None = None, port: int = 0) -> None:
         """Serve a page about the recording at `path`; port 0 takes any that is free. Raises `PortError`.
@@ -97,7 +97,7 @@ class LivePage(Closing, Listener):
             self._faults.append(fault)
 
     def watch(self, progress: Progress) -> None:
-        """Take over the counts of a recorder."""
+        """Show the counts of a recorder."""
         self._progress = progress
 
     def close(self) -> None:
@@ -118,7 +118,7 @@ class LivePage(Closing, Listener):
         )
 
     def body(self) -> str:
-        """Return what changes: counts, pairs, faults, disk; and the name, as the next recorder may have this port."""
+        """Return the part that changes: name, counts, pairs, faults, disk. The next recorder may have the same port."""
         with self._lock:
             series = {pair: list(points) for pair, points in self._series.items()}
             faults = list(reversed(self._faults))
@@ -136,7 +136,7 @@ class LivePage(Closing, Listener):
         return "".join(parts)
 
     def _disk(self) -> str:
-        """Return how large the file is and how much room is left, and what waits to be written."""
+        """Return the size of the file, the free space, and the number of rows that wait to be written."""
         try:
             size = sum(p.stat().st_size for p in (self._path, Path(f"{self._path}.wal")) if p.exists())
             free = shutil.disk_usage(self._path.parent).free
@@ -203,7 +203,7 @@ def _send(handler: BaseHTTPRequestHandler, text: str) -> None:
 
 
 def _table(progress: Progress, series: Mapping[Pair, Sequence[Point]], *, corrected: bool) -> str:
-    """Return a row a pair; one that has not ranged for two seconds stands out."""
+    """Return a table with one row for each pair; pairs without ranges for two seconds are highlighted."""
     names = ["pair", "rate (Hz)", "success", "range (m)", *(["corrected (m)"] if corrected else []), "FPP (dBm)"]
     head = "".join(f"<th>{name}</th>" for name in names)
     drawn = "<b class='range'>range</b>" + (", <b class='corrected'>corrected</b>" if corrected else "")

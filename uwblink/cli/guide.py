@@ -1,4 +1,4 @@
-"""What guides whoever types a command: examples in its help, panels, and names that a shell completes."""
+"""Help of commands: examples, panels, completion, and options that are made of settings."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _parsed(field: Field[Any], value: Any) -> Any:
 
 
 def apart(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that refuses, before it does anything, to write over its own outputs and inputs."""
+    """Return a command that first checks that its outputs differ from each other and from its inputs."""
 
     @wraps(command)
     def run(**given: Any) -> None:
@@ -190,6 +190,6 @@ def _tags(paths: Iterable[Path]) -> list[int]:
         try:
             with Recording.open(path) as recording:
                 found |= {tag.tag for tag in recording.tags()}
-        except UwblinkError:  # a shell that completes has nobody to tell
+        except UwblinkError:  # completion does not report errors
             continue
     return sorted(found)

@@ -1,4 +1,4 @@
-"""What a command does before anything is imported for it, for all three commands.
+"""Start of the three commands, before their modules are imported.
 
 Nothing heavy is imported here: Ctrl-C is answered while the rest is loaded, which takes some tenths of a second.
 """
@@ -31,7 +31,7 @@ def start(command: Callable[[], NoReturn]) -> NoReturn:
 
 
 def keep_imported() -> None:
-    """Take what was imported so far for what stays to the end: it is never searched for cycles again.
+    """Exclude all objects so far from garbage collection.
 
     For commands that draw: Matplotlib is a hundred thousand objects, and searching them a tenth of a page's time. Not
     where DuckDB is loaded, which looks at the end for what is left of it, and would print what no search found.

@@ -1,4 +1,4 @@
-"""Turns recordings into files that others read: one row a form."""
+"""Export of recordings to files of other formats; programs can register exporters of their own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uwblink.recording.intake import check_name
 
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """A form that a recording can leave in.
+    """A format to which recordings can be exported.
 
     `write(recording, folder)` writes files into an empty folder and returns what each holds, rows by the file's name;
     it raises `RecordingError`.
@@ -51,7 +51,7 @@ EXPORTERS: Final[Registry[Exporter]] = Registry(
 
 
 def register_exporter(row: Exporter, *, replace: bool = False) -> None:
-    """Add a form to `EXPORTERS`: `export_recording` and `uwblink export` then know it.
+    """Add a format to `EXPORTERS`, for `export_recording` and `uwblink export`.
 
     `replace` puts it in place of one registered before. Raises `ArgumentError` for a name that is taken.
     """
@@ -59,7 +59,7 @@ def register_exporter(row: Exporter, *, replace: bool = False) -> None:
 
 
 def check_export(folder: str | os.PathLike[str], *, to: str, force: bool) -> None:
-    """Raise what `export_recording` raises for a form that there is not, or a folder that cannot be written."""
+    """Raise what `export_recording` raises for an unknown format, or a folder that cannot be written."""
     final = Path(folder)
     if to not in EXPORTERS:
         raise ArgumentError(f"found {to!r:.40}, allowed: {', '.join(EXPORTERS)}", parameter="to")

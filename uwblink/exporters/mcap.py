@@ -65,7 +65,7 @@ def _schemas() -> dict[str, dict[str, Any]]:
 
 
 SCHEMAS: Final = _schemas()
-"""What messages hold, as JSON Schema; what is not known is left out of a message."""
+"""JSON Schemas of the messages, which leave out unknown values."""
 
 
 def stamped(time_ns: int, content: dict[str, Any]) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def _readings(table: str, columns: Any) -> Iterator[TimedRow]:
 
 
 def fits_exchanges(held: Contents) -> bool:
-    """Return whether ranges were corrected, and the table of that is that of the exchanges, row by row."""
+    """Return whether the table `corrected` has the same rows as the exchanges."""
     return bool(held.corrected) and all(
         np.array_equal(held.corrected[name], getattr(held.exchanges, name)) for name in ENDS
     )
@@ -141,7 +141,7 @@ def _messages(recording: Recording) -> Iterator[tuple[int, str, str, dict[str, A
 
 
 def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]:
-    """Return what gives the content of one range; `corrected_m` and so on where ranges were corrected."""
+    """Return a function for the content of a range, with `corrected_m` and so on if ranges were corrected."""
     e = replace(held.exchanges, truth_m=np.where(np.isfinite(held.exchanges.truth_m), held.exchanges.truth_m, by_poses))
     columns = {name: getattr(e, name).tolist() for name in ("initiator", "target", "protocol", *_MEASURED)}
     if fits_exchanges(held):
@@ -151,7 +151,7 @@ def _ranges(held: Contents, by_poses: Floats) -> Callable[[int], dict[str, Any]]
 
 
 def _known(row: dict[str, Any]) -> dict[str, Any]:
-    """Leave out numbers that are none: JSON has no word for them."""
+    """Leave out numbers that are not finite, which JSON does not have."""
     return {name: value for name, value in row.items() if not isinstance(value, float) or np.isfinite(value)}
 
 

@@ -40,17 +40,16 @@ def _write(recording: Path, folder: Path, suffix: str, options: str, cells: Mapp
     import duckdb
 
     with Recording.open(recording) as opened:
-        # What every reader checks is checked here too, before the file is read past it.
+        # The checks of every reader, before DuckDB reads the file directly.
         counts = {table: opened.count(table) for table in TABLES}
         by_poses = list(distances_by_poses_m(opened, opened.exchange_blocks())) if counts["poses"] else []
     wanted = {table: folder / f"{table}.{suffix}" for table in TABLES if counts[table] or table == "exchanges"}
-    # What a link leads to has its log beside it, not beside the link.
+    # The log is beside the file, not beside a link to it.
     place = recording.resolve()
     check_log(place)
     try:
-        # What one of several threads is behind with, the others keep in memory; one takes no more processor time, and
-        # for 4 million exchanges as CSV 0.29 GB in place of 0.41 GB (2026-11-22). What is written comes on top of the
-        # memory for what is read.
+        # Several threads buffer rows to keep their order. One takes no more processor time, and 0.29 GB instead of
+        # 0.41 GB for 4 million exchanges as CSV (2026-11-22). The limit is for reading; buffers for writing add to it.
         with connect(paths=[place, log_of(place)], folders=[folder], memory_mb=400, threads=1) as db:
             db.execute(f"ATTACH {_literal(place)} AS source (READ_ONLY)")
             if by_poses:
@@ -83,7 +82,7 @@ def _query(db: duckdb.DuckDBPyConnection, table: str, cells: Mapping[str, str], 
         origin = f"WHEN {measured} IS NOT NULL THEN 'measured' WHEN {by_poses} IS NOT NULL THEN '{BY_POSES}'"
         columns[TRUTH_FROM] = f"CASE {origin} END"
     listed = ", ".join(f'{cell} AS "{name}"' for name, cell in columns.items())
-    # In their order without a word, which DuckDB keeps; asked to sort them it would hold all of them.
+    # DuckDB keeps the order of rows; ORDER BY would hold all of them in memory.
     return f"SELECT {listed} FROM {source}"  # noqa: S608 - keys of TABLES
 
 

@@ -1,4 +1,4 @@
-"""A gate in front of a WebSocket server, which lets viewers in and refuses other web sites.
+"""A proxy in front of a WebSocket server, which refuses connections of other web sites.
 
 Any page in a browser may connect to a WebSocket on this computer and read what comes; the browser only tells the server
 whose page it is (`Origin`) and by which name it found the server (`Host`). A site may point a name of its own at this
@@ -27,7 +27,7 @@ VIEWERS: Final = "foxglove.dev"
 
 
 def hidden_address() -> str:
-    """Return a loopback address that a web site cannot guess, where the system has more than one."""
+    """Return a random loopback address, which web sites cannot guess, on systems with more than one."""
     address = str(ipaddress.IPv4Address(LOOPBACK) + 1 + secrets.randbelow(2**24 - 3))
     with contextlib.suppress(OSError), socket.create_server((address, 0)):
         return address
@@ -77,7 +77,7 @@ class Gate(socketserver.ThreadingTCPServer):
         self.server_close()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing of connections that are lost, which is no error."""
+        """Ignore lost connections."""
         if not isinstance(sys.exception(), OSError | HTTPException):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 

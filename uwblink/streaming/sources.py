@@ -1,4 +1,4 @@
-"""Ranges as they come, corrected: of boards that range now, or of a recording played in its own time."""
+"""Streams of ranges, optionally corrected: from boards, or from a recording in real time."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def stream(
     listeners: Iterable[Listener | Callable[[Heard], object]] = (),
     using: Ports | None = None,
 ) -> Stream:
-    """Yield ranges as they come: of boards at ports, or of a recording in its own time.
+    """Yield ranges as they are measured by boards, or as they were measured in a recording.
 
     `source` is the path of a recording, or names of ports, on which `plan` is played (every two boards in turns without
     one). `calibration` corrects: a file's path, or a function as `uwblink.boards.load_correction` returns. A recording
@@ -216,7 +216,7 @@ def _exchanges(path: Path, correct: Correction | None) -> Exchanges:
         if correct and "calibration" in recording.meta():
             raise ArgumentError(f"{path}: its ranges are corrected already; stream it without `calibration`")
         found = recording.exchanges()
-    if correct and len(found):  # one of each pair, so that what cannot be corrected is told before the first range
+    if correct and len(found):  # one range of each pair, so that errors come before the first range
         correct(found[np.unique(np.column_stack([found.initiator, found.target]), axis=0, return_index=True)[1]])
     return found.in_time_order()
 
@@ -226,7 +226,7 @@ def _play(
 ) -> Stream:
     start_s = time.monotonic()
     first_ns = int(exchanges.time_ns[0]) if len(exchanges) else 0
-    # Some at a time, because as numbers of Python they take ten times the memory.
+    # In blocks, because Python numbers take ten times the memory.
     for start in range(0, len(exchanges), 10_000):
         for found in streamed(exchanges[start : start + 10_000], correct):
             since_s = (found.time_ns - first_ns) * 1e-9
