@@ -18,7 +18,7 @@ import uwblink
 import uwbsim
 from docs.site.commands import leaves
 from tests.boards import served
-from tests.in_process import run
+from tests.processes import run
 from uwblink.cli.guide import WRITTEN
 from uwblink.exporters import export_recording
 
@@ -61,7 +61,7 @@ COMMANDS = (
     ("uwbsim twin {f.uwb} -c {c.json} -o out.toml", 1_000),
     ("uwblink import csv {t.csv} -o out.uwb", 20_000),
     ("uwblink import exported {csv} -o out.uwb", 20_000),
-    ("uwblink import guess {t.csv} -o out.toml", 20),
+    ("uwblink import guess {t.csv} -o out.toml", 100),
     ("uwblink import bag {mcap/recording.mcap} -o out.uwb", 20_000),
     ("uwblink replay {boards.uwb} -o out.uwb", 20_000),
     ("uwblink export {f.uwb} --to csv -o out", 10_000),
@@ -82,10 +82,10 @@ COMMANDS = (
         for form in ("csv", "parquet", "mcap", "rosbag2")
     ),
     *(
-        (f"calib export {{c.json}} --to {form} -o out", 20)
+        (f"calib export {{c.json}} --to {form} -o out", 100)
         for form in ("registers", "firmware", "json", "csv", "miluv", "ros-yaml")
     ),
-    ("calib export {c.json} --to c-header -o out.h", 20),
+    ("calib export {c.json} --to c-header -o out.h", 100),
     ("calib localize {f.uwb} -c {c.json} --tum out", 1_000),
     ("calib compare {c.json} {five.json} --figures out", 1_000),
     ("calib report {f.uwb} -o out.html", 1_000),
@@ -153,9 +153,9 @@ def test_every_output_of_every_command_is_written_onto_a_full_disk():
 @pytest.mark.parametrize(("line", "most_bytes"), COMMANDS)
 def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_bytes):
     words = [str(seeds / word.strip("{}")) if word.startswith("{") else word for word in line.split()]
-    ended = run(*words, folder=tmp_path, most_bytes=most_bytes)
-    said = [text for text in ended.err.splitlines() if not text.startswith("warning: ")]
-    assert ended.status == 2, ended
+    ended = run(*words, cwd=tmp_path, most_bytes=most_bytes)
+    said = [text for text in ended.stderr.splitlines() if not text.startswith("warning: ")]
+    assert ended.returncode == 2, ended
     assert len(said) == 1, ended
     assert said[0].startswith("error: ")
     assert "cannot be" in said[0]
@@ -163,14 +163,14 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(seeds, tmp_path, line, most_
 
 
 def test_where_the_disk_has_room_the_same_commands_write(seeds, tmp_path):
-    assert run("uwblink", "import", "csv", seeds / "t.csv", "-o", "out.uwb", folder=tmp_path).status == 0
-    assert run("uwblink", "show", "out.uwb", folder=tmp_path).out.startswith("out.uwb: ")
+    assert run("uwblink", "import", "csv", seeds / "t.csv", "-o", "out.uwb", cwd=tmp_path).returncode == 0
+    assert run("uwblink", "show", "out.uwb", cwd=tmp_path).stdout.startswith("out.uwb: ")
 
 
 def test_a_folder_that_vanishes_is_one_line(seeds, tmp_path):
-    ended = run("calib", "export", seeds / "c.json", "--to", "csv", "-o", "no/out.csv", folder=tmp_path)
-    assert ended.status == 2
-    assert ended.err.count("\n") == 1
+    ended = run("calib", "export", seeds / "c.json", "--to", "csv", "-o", "no/out.csv", cwd=tmp_path)
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
 
 
 def test_poses_for_which_the_disk_has_no_room_leave_the_recording_as_it_was(seeds, tmp_path):
@@ -178,10 +178,10 @@ def test_poses_for_which_the_disk_has_no_room_leave_the_recording_as_it_was(seed
     flight = uwblink.load(seeds / "f.uwb")
     replace(flight, poses=flight.poses[:0]).save(path)
     source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
-    ended = run("uwblink", "poses", path, *source, folder=tmp_path, most_bytes=1000)
-    assert ended.status == 2, ended
-    assert ended.err.count("\n") == 1
-    assert "cannot be written" in ended.err
+    ended = run("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=1000)
+    assert ended.returncode == 2, ended
+    assert ended.stderr.count("\n") == 1
+    assert "cannot be written" in ended.stderr
     # DuckDB's log of the update that failed may lie beside it, until the recording is next written to.
     assert {each.name for each in tmp_path.iterdir()} <= {"f.uwb", "f.uwb.wal"}
     after = uwblink.load(path)
@@ -194,11 +194,11 @@ def test_poses_that_fit_into_the_log_alone_are_kept_in_it(seeds, tmp_path):
     flight = uwblink.load(seeds / "f.uwb")
     replace(flight, poses=flight.poses[:0]).save(path)
     source = [word for body in ("ifo001", "ifo002") for word in ("--from", f"{body}={seeds / 'tum' / body}.tum")]
-    ended = run("uwblink", "poses", path, *source, folder=tmp_path, most_bytes=path.stat().st_size + 20_000)
-    assert ended.status == 2, ended
-    assert ended.err.count("\n") == 1
-    assert "cannot be completed" in ended.err
-    assert "keep the two together" in ended.err
+    ended = run("uwblink", "poses", path, *source, cwd=tmp_path, most_bytes=path.stat().st_size + 20_000)
+    assert ended.returncode == 2, ended
+    assert ended.stderr.count("\n") == 1
+    assert "cannot be completed" in ended.stderr
+    assert "keep the two together" in ended.stderr
     assert {each.name for each in tmp_path.iterdir()} == {"f.uwb", "f.uwb.wal"}
     after = uwblink.load(path)
     assert len(after.exchanges) == len(flight.exchanges)
@@ -210,23 +210,23 @@ def test_a_stream_for_which_the_disk_has_no_room(tmp_path, most_bytes, said, kep
     """It is full when the recording begins, or when all has been written to the log and is put into the file."""
     with served() as server:
         words = ["uwblink", "stream", *server.names.values(), "-o", "out.uwb", "--duration", "1.5", "--rate", "100"]
-        ended = run(*words, folder=tmp_path, most_bytes=most_bytes)
-    assert ended.status == 2, ended
-    assert ended.err.count("\n") == 1
-    assert (said or "cannot be completed (") in ended.err
+        ended = run(*words, cwd=tmp_path, most_bytes=most_bytes)
+    assert ended.returncode == 2, ended
+    assert ended.stderr.count("\n") == 1
+    assert (said or "cannot be completed (") in ended.stderr
     if not kept:
         assert list(tmp_path.iterdir()) == []
         return
     assert (tmp_path / "out.uwb").stat().st_size == most_bytes
     # On a busy machine there are few, and an answer that came too late is in the file alone.
-    assert len(uwblink.load(tmp_path / "out.uwb").exchanges) >= len(ended.out.splitlines()) > 0
+    assert len(uwblink.load(tmp_path / "out.uwb").exchanges) >= len(ended.stdout.splitlines()) > 0
 
 
 def test_a_plot_of_a_board_for_which_the_disk_has_no_room(tmp_path):
     with served() as server:
         here, there, *_ = server.names
         words = ["uwblink", "cir", server.names[here], there, "--plot", "out.png"]
-        ended = run(*words, folder=tmp_path, most_bytes=1000)
-    assert ended.status == 2, ended
-    assert ended.err == "error: out.png: cannot be written (File too large)\n"
+        ended = run(*words, cwd=tmp_path, most_bytes=1000)
+    assert ended.returncode == 2, ended
+    assert ended.stderr == "error: out.png: cannot be written (File too large)\n"
     assert list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ import pytest
 import calib
 import uwblink
 import uwbsim
-from tests.in_process import run
+from tests.processes import run
 from uwblink.database import STORAGE_VERSION
 
 ROOT = Path(__file__).parents[1]
@@ -50,11 +50,11 @@ def place(seeds, tmp_path):
 
 def refused(ended, *named):
     """Whether a command ended with one line and status 2, which names what it must and quotes no secret."""
-    assert ended.status == 2, ended
-    assert ended.err.count("\n") == 1, ended
-    assert SECRET not in ended.out + ended.err
+    assert ended.returncode == 2, ended
+    assert ended.stderr.count("\n") == 1, ended
+    assert SECRET not in ended.stdout + ended.stderr
     for name in named:
-        assert str(name) in ended.err
+        assert str(name) in ended.stderr
     return True
 
 
@@ -180,9 +180,9 @@ def test_an_allowed_folder_holds_files_of_scenarios(place):
     (place / "other" / "slots.csv").write_text("time_s,initiator,target\n0,1,2\n0.1,2,3\n")
     linked(place, "outside")
     words = ["s/s.toml", "--set", "ranging.plan={file='../other/slots.csv'}"]
-    assert refused(run("uwbsim", "validate", *words, folder=place), "ranging.plan.file", "--allow-files")
-    done = run("uwbsim", "validate", *words, "--allow-files", "other", folder=place)
-    assert done.status == 0, done
+    assert refused(run("uwbsim", "validate", *words, cwd=place), "ranging.plan.file", "--allow-files")
+    done = run("uwbsim", "validate", *words, "--allow-files", "other", cwd=place)
+    assert done.returncode == 0, done
     loaded = uwbsim.load(place / "s" / "s.toml", {"ranging.plan": {"file": "../other/slots.csv"}},
                          allow_files=[place / "other"])  # fmt: skip
     assert loaded.ranging.plan.model_dump()["slots"] == ((0.0, 1, 2), (0.1, 2, 3))
@@ -196,7 +196,7 @@ def test_a_sweep_reaches_no_scenario_that_nobody_named(place):
         assert refused(run("uwbsim", "sweep", plan, "-o", place / "out", "--workers", 1), plan, "sweep.scenario")
     plan.write_text("sweep = { scenario = '../s.toml', protocols = ['ds'], ranges = 10 }\n")
     words = ["sweep", plan, "-o", place / "out", "--workers", 1, "--allow-files", place]
-    assert run("uwbsim", *words).status == 0
+    assert run("uwbsim", *words).returncode == 0
 
 
 @pytest.mark.parametrize("design", ["grid", "latin-hypercube"])
@@ -231,7 +231,7 @@ def test_what_lies_beside_a_recording_leads_nowhere(place, kind, beside, words):
     else:
         log.symlink_to("secret.txt" if kind == "link" else "new.txt")
     before = names(place)
-    assert refused(run(*words, folder=place), log.name)
+    assert refused(run(*words, cwd=place), log.name)
     assert (place / "secret.txt").read_text() == SECRET
     assert names(place) == before
 
@@ -280,9 +280,9 @@ def hostile(tmp_path_factory):
 
 @pytest.mark.parametrize("line", PRINTING)
 def test_what_a_file_says_steers_nothing(hostile, line):
-    ended = run(*line.split(), folder=hostile)
-    assert ended.status in (0, 2), ended
-    assert all(c.isprintable() or c == "\n" for c in ended.out + ended.err), ended
+    ended = run(*line.split(), cwd=hostile)
+    assert ended.returncode in (0, 2), ended
+    assert all(c.isprintable() or c == "\n" for c in ended.stdout + ended.stderr), ended
     assert not list(hostile.parents[2].rglob("evil*"))
     for page in hostile.glob("*.html"):
         assert "<script>alert" not in page.read_text()
@@ -308,8 +308,8 @@ def test_outputs_go_through_no_planted_link(place, line, output):
         link.unlink(missing_ok=True)
         if "--force" in line or name != path.name or output.startswith("results"):
             link.symlink_to(secret)
-    ended = run(*line.split(), folder=place)
-    assert ended.status == 0, ended
+    ended = run(*line.split(), cwd=place)
+    assert ended.returncode == 0, ended
     assert secret.read_text() == SECRET
     assert not path.is_symlink()
     assert path.exists()
@@ -328,7 +328,7 @@ def test_no_name_of_a_partial_file_can_be_guessed(place):
 
 def test_a_name_may_be_as_long_as_the_file_system_takes(tmp_path):
     name = "n" * 240 + ".uwb"
-    assert run("calib", "sample", "-o", tmp_path / name, "-n", 30).status == 0
+    assert run("calib", "sample", "-o", tmp_path / name, "-n", 30).returncode == 0
     assert names(tmp_path) == [name]
 
 
@@ -378,7 +378,7 @@ def test_a_log_left_by_the_file_that_is_replaced_goes_with_it(place):
         recording.append_tags([uwblink.Tag(7, "old", (0.0, 0.0, 0.0))])
         shutil.copy(place / "old.uwb", path)
         shutil.copy(place / "old.uwb.wal", place / "f.uwb.wal")
-    assert run("calib", "sample", "-o", path, "-n", 100, "--force").status == 0
+    assert run("calib", "sample", "-o", path, "-n", 100, "--force").returncode == 0
     assert 7 not in {tag.tag for tag in uwblink.load(path).tags}
 
 
@@ -411,7 +411,7 @@ def test_what_is_written_the_lowest_allowed_version_reads(place):
     assert f'"duckdb>={STORAGE_VERSION.removeprefix("v").rpartition(".")[0]}.' in text
     with uwblink.Recording.create(place / "live.uwb", live=True) as recording:
         recording.snapshot(place / "snapshot.uwb")
-    assert run("calib", "sample", "-o", place / "sample.uwb", "-n", 100).status == 0
+    assert run("calib", "sample", "-o", place / "sample.uwb", "-n", 100).returncode == 0
     made = [*place.glob("*.uwb"), place / "results" / "results.duckdb"]
     assert {path.name: storage(path) for path in made} == {path.name: STORAGE_OF_1_5 for path in made}
     assert len(made) == 5

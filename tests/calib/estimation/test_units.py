@@ -7,7 +7,7 @@ import pytest
 
 import calib
 from tests.calib import synthetic
-from tests.in_process import run
+from tests.processes import run
 from uwblink.recording.file import Recording
 
 
@@ -51,6 +51,6 @@ def test_the_command_writes_nothing_and_ends_with_1(tmp_path, change):
         recording.append_poses(poses)
         recording.append_tags(flight.tags)
     done = run("calib", "fit", tmp_path / "flight.uwb", "-o", tmp_path / "c.json")
-    assert done.status == 1
-    assert ("millimetres" if change == "poses" else "dBm") in done.err
+    assert done.returncode == 1
+    assert ("millimetres" if change == "poses" else "dBm") in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["flight.uwb"]

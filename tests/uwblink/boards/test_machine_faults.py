@@ -1,6 +1,7 @@
 """The recorder while its machine misbehaves: clocks are set, the process is stopped, its file or folder goes away."""
 
 import os
+import subprocess
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.boards import bench_scenario, served
-from tests.in_process import Ended, run
+from tests.processes import run
 from uwblink.boards.listeners import Listener
 from uwblink.boards.ports import SerialPorts
 from uwblink.boards.ranging_plan import RangingPlan
@@ -167,7 +168,7 @@ def test_a_folder_made_read_only_under_the_recorder_takes_nothing_away():
 
 def test_two_recorders_cannot_have_one_file(tmp_path):
     path = tmp_path / "f.uwb"
-    found: list[Ended] = []
+    found: list[subprocess.CompletedProcess[str]] = []
 
     def second():
         with served() as other:
@@ -177,10 +178,10 @@ def test_two_recorders_cannot_have_one_file(tmp_path):
 
     ports = VirtualPorts(bench_scenario())
     record(ports.names.values(), path, RangingPlan(), duration_s=2.0, using=ports, listeners=[After(t20=second)])
-    assert [ended.status for ended in found] == [2, 2, 2]
-    assert "exists already" in found[0].err
+    assert [ended.returncode for ended in found] == [2, 2, 2]
+    assert "exists already" in found[0].stderr
     for ended in found[1:]:
-        assert ended.err == f"error: {path}: another process is writing it; give another name\n"
+        assert ended.stderr == f"error: {path}: another process is writing it; give another name\n"
     exchanges, kinds = exchanges_of(path)
     assert len(exchanges) > 50
     assert kinds == []

@@ -13,7 +13,7 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from tests.in_process import CONTEXT, run
+from tests.processes import CONTEXT, run
 from tests.uwbsim.sweep.test_sweep import HEAD, plan, rows
 from uwblink.errors import UwblinkError
 from uwbsim.sweep.executors import ClusterLostError
@@ -107,12 +107,12 @@ def test_two_sweeps_cannot_have_one_folder(done):
 def test_a_full_disk_ends_a_sweep_with_one_line_and_keeps_what_was_done(tmp_path):
     plan(tmp_path, SMALL)
     ended = run("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1", most_bytes=8000)
-    assert ended.status == 2, ended
-    assert ended.err.count("\n") == 1
+    assert ended.returncode == 2, ended
+    assert ended.stderr.count("\n") == 1
     assert not (tmp_path / "out" / "results.csv").exists()
     # Once there is room again, the same command does it.
     (tmp_path / "out" / "results.duckdb").unlink(missing_ok=True)
-    assert run("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1").status == 0
+    assert run("uwbsim", "sweep", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", "1").returncode == 0
 
 
 SCHEDULER = """
@@ -166,9 +166,9 @@ def test_results_of_another_version_are_not_gone_on_with(done):
     p, out = done
     with_sql("UPDATE identity SET value = '\"0.0.1\"' WHERE key = 'uwbcal'")(out / "results.duckdb")
     ended = run("uwbsim", "sweep", p.path, "-o", out, "--workers", 1, "--resume")
-    assert ended.status == 2, ended
-    assert str(out) in ended.err
-    assert "0.0.1" in ended.err
+    assert ended.returncode == 2, ended
+    assert str(out) in ended.stderr
+    assert "0.0.1" in ended.stderr
 
 
 ENDLESS = "sweep = { scenario = 'noiseless', protocols = ['ds'], ranges = 20000, seeds = 100000 }\n"
