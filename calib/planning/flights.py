@@ -17,15 +17,12 @@ from calib.data.sources import Data
 from calib.errors import BadInputError
 from calib.planning.flight_information import Errors, Flight, Predicted, flight_of
 from calib.planning.reference_motion import reference_motion
-from calib.planning.result import FlightPlan, NextBest
+from calib.planning.result import FlightPlan, NextBest, mean_std_ns
 from calib.planning.settings import FlightPlanSettings
 from calib.spread import TWO_SIDED_95
 from calib.trajectories.fitting import usable_of
 from calib.trajectories.scene import Usable
 from uwblink.arrays import Floats
-
-GUESS_NS = 1.5
-"""How far a delay is known without any data, for means over tags of which some are not determined."""
 
 MORE_KNOWN_S = 10.0
 MORE_ANCHORS = 4
@@ -134,9 +131,8 @@ def _plan(asked: FlightPlanSettings, data: Data | None) -> FlightPlan:
 
 
 def _mean_ns(covariance: Floats) -> float:
-    """Return the root mean square of half intervals, of which each is known to `GUESS_NS` at worst."""
-    information = np.linalg.pinv(covariance, hermitian=True) + np.eye(len(covariance)) / GUESS_NS**2
-    return TWO_SIDED_95 * float(np.sqrt(np.trace(np.linalg.inv(information)) / len(covariance)))
+    """Return the root mean square of half intervals, of which each is known to a guess at worst."""
+    return TWO_SIDED_95 * mean_std_ns(np.asarray(np.linalg.pinv(covariance, hermitian=True), np.float64))
 
 
 def _more(asked: FlightPlanSettings, flight: Flight, found: Predicted) -> Iterator[NextBest]:

@@ -7,10 +7,24 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from calib.information import Verdict
 from calib.planning.settings import FlightPlanSettings
 from calib.trajectories.scene import Usable
 from uwblink.arrays import Floats
+
+GUESS_NS = 1.5
+"""How far a delay is known without any data: means over tags are finite then, though some are not determined."""
+
+
+def mean_std_ns(information: Floats) -> float:
+    """Return the root mean variance of delays, ns, from what data tell of them (tags, tags), 1/ns^2, beside the guess.
+
+    Rounded, so that mirror images are equally good on every machine and the first of them is taken.
+    """
+    whole = information + np.eye(len(information)) / GUESS_NS**2
+    return round(float(np.sqrt(np.trace(np.linalg.inv(whole)) / len(whole))), 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +101,9 @@ class _Plan:
             yield from (f"not determined: {direction.words}" for direction in self.verdict.free)
 
     def _next_lines(self) -> Iterator[str]:
-        for best in self.next_best:
-            yield f"next best: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}"
+        for k, best in enumerate(self.next_best):
+            first = "or" if k else "next best"
+            yield f"{first}: {best.what}: ± {best.mean_ns:.3f} ns on average, not {best.instead_of_ns:.3f}"
 
     def _common_dict(self) -> dict[str, Any]:
         """Return what plans of both kinds have, as JSON takes it; null where nothing is determined."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,12 @@ from calib.planning.predicted import (
     random_layouts,
     verdict_on_delays,
 )
-from calib.planning.result import Halves, NextBest, Plan, PlannedArrangement
+from calib.planning.result import Halves, NextBest, Plan, PlannedArrangement, mean_std_ns
 from calib.planning.settings import SurveyPlanSettings
 from calib.spread import TWO_SIDED_95
 from calib.surveys.outcome import students_factor
 from uwblink.arrays import Floats
 
-NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 RANGES_A_PAIR = 20
 """Noise of 4 cm leaves 9 mm in a mean of so many, which adds a tenth to a pair's constant error of 2 cm."""
 
@@ -37,9 +37,6 @@ MOST_ARRANGEMENTS = 12
 
 WORTH_IT = 0.06
 """Share by which one arrangement more must narrow the mean interval to be planned, where no number is given."""
-
-GUESS_NS = 1.5
-"""How far a delay is known without any data, for the choice alone."""
 
 
 def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None, **changes: Any) -> Plan:
@@ -69,7 +66,7 @@ def plan(boards: int | Sequence[int], settings: SurveyPlanSettings | None = None
         best = _best_tape(inputs, chosen)
         if best is not None:
             chosen[best[0]] = best[1]
-    made = tuple(_named(NAMES[k], layout, inputs.tags) for k, layout in enumerate(chosen))
+    made = tuple(_named(ascii_uppercase[k], layout, inputs.tags) for k, layout in enumerate(chosen))
     seconds = max(30.0, math.ceil(RANGES_A_PAIR * math.comb(len(inputs.tags), 2) / rate_hz / 10) * 10.0)
     predictions = predict(inputs, chosen)
     after = [
@@ -104,8 +101,8 @@ def _choose(informations: list[Floats], count: int | None) -> list[int]:
     while len(found) < (count or MOST_ARRANGEMENTS):
         # The same once more would have the same errors, unless boards were taken away in between.
         left = [k for k in range(len(informations)) if k not in found] or list(range(len(informations)))
-        best = min(left, key=lambda k: _mean_std(total + informations[k]))
-        before, after = _mean_std(total), _mean_std(total + informations[best])
+        best = min(left, key=lambda k: mean_std_ns(total + informations[k]))
+        before, after = mean_std_ns(total), mean_std_ns(total + informations[best])
         if count is None and len(found) >= 2 and after > (1 - WORTH_IT) * before:
             break
         found.append(best)
@@ -124,18 +121,9 @@ def _best_tape(inputs: SurveyPlanSettings, chosen: list[Layout]) -> tuple[int, L
                 continue
             taped = replace(layout, taped=(*layout.taped, pair))
             after = total - each[k] + delay_information(inputs, taped)
-            if best is None or _mean_std(after) < best[0]:
-                best = _mean_std(after), k, taped, pair, after
+            if best is None or mean_std_ns(after) < best[0]:
+                best = mean_std_ns(after), k, taped, pair, after
     return None if best is None else best[1:]
-
-
-def _mean_std(information: Floats) -> float:
-    """Return the root mean variance of the delays, ns, of which a little is known without any data.
-
-    Rounded, so that mirror images are equally good on every machine and the first of them is taken.
-    """
-    guess = np.eye(len(information)) / GUESS_NS**2
-    return round(float(np.sqrt(np.trace(np.linalg.inv(information + guess)) / len(information))), 8)
 
 
 def _total(inputs: SurveyPlanSettings, chosen: Sequence[Layout]) -> Floats:
@@ -162,15 +150,15 @@ def _next_best(
 ) -> list[NextBest]:
     """Return the next arrangement and the next taped distance, the one that brings more first."""
     wide, total = _interval(inputs, chosen), _total(inputs, chosen)
-    now = wide * _mean_std(total)
-    k = min(range(len(candidates)), key=lambda k: _mean_std(total + informations[k]))
-    more = _named(NAMES[min(len(chosen), len(NAMES) - 1)], candidates[k], inputs.tags)
-    found = [NextBest(f"an arrangement {more.where(inputs.on)}", wide * _mean_std(total + informations[k]), now)]
+    now = wide * mean_std_ns(total)
+    k = min(range(len(candidates)), key=lambda k: mean_std_ns(total + informations[k]))
+    more = _named(ascii_uppercase[min(len(chosen), len(ascii_uppercase) - 1)], candidates[k], inputs.tags)
+    found = [NextBest(f"an arrangement {more.where(inputs.on)}", wide * mean_std_ns(total + informations[k]), now)]
     best = _best_tape(inputs, chosen)
     if best is not None:
         number, _, (i, j), after = best
-        what = f"the distance of {inputs.tags[i]} and {inputs.tags[j]} in {NAMES[number]} by tape"
-        found.append(NextBest(what, wide * _mean_std(after), now))
+        what = f"the distance of {inputs.tags[i]} and {inputs.tags[j]} in {ascii_uppercase[number]} by tape"
+        found.append(NextBest(what, wide * mean_std_ns(after), now))
     return sorted((one for one in found if one.mean_ns < now), key=lambda one: one.mean_ns)
 
 
