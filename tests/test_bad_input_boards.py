@@ -102,7 +102,7 @@ def test_replays_of_what_has_no_bytes(tmp_path):
         ("[[faults]]\nkind = 'flood'", ["faults", "flood"]),
         ("[[faults]]\nkind = 'hang'\ntag = 99\nat_s = 1", ["faults[0].tag", "99", "10, 20"]),
         ("[[faults]]\nkind = 'lose-frames'\nshare = 2", ["share"]),
-        ("faults = [", ["cannot be read"]),
+        ("faults = [", ["not valid TOML"]),
     ],
 )
 def test_faults_that_cannot_be(tmp_path, text, fragments):
