@@ -49,6 +49,9 @@ LOUD_M: Final = 0.3
 CUTS: Final = 47
 """Times at which a delay is tested for a change: so close that a step between two of them loses 1 % of its size."""
 
+MARGIN: Final = 0.06
+"""Part of a recording at either end in which no change is looked for: two of the stretches of time of its scores."""
+
 MOST_COLUMNS: Final = 2500
 """Shifts of pairs at several times that are tested together: their covariance takes 50 MB."""
 
@@ -124,7 +127,8 @@ def changed_delays(view: RecordingView) -> Iterator[Candidate]:
     fit = view.quick_fit
     if fit is None or fit.time_s[-1] < SHORTEST_S:
         return
-    cuts = np.linspace(0, fit.time_s[-1], min(CUTS, MOST_COLUMNS // len(fit.ends)) + 2)[1:-1]
+    several = min(CUTS, MOST_COLUMNS // len(fit.ends))
+    cuts = fit.time_s[-1] * np.linspace(MARGIN, 1 - MARGIN, several)
     for shift in shifts(fit, fit.time_s[:, None] >= cuts):
         mine = fit.of_tag(shift.tag)
         time_s, rest, late = fit.time_s[mine], fit.clipped[mine], shift.late[mine]
