@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 LIFTS: Final = ("mean-of-lifted", "lift-of-mean")
 CONSTANTS: Final = ("tag", "pair")
+FOLDS: Final = ("time", "pair", "session")
 HIGHEST_TAG: Final = 65_535
 """Ids of tags have 16 bits in recordings."""
 
@@ -104,7 +105,9 @@ class FitSettings:
     fits delays first and then the curve to what they leave (ICRA 2023, sections III and IV). `minimum_norm` fits the
     smallest delays that agree with the data where the pairs leave delays free. The curve is zero at
     `reference_power_dbm`, `alpha_dbm` by default; `delays_only` fits no curve; `delays_from` is a calibration, or its
-    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay.
+    path, whose delays are taken over; `constants` "pair" gives each pair a constant instead of each tag a delay. With
+    `hold_out` a second fit, to the other ranges, is judged on such a share of them, by `fold`; what was found is in the
+    provenance of the calibration, which is fitted to all.
 
     >>> import calib
     >>> settings = calib.FitSettings(loss="huber", fixed_ns={1: -0.3})
@@ -195,8 +198,27 @@ class FitSettings:
         rich_help_panel=MODEL_PANEL,
     )
 
+    hold_out: float = setting(
+        0.0,
+        "Share of the data by which a second fit, to the others, is judged: 0.3, for instance.",
+        metavar="SHARE",
+        rich_help_panel=MODEL_PANEL,
+    )
+    fold: str = setting(
+        "time",
+        "What is held out: tenths of each session's time, pairs, or sessions.",
+        names=FOLDS,
+        rich_help_panel=MODEL_PANEL,
+    )
+
+    def _check_hold_out(self) -> None:
+        check_choice("fold", self.fold, FOLDS)
+        if not (_is_finite(self.hold_out) and 0 <= self.hold_out <= 0.9):
+            raise BadInputError(f"found {self.hold_out!r}, expected a share, 0 to 0.9", parameter="hold_out")
+
     def __post_init__(self) -> None:
         """Check the settings; whether a loss is known, the fit checks."""
+        self._check_hold_out()
         check_choice("lift", self.lift, LIFTS)
         check_choice("constants", self.constants, CONSTANTS)
         if self.scale_ns is not None and not (_is_finite(self.scale_ns) and self.scale_ns > 0):

@@ -369,6 +369,19 @@ def rests_on(provenance: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
+def held_out_line(calibration: Calibration) -> str:
+    """Return how a fit without the ranges that were held out did on them, "" where none were."""
+    told = calibration.provenance.get("held_out")
+    if not isinstance(told, Mapping):
+        return ""
+    inside = "" if told["inside_95"] is None else f", {100 * told['inside_95']:.0f} % within their 95 % intervals"
+    return (
+        f"judged on {told['ranges']} ranges held out by {told['fold']}: median {100 * told['raw_median_m']:+.1f} to "
+        f"{100 * told['median_m']:+.1f} cm, robust deviation {100 * told['raw_robust_std_m']:.1f} to "
+        f"{100 * told['robust_std_m']:.1f} cm{inside}"
+    )
+
+
 def _listed(names: object, one: str, many: str) -> str:
     count = len(names) if isinstance(names, list) else 0
     return f"{count} {one if count == 1 else many}"

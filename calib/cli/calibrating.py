@@ -111,6 +111,10 @@ def fit(
             typer.echo(line)
         for reason, number in result.ranges.excluded.items():
             typer.echo(f"  left out: {number} exchanges, {reason}")
+        from calib.calibration import held_out_line
+
+        if told := held_out_line(found):
+            typer.echo(f"  {told}")
         for warning in result.warnings:
             warn(warning)
     if not result.success:

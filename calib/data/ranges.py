@@ -386,3 +386,28 @@ def without_static(ranges: Ranges, *, span_s: float = 2.0, within_m: float = 0.0
         raise UnanswerableError(f"{ranges.source}: nothing moves, so `trim_static` leaves nothing")
     count = int(np.count_nonzero(~moves))
     return replace(ranges[moves], excluded=ranges.excluded | ({STATIC: count} if count else {}))
+
+
+def held_out(ranges: Ranges, share: float, fold: str) -> Bools:
+    """Return which ranges (n,) are held out: evenly spread tenths of each session's time, pairs, or sessions.
+
+    Raises `UnanswerableError` where that leaves nothing to fit or nothing to judge by.
+    """
+    if fold == "pair":
+        ends = np.sort(np.column_stack([ranges.initiator, ranges.target]), axis=1)
+        unit = np.unique(ends, axis=0, return_inverse=True)[1].ravel()
+    elif fold == "session":
+        unit = np.unique(ranges.session, return_inverse=True)[1]
+    else:
+        unit = np.empty(len(ranges), dtype=np.int64)
+        for number, session in enumerate(np.unique(ranges.session).tolist()):
+            mine = ranges.session == session
+            since = ranges.time_ns[mine] - ranges.time_ns[mine].min()
+            unit[mine] = 10 * number + np.minimum(10 * since // max(int(since.max()), 1), 9)
+    found = np.floor((unit + 1) * share + 1e-9) > np.floor(unit * share + 1e-9)
+    if not found.any() or found.all():
+        raise UnanswerableError(
+            f"{ranges.source}: {share:g} of its {int(unit.max()) + 1} parts by {fold} leaves nothing to fit or "
+            "nothing to judge by; choose another share or fold"
+        )
+    return np.asarray(found)

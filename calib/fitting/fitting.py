@@ -21,11 +21,12 @@ from calib.checks.fitted import examine_fit
 from calib.checks.limits import limits, warnings_of
 from calib.checks.plausibility import implausible, one_way, refuse_impossible, refuse_refuted
 from calib.checks.power_levels import unlike_powers
-from calib.data.ranges import Ranges
+from calib.data.ranges import Ranges, held_out
 from calib.data.sources import Data, load_ranges
 from calib.estimator.known_distances import KnownDistances, Recipe, fit_known_distances
 from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
+from calib.evaluation.statistics import evaluate
 from calib.fitting.known_delays import imported, std_taken_over, taken_over
 from calib.fitting.result import FitResult
 from calib.settings import FitSettings
@@ -119,6 +120,8 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
         "corrected": float(np.std(residuals)),
     }
+    if settings.hold_out:
+        provenance["held_out"] = _judged(ranges, settings)
     return FitResult(
         calibration=replace(calibration, provenance=provenance),
         ranges=ranges,
@@ -128,6 +131,23 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
         warnings=warnings,
     )
+
+
+def _judged(ranges: Ranges, settings: FitSettings) -> dict[str, Any]:
+    """Return how a fit to a part of the ranges does on those that are held out, for the provenance."""
+    rows = held_out(ranges, settings.hold_out, settings.fold)
+    part = fit(ranges[~rows], settings, hold_out=0.0)
+    found = evaluate(ranges[rows], part.calibration).overall
+    return {
+        "share": settings.hold_out,
+        "fold": settings.fold,
+        "ranges": found.full.n,
+        "raw_median_m": found.raw.median_m,
+        "median_m": found.full.median_m,
+        "raw_robust_std_m": found.raw.robust_std_m,
+        "robust_std_m": found.full.robust_std_m,
+        "inside_95": None if np.isnan(found.inside_95) else found.inside_95,
+    }
 
 
 def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools, Floats]:
