@@ -62,8 +62,13 @@ pythons: ## run the whole test suite on other Pythons, with the locked versions;
 fuzz: setup ## run commands on 2000 damaged files and options (10 minutes)
 	$(BIN)/python -m tests.fuzz.commands
 
-mutants: setup ## put faults into the code, 40 a file, and name those that no test notices (30 minutes)
-	$(BIN)/python -m tests.mutants --each 40
+mutants: ## put faults into the code (mutmut) and name those that no test notices; FAULTS="uwblink.twr.*" limits them
+	$(PYTHON) -m venv .venv-mutants
+	.venv-mutants/bin/python -m pip install $(LOCKED)
+	.venv-mutants/bin/python -m pip install $(ITSELF)
+	.venv-mutants/bin/python -m pip install --quiet --disable-pip-version-check mutmut==3.8.1
+	.venv-mutants/bin/mutmut run --max-children 2 $(FAULTS)
+	.venv-mutants/bin/mutmut results
 
 lint: setup ## check style (ruff) and types (mypy)
 	$(BIN)/ruff check .
