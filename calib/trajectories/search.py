@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy import sparse
 
-from calib.estimator.inverse import Matrix, SparseInverse
 from calib.estimator.optimize import Optimum, maximize
-from calib.estimator.range_model import RangeModel
+from calib.estimator.range_model import NOISE_M, NOISE_WORTH, RangeModel
 from calib.estimator.range_rows import RESIDUAL, Errors, Mixture, Part, RangeRows
-from calib.estimator.rows import NormalRows, Rows, sum_rows
+from calib.estimator.rows import NormalRows, Rows
 from calib.estimator.unknowns import Layout, Priors, Unknown
 from calib.spread import robust_spread
 from calib.trajectories.motion import Distances, Motion, TapeRows, known_rows
@@ -38,9 +38,15 @@ FIRST_SCALE_M, LEAST_SCALE_M = 0.15, 0.01
 ROUNDS = 3
 """Rounds in which the scale of a loss, or the share of ranges that paths use up, is found again."""
 
-MOST_USED = 0.8
+LITTLE_TAKEN, MOST_TAKEN = 0.5, 0.9
+"""Ranges of which unknowns take no more say what errors are; shares are held below the most, as roots are divided by
+what is left."""
+
 FEWEST_A_PAIR = 15
-"""Of fewer ranges a pair on average nobody can tell what their errors are made of: they keep Cauchy's likelihood."""
+"""Of fewer ranges a pair on average, beside those that paths use up, errors of all pairs are taken to be alike."""
+
+MOST_TURNS, STILL = 8, 0.1
+"""Turns in which motion and errors are fitted, at most; the last moves no delay by more of its standard error."""
 
 FINEST_S = 0.11
 """Control points are not put twice as densely again below this."""
@@ -117,7 +123,7 @@ def settle(
 class Found:
     """The top: all unknowns, and what is needed to judge them.
 
-    `used` is the share of the ranges that paths and attitudes use up, `coarse` how much of motion they leave out.
+    `used` is the share of the ranges that the unknowns use up, `coarse` how much of motion they leave out.
     """
 
     scene: Scene
@@ -151,7 +157,8 @@ class _Search:
         self, scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]
     ) -> None:
         self.model, self.error_m, self.done = model, error_m, done
-        self.motion, self.origin, self.used, self.steps = Motion.of(scene), start, 0.0, 0
+        self.motion, self.origin, self.steps = Motion.of(scene), start, 0
+        self.taken: Floats = np.zeros(len(error_m))
         self.weights: dict[tuple[str, int], float] = {}
         self.values: dict[str, Floats] = dict(start)
         self.build(Cauchy(FIRST_SCALE_M))
@@ -183,20 +190,18 @@ class _Search:
         """Return kind and number of each prior."""
         return [(block.kind, k) for block in self.layout.blocks for k in range(len(block.priors))]
 
-    def climb(self, *, evidence_steps: int = 12, tolerance: float = 0.1) -> Optimum:
-        """Go to the top, and see what paths use up of the ranges there."""
+    def climb(self, *, evidence_steps: int = 12, tolerance: float = 0.1, steps: int = 60) -> Optimum:
+        """Go to the top, and see what the unknowns use up of the ranges there."""
         rows: list[Rows] = [replace(self.rows, errors=self.errors), *self.known.values(), *self.gauge]
         asked = self.layout.indices(["delay", *self.model.curve_kinds()])
         found = maximize(
-            rows, self.priors, self.x, steps=60, evidence_steps=evidence_steps, tolerance=tolerance, asked=asked
+            rows, self.priors, self.x, steps=steps, evidence_steps=evidence_steps, tolerance=tolerance, asked=asked
         )
         self.x, self.steps = found.x, self.steps + found.steps
         self.rows = replace(self.rows, errors=self.errors)
         self.values = {kind: found.x[where] for kind, where in self.layout.where.items()}
         self.weights = dict(zip(self._keys(), self.priors.weights, strict=True))
-        own = self.layout.indices(MOTION)
-        information = sum_rows([self.rows], found.x).information
-        self.used = min(_trace(found, information, own) / len(self.rows), MOST_USED)
+        self.taken = taken_shares(self.rows, found)
         self.done(1 - 0.97**self.steps)
         return found
 
@@ -206,12 +211,27 @@ class _Search:
         for turn in range(ROUNDS):
             self.errors = Cauchy(scale)
             self.climb(evidence_steps=12 if turn else 0)
-            scale = max(robust_spread(self.residuals()), LEAST_SCALE_M)
+            scale = self.scale()
         self.trust()
 
+    def scale(self) -> float:
+        """Return the scale of residuals, and what is known of noise beforehand, each by how many ranges it is worth."""
+        free = len(self.rows) * (1 - self.used)
+        square = free * robust_spread(self.residuals()[self.telling()]) ** 2 + NOISE_WORTH * NOISE_M**2
+        return float(np.sqrt(square / (free + NOISE_WORTH)))
+
     def residuals(self) -> Floats:
-        """Return the residuals of the ranges (n,), of which paths have taken a part."""
-        return np.asarray(self.rows.residuals(self.x) / np.sqrt(1 - self.used))
+        """Return the residuals of the ranges (n,), as large as they were if the unknowns had taken nothing of them."""
+        return np.asarray(self.rows.residuals(self.x) / np.sqrt(1 - self.taken))
+
+    @property
+    def used(self) -> float:
+        """Return the share of the ranges that the unknowns use up."""
+        return float(np.mean(self.taken))
+
+    def telling(self) -> Ints:
+        """Return the ranges of which the unknowns take the least: half of them, and all that they take little of."""
+        return np.flatnonzero(self.taken <= max(LITTLE_TAKEN, float(np.median(self.taken))))
 
     def trust(self) -> None:
         """Trust accelerometers and height sensors as far as their residuals say."""
@@ -244,34 +264,44 @@ class _Search:
         self.climb(evidence_steps=0)
 
     def likeliest(self) -> Found:
-        """Go to the top of the likelihood of ranges that are direct, reflected or outliers."""
-        if len(self.rows) < FEWEST_A_PAIR * len(self.model.pairs.ends):
-            self.errors = Cauchy(max(robust_spread(self.residuals()), LEAST_SCALE_M), expected=True)
-            return self.found(self.climb(evidence_steps=0, tolerance=0.01))
-        errors, unknowns, parts = self.model.error_model(self.residuals())
-        self.of_errors(errors, unknowns, parts)
+        """Go to the top of the likelihood of ranges that are direct, reflected or outliers.
+
+        Motion and errors are fitted in turn: the likelihood of both together is greatest where paths go through some
+        ranges exactly and the noise of those is zero.
+        """
+        mixture, unknowns, parts = self.model.error_model(self.residuals())
+        if len(self.rows) * (1 - self.used) < FEWEST_A_PAIR * len(self.model.pairs.ends):
+            unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
+        errors, delays, settled = replace(mixture, expected=True), self.values["delay"], False
+        for turn in range(MOST_TURNS):
+            self.fit_errors(mixture, unknowns, parts)
+            known = tuple(_as_known(unknown, self.values[unknown.kind]) for unknown in unknowns)
+            self.build(errors, (known, parts))
+            found = self.climb(evidence_steps=0 if turn > 1 else 12, tolerance=0.03, steps=20)
+            if turn == 0:
+                self.trust()
+            own = self.layout.where["delay"]
+            std = np.sqrt(np.maximum(np.diag(found.covariance[:, own][own]), 1e-12))
+            moved, delays = np.abs(found.x[own] - delays), found.x[own]
+            settled = turn > 1 and bool(np.all(moved < STILL * std))
+            if settled:
+                break
+        # What errors are made of is as unknown as all else: it has its part in the covariance.
         self.build(errors, (unknowns, parts))
         self.errors = replace(errors, used=self.used)
-        self.climb()
-        self.trust()
-        self.errors = replace(errors, used=self.used)
-        found = self.climb(evidence_steps=0, tolerance=0.03)
-        # At the top, what ranges tell on average: squares of the slopes of few are too unsteady for its covariance.
-        self.errors = replace(self.errors, expected=True)
-        return self.found(replace(self.climb(evidence_steps=0, tolerance=np.inf), success=found.success))
+        return self.found(replace(self.climb(evidence_steps=0, tolerance=np.inf), success=settled))
 
-    def of_errors(self, errors: Mixture, unknowns: tuple[Unknown, ...], parts: tuple[Part, ...]) -> None:
-        """Find what errors are made of at the present distances, which are a start for all together."""
-        distances = self.geometry.distances(self.x)[0]
-        layout, rows = self.model.build(self.error_m - distances, errors, unknowns, parts)
+    def fit_errors(self, errors: Mixture, unknowns: tuple[Unknown, ...], parts: tuple[Part, ...]) -> None:
+        """Fit what errors are made of to the residuals."""
+        layout, rows = self.model.build(self.residuals(), errors, unknowns, parts, only=())
         x, priors = layout.start(), Priors(layout)
         for kind, where in layout.where.items():
             x[where] = self.values.get(kind, x[where])
-        found = maximize([rows, *self.model.gauge_rows(layout)], priors, x, tolerance=1.0)
-        own = {block.kind for block in unknowns}
-        self.values |= {kind: found.x[where] for kind, where in layout.where.items() if kind in own}
         keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
-        self.weights |= {key: w for key, w in zip(keys, priors.weights, strict=True) if key[0] in own}
+        priors.weights = [self.weights.get(key, w) for key, w in zip(keys, priors.weights, strict=True)]
+        found = maximize([rows.sample(self.telling())], priors, x, tolerance=0.1)
+        self.values |= {kind: found.x[where] for kind, where in layout.where.items()}
+        self.weights |= dict(zip(keys, priors.weights, strict=True))
 
     def found(self, found: Optimum) -> Found:
         """Return what was found."""
@@ -292,14 +322,35 @@ class _Search:
         )
 
 
-def _trace(found: Optimum, information: Matrix, own: Ints) -> float:
-    """Return how many of some unknowns (k,) the information of rows determines."""
-    inverse = found.covariance
-    if not isinstance(inverse, SparseInverse):
-        return float(np.sum((inverse @ information)[own, own]))
-    probes = np.zeros((found.layout.size, 24))
-    probes[own] = np.random.default_rng(0).choice([-1.0, 1.0], (len(own), 24))
-    return float(np.sum(probes * (inverse @ (information @ probes)))) / 24
+def _as_known(unknown: Unknown, values: Floats) -> Unknown:
+    """Return a block of unknowns that keep their values, and the weights of their priors."""
+    priors = tuple(replace(prior, bounds=None) for prior in unknown.priors)
+    return replace(unknown, start=values, known=np.ones(len(values), dtype=bool), priors=priors)
+
+
+PROBES = 48
+"""Random vectors by which shares are estimated (Hutchinson 1990; Bekas, Kokiopoulou, Saad 2007), to a tenth or so."""
+
+
+def taken_shares(rows: RangeRows, found: Optimum) -> Floats:
+    """Return the share of each range (n,) that the unknowns use up: its leverage, at most `MOST_TAKEN`.
+
+    These are the diagonal of W^1/2 A C A' W^1/2, of what residuals tell W, their derivatives A and the covariance C.
+    A range of a mixture tells of its residual what it does if it is direct.
+    """
+    size, parts, values = found.layout.size, [], rows.values(found.x)
+    for terms in rows.terms(found.x):
+        part = terms.beside or terms
+        parts.append((part.as_matrix(part.slopes if part.entries is None else part.entries, size), part.weight))
+    if "noise" in values:
+        weight = (np.exp(-2 * values["noise"]) / (1 + np.exp(values["odds"])))[rows.order]
+    else:
+        weight = np.concatenate([known for _, known in parts])
+    reach = sparse.csr_matrix(sparse.diags_array(np.sqrt(weight)) @ sparse.vstack([matrix for matrix, _ in parts]))
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), PROBES))
+    shares = np.empty(len(rows))
+    shares[rows.order] = np.mean(probes * (reach @ (found.covariance @ (reach.T @ probes))), axis=1)
+    return np.clip(shares, 0.0, MOST_TAKEN)
 
 
 NEAR = (0.08, 0.16, 0.3)

@@ -27,11 +27,6 @@ def joint_scores(found, flown):
     return differ / np.hypot(std, [whole.delays_std_ns[tag] for tag in tags])
 
 
-# Intervals of half a dozen ranges a pair among obstacles are too narrow: z-scores of 1.8 rms, 4 at most.
-too_narrow = pytest.mark.xfail(reason="intervals of a real flight with few ranges a pair are too narrow", strict=False)
-
-
-@too_narrow
 def test_ten_seconds_of_motion_capture_an_imu_and_heights_follow_a_real_flight(flown):
     found = calib.fit_from_ranges(flown, poses_until_s=10.0, attitudes="imu")
     truth = calib.load_ranges(flown)
@@ -45,7 +40,6 @@ def test_ten_seconds_of_motion_capture_an_imu_and_heights_follow_a_real_flight(f
     assert np.abs(scores).max() < 2.5
 
 
-@too_narrow
 def test_anchors_alone_leave_the_delays_open_and_intervals_say_how_far(flown):
     found = calib.fit_from_ranges(flown, poses_until_s=0.0, minimum_norm=True)
     assert "the ranges determine no delay" in found.warnings[0]
