@@ -1,7 +1,8 @@
 """The search: the likeliest delays, curve, errors and trajectories together, from where trajectories are thought to be.
 
-Ranges first have Cauchy's likelihood, which descends from anywhere, then that of `calib.range_errors`. How much jerk
-paths have is estimated along, and so is how far accelerometers and height sensors are to be trusted.
+Ranges first have Cauchy's likelihood, which descends from anywhere, then that of `calib.range_errors`, whose parameters
+and the motion are fitted in turn. The variance of jerk is estimated along, and so are the standard deviations of
+accelerometers and height sensors.
 """
 
 from __future__ import annotations
@@ -60,13 +61,9 @@ FORCES_M_S2 = (0.02, 5.0)
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """Cauchy's likelihood of residuals, with a curvature that descends from anywhere (`Errors`).
-
-    With `expected` each tells what all do on average, as near the top.
-    """
+    """Cauchy's likelihood of residuals, with a curvature that descends from anywhere (`Errors`)."""
 
     scale_m: float
-    expected: bool = False
     parameters: tuple[str, ...] = ()
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
@@ -76,8 +73,6 @@ class Cauchy:
         curvature = weight * (1 - u**2) / (1 + u**2)
         # Where the loss bends upwards there is none: a fifth of the weight, as of reweighted least squares.
         tells = np.maximum(curvature, 0.2 * weight)
-        if self.expected:
-            tells = np.full(len(u), max(float(np.mean(curvature)), 0.2 * float(np.mean(weight))))
         return -np.log1p(u**2), {RESIDUAL: -weight * values[RESIDUAL]}, tells
 
 
@@ -270,7 +265,8 @@ class _Search:
         ranges exactly and the noise of those is zero.
         """
         mixture, unknowns, parts = self.model.error_model(self.residuals())
-        if len(self.rows) * (1 - self.used) < FEWEST_A_PAIR * len(self.model.pairs.ends):
+        few = len(self.rows) * (1 - self.used) < FEWEST_A_PAIR * len(self.model.pairs.ends)
+        if few:
             unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
         errors, delays, settled = replace(mixture, expected=True), self.values["delay"], False
         for turn in range(MOST_TURNS):
@@ -288,6 +284,9 @@ class _Search:
                 break
         # What errors are made of is as unknown as all else: it has its part in the covariance.
         self.build(errors, (unknowns, parts))
+        if not few:
+            self.errors = replace(mixture, used=self.used)
+            self.climb(evidence_steps=0, tolerance=0.03, steps=20)
         self.errors = replace(errors, used=self.used)
         return self.found(replace(self.climb(evidence_steps=0, tolerance=np.inf), success=settled))
 
@@ -336,16 +335,18 @@ def taken_shares(rows: RangeRows, found: Optimum) -> Floats:
     """Return the share of each range (n,) that the unknowns use up: its leverage, at most `MOST_TAKEN`.
 
     These are the diagonal of W^1/2 A C A' W^1/2, of what residuals tell W, their derivatives A and the covariance C.
-    A range of a mixture tells of its residual what it does if it is direct.
     """
     size, parts, values = found.layout.size, [], rows.values(found.x)
     for terms in rows.terms(found.x):
         part = terms.beside or terms
-        parts.append((part.as_matrix(part.slopes if part.entries is None else part.entries, size), part.weight))
+        weight = np.ones(1) if part.weight is None else part.weight
+        if part is not terms and terms.residual is not None:
+            weight = weight + np.mean(terms.residual**2)
+        parts.append((part.as_matrix(part.slopes if part.entries is None else part.entries, size), weight))
+    weight = np.concatenate([known for _, known in parts])
     if "noise" in values:
-        weight = (np.exp(-2 * values["noise"]) / (1 + np.exp(values["odds"])))[rows.order]
-    else:
-        weight = np.concatenate([known for _, known in parts])
+        # A residual tells no more than if all errors were normal (Stam 1959).
+        weight = np.minimum(weight, np.exp(-2 * values["noise"][rows.order]))
     reach = sparse.csr_matrix(sparse.diags_array(np.sqrt(weight)) @ sparse.vstack([matrix for matrix, _ in parts]))
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), PROBES))
     shares = np.empty(len(rows))
