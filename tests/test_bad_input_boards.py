@@ -54,7 +54,7 @@ def test_no_such_port(tmp_path, words):
     [
         ("twr {one} 1", ["own id"]),
         ("twr {one} 9", ["COMMANDED TASK FAILED AFTER 5 ATTEMPTS"]),
-        ("twr {one} 2 --protocol tdoa", ["tdoa", "ss and ds"]),
+        ("twr {one} 2 --protocol tdoa", ["tdoa", "ds and ss"]),
         ("set-delay {one} 279", ["279", "280 to 6500"]),
         ("set-delay {one} 100000", ["100000", "280 to 6500"]),
         ("passive {one} maybe", ["maybe", "on or off"]),

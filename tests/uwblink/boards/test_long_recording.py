@@ -1,7 +1,6 @@
 """A recorder that runs for hours holds no more than one that runs for seconds, and each commit does the same work."""
 
 import gc
-import sys
 from time import process_time
 
 import numpy as np
@@ -92,8 +91,8 @@ def test_nothing_grows_with_the_recording(tmp_path, statements):
     assert len({tuple(asked) for asked in committing.asked}) == 1
 
 
-def test_neither_slower_nor_later_as_it_gets_longer(tmp_path):
-    """A minute and a half at fifty times its speed; `make bench-hours` records eight hours so."""
+def test_no_slower_as_it_gets_longer(tmp_path):
+    """A minute and a half in virtual time; `make bench-hours` records eight hours so, and says how fast."""
     spent: list[float] = []
     ports = AnsweringPorts()
     with Recording.create(tmp_path / "long.uwb", live=True, memory_mb=FILE_MB) as recording:
@@ -109,8 +108,6 @@ def test_neither_slower_nor_later_as_it_gets_longer(tmp_path):
     third = len(taken) // 3
     # Medians, for others work on the machine too; what looks at everything so far would take twice as long at the end.
     assert np.median(taken[-third:]) < 1.5 * np.median(taken[1 : 1 + third])
-    # The quickest, in which others disturbed least: at rest it is half of what it may be. To count lines takes as long.
-    assert np.min(taken) < WHILE_FAST / RATE_HZ / (FAST if sys.gettrace() is None else 10)
 
 
 def test_the_time_of_a_recording_is_that_of_its_boards(tmp_path):
