@@ -55,7 +55,7 @@ nitpick_ignore_regex = [
     ),
     (
         "py:class",
-        r"uwbsim\.scenario\..*|Faults|GeometricMultipath|Shadow|Spline",
+        r"uwbsim\.scenario\..*|Faults|GeometricMultipath|Shadow|Spline|SweepSettings",
     ),  # models of files, which have pages of their own
     (
         "py:class",

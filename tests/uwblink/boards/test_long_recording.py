@@ -1,6 +1,7 @@
 """A recorder that runs for hours holds no more than one that runs for seconds, and each commit does the same work."""
 
 import gc
+import sys
 from time import process_time
 
 import numpy as np
