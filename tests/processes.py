@@ -6,6 +6,7 @@ A command takes 0.4 s to import what it needs and often less to do its work, and
 from __future__ import annotations
 
 import atexit
+import functools
 import importlib
 import multiprocessing
 import os
@@ -47,9 +48,11 @@ def run(
     writes may be longer than `most_bytes`, as on a full disk; `user` takes its rights away.
     """
     argv = [str(BIN / str(words[0])), *map(str, words[1:])]
+    if most_bytes is not None:
+        return _run_limited(argv, cwd, dict(os.environ if env is None else env), timeout, most_bytes)
     with tempfile.TemporaryDirectory() as folder:
         printed = [Path(folder) / name for name in ("out", "err")]
-        settings = (str(cwd or Path.cwd()), dict(os.environ if env is None else env), most_bytes, user)
+        settings = (str(cwd or Path.cwd()), dict(os.environ if env is None else env), user)
         process = CONTEXT.Process(target=_work, args=(argv, [*map(str, printed)], *settings))
         process.start()
         process.join(timeout)
@@ -60,9 +63,26 @@ def run(
         return subprocess.CompletedProcess(argv, process.exitcode, *(path.read_text("utf-8") for path in printed))
 
 
-def _work(
-    argv: list[str], printed: list[str], cwd: str, env: dict[str, str], most_bytes: int | None, user: int | None
-) -> None:
+def _run_limited(
+    argv: list[str], cwd: str | os.PathLike[str] | None, env: dict[str, str], timeout: float | None, most_bytes: int
+) -> subprocess.CompletedProcess[str]:
+    """Run a command that may write no long file; coverage is not measured, because its file could not be written."""
+    plain = {name: value for name, value in env.items() if not name.startswith("COVERAGE_")}
+    limit = functools.partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    return subprocess.run(
+        argv,
+        cwd=cwd,
+        env=plain,
+        timeout=timeout,
+        preexec_fn=limit,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def _work(argv: list[str], printed: list[str], cwd: str, env: dict[str, str], user: int | None) -> None:
     """Become a command: its folder, environment, output and limits; ends the process with its status."""
     for descriptor, path in enumerate([os.devnull, *printed]):
         opened = os.open(path, os.O_CREAT | os.O_WRONLY if descriptor else os.O_RDONLY, 0o600)
@@ -74,8 +94,6 @@ def _work(
     os.environ.update(env)
     status = 1
     try:
-        if most_bytes is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
         if user is not None:
             os.seteuid(user)
         status = _call(argv)
