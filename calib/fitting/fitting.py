@@ -28,7 +28,7 @@ from calib.estimator.losses import MIXTURE, check_loss
 from calib.estimator.to_calibration import calibration_of
 from calib.evaluation.statistics import evaluate
 from calib.fitting.known_delays import imported, std_taken_over, taken_over
-from calib.fitting.result import FitResult
+from calib.fitting.result import FitResult, HeldOut
 from calib.settings import FitSettings
 from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
@@ -120,8 +120,9 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
         "corrected": float(np.std(residuals)),
     }
-    if settings.hold_out:
-        provenance["held_out"] = _judged(ranges, settings)
+    held = _held_out(ranges, settings) if settings.hold_out else None
+    if held is not None:
+        provenance["held_out"] = _judged(held, settings)
     return FitResult(
         calibration=replace(calibration, provenance=provenance),
         ranges=ranges,
@@ -130,14 +131,19 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         success=found.success,
         message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
         warnings=warnings,
+        held_out=held,
     )
 
 
-def _judged(ranges: Ranges, settings: FitSettings) -> dict[str, Any]:
-    """Return how a fit to a part of the ranges does on those that are held out, for the provenance."""
+def _held_out(ranges: Ranges, settings: FitSettings) -> HeldOut:
+    """Return the ranges that are held out, and a fit to the others."""
     rows = held_out(ranges, settings.hold_out, settings.fold)
-    part = fit(ranges[~rows], settings, hold_out=0.0)
-    found = evaluate(ranges[rows], part.calibration).overall
+    return HeldOut(ranges[rows], fit(ranges[~rows], settings, hold_out=0.0).calibration)
+
+
+def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
+    """Return how a fit to a part of the ranges does on those that are held out, for the provenance."""
+    found = evaluate(held.ranges, held.calibration).overall
     return {
         "share": settings.hold_out,
         "fold": settings.fold,

@@ -15,14 +15,22 @@ if TYPE_CHECKING:
     from calib.figures import Axes
 
 
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """Ranges (n,) that were held out, and the calibration that was fitted to the others."""
+
+    ranges: Ranges
+    calibration: Calibration
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class FitResult:
     """A calibration and how it came about.
 
     `ranges` are those that were fitted (n,), `residuals_m` their fully corrected errors, corrected range less truth;
     `inliers` those within three sigmas. `message` says how the search ended, `warnings` what a user should know before
-    trusting it, the gravest first. The `plot_` methods draw into matplotlib axes, new ones if none are given, and
-    return them.
+    trusting it, the gravest first. `held_out` is there if `FitSettings.hold_out` asked for it. The `plot_` methods draw
+    into matplotlib axes, new ones if none are given, and return them.
 
     >>> import calib
     >>> result = calib.fit(calib.sample_flight())
@@ -38,6 +46,7 @@ class FitResult:
     success: bool
     message: str
     warnings: list[str]
+    held_out: HeldOut | None = None
 
     def __repr__(self) -> str:
         """Return the calibration as a table, below what it was fitted to, above the warnings."""

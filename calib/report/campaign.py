@@ -27,6 +27,9 @@ from calib.report.writing import check_places
 from calib.settings import FitSettings
 from uwblink.pages.blocks import write_document
 
+HELD_OUT_SHARE: Final = 0.3
+"""Share of the recordings that judges a report without tests: three of the tenths of `FitSettings.fold`."""
+
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
 """Scales of the loss, over the chosen one, for which a campaign is fitted again: a factor of 16 in all."""
 
@@ -99,11 +102,12 @@ def run_campaign(
 ) -> Campaign:
     """Fit to the training recordings, judge and localize on the tests, and return all that a report tells of.
 
-    Recordings are what `load_ranges` takes, `settings` and keyword arguments what `fit` takes. Without tests the
-    training is judged, and the report says so. `Ranges` alone are fitted and judged, but neither examined nor
-    localized: that takes a recording. `trim_static` leaves out of the training where nothing moves; `progress` is
-    called with what is being done; `command` is the command line that the report states. Raises what `load_ranges` and
-    `fit` raise.
+    Recordings are what `load_ranges` takes, `settings` and keyword arguments what `fit` takes. Without tests a
+    second fit is judged on a part of the training that is held out from it (`FitSettings.hold_out`, 0.3 by default);
+    where that is too short, the training itself is judged. The report says which. `Ranges` alone are fitted and
+    judged, but neither examined nor localized: that takes a recording. `trim_static` leaves out of the training where
+    nothing moves; `progress` is called with what is being done; `command` is the command line that the report states.
+    Raises what `load_ranges` and `fit` raise.
 
     >>> import calib
     >>> campaign = calib.run_campaign(calib.sample_flight(), calib.sample_flight(300, seed=2), loss="huber")
@@ -120,13 +124,14 @@ def run_campaign(
         testing = load_each(judged, need_power=need_power) if judged else []
         progress("fitting")
         ranges = concatenate(fitted)
-        found = fit(ranges, settings)
+        found = fit(ranges, settings) if testing else _fit_and_hold_out(ranges, settings)
+        held = None if testing else found.held_out
         known = found.calibration
         refits: dict[float, Calibration] = {}
         # The mixture and least squares have no scale.
         for factor in SCALES if known.loss not in (MIXTURE, "l2") else ():
             scale_ns = factor * known.scale_ns
-            refits[scale_ns] = fit(ranges, replace(settings, scale_ns=scale_ns)).calibration
+            refits[scale_ns] = fit(ranges, replace(settings, scale_ns=scale_ns, hold_out=0.0)).calibration
         progress("examining")
         findings = [finding for one in (*recordings, *judged) for finding in _findings(one)]
         progress("localizing")
@@ -134,7 +139,8 @@ def run_campaign(
         return Campaign(
             calibration=known,
             training=fitted,
-            tests=testing,
+            tests=testing if held is None else [held.ranges],
+            part=None if held is None else held.calibration,
             fit=found,
             refits=refits,
             # From the first recording that has passive listeners.
@@ -143,6 +149,16 @@ def run_campaign(
             tracks=[track for data in judged or recordings for track in _tracks(data, known)],
             origin=origin_of([*given[0], *given[1]], command),
         )
+
+
+def _fit_and_hold_out(ranges: Ranges, settings: FitSettings) -> FitResult:
+    """Fit, and fit a second time without a part to judge by, unless nobody asked for it and the ranges are too few."""
+    if settings.hold_out:
+        return fit(ranges, settings)
+    try:
+        return fit(ranges, settings, hold_out=HELD_OUT_SHARE)
+    except UnanswerableError:
+        return fit(ranges, settings)
 
 
 def _findings(data: Data) -> list[tuple[str, Finding]]:

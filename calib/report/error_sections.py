@@ -242,6 +242,6 @@ def over_time(results: Results) -> list[Block]:
             f"{recording.source}: calibrated errors, and lines between which 95 % should lie without reflections."
             f"{left_out}"
         )
-        draw = partial(figures.over_time, ranges=recording, applied=results.calibration.apply(recording))
+        draw = partial(figures.over_time, ranges=recording, applied=results.judged_calibration.apply(recording))
         blocks.append(Picture(f"over-time-{k + 1}", draw, caption))
     return blocks

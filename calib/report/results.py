@@ -6,7 +6,7 @@ import datetime
 import hashlib
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data
-from calib.evaluation.statistics import Evaluation, evaluate
+from calib.evaluation.statistics import Evaluation, PlantedComparison, beside_planted, evaluate
 
 if TYPE_CHECKING:
     from calib.evaluation.localization import Localization
@@ -62,9 +62,10 @@ class Results:
     """What a report tells of: a calibration, and as much as there is of how it was fitted and how it does.
 
     `training` are the ranges it was fitted to, `tests` others that judge it; an `evaluated` one of the judged ranges
-    is not made again. `refits` are calibrations for other scales of the loss, by
-    scale in ns; `heard` delays as passive listeners see them; `findings` the doctor's, by recording; `tracks` the
-    bodies that were localized; `origin` says when the report was made, and from what files.
+    is not made again. `part` is a calibration fitted without the tests where those were held out from the recordings
+    that `calibration` was fitted to; it is the one that is judged. `refits` are calibrations for other scales of the
+    loss, by scale in ns; `heard` delays as passive listeners see them; `findings` the doctor's, by recording; `tracks`
+    the bodies that were localized; `origin` says when the report was made, and from what files.
     """
 
     calibration: Calibration
@@ -72,6 +73,7 @@ class Results:
     tests: list[Ranges] = field(default_factory=list)
     evaluated: Evaluation | None = None
     fit: FitResult | None = None
+    part: Calibration | None = None
     refits: dict[float, Calibration] = field(default_factory=dict)
     heard: dict[int, OverheardDelay] = field(default_factory=dict)
     findings: list[tuple[str, Finding]] = field(default_factory=list)
@@ -91,7 +93,12 @@ class Results:
     @property
     def held_out(self) -> bool:
         """Whether it is judged on recordings that the fit has not seen."""
-        return bool(self.tests) and not self.evaluation.seen
+        return bool(self.tests) and self.part is None and not self.evaluation.seen
+
+    @property
+    def judged_calibration(self) -> Calibration:
+        """The calibration whose errors are shown."""
+        return self.part or self.calibration
 
     @cached_property
     def trained(self) -> Ranges:
@@ -106,9 +113,18 @@ class Results:
     @cached_property
     def corrected(self) -> CorrectedRanges:
         """The judged ranges, corrected."""
-        return self.calibration.apply(self.judged)
+        return self.judged_calibration.apply(self.judged)
 
     @cached_property
     def evaluation(self) -> Evaluation:
         """How the calibration does on the judged ranges."""
-        return self.evaluated or evaluate(self.judged, self.calibration)
+        found = self.evaluated or evaluate(self.judged, self.judged_calibration)
+        # What was held out is of a recording that both fits know by its name, but was not fitted.
+        return found if self.part is None else replace(found, seen=())
+
+    @cached_property
+    def planted(self) -> PlantedComparison | None:
+        """The calibration beside what a simulation planted."""
+        if self.part is None:
+            return self.evaluation.planted
+        return beside_planted(self.trained, self.calibration.apply(self.trained), self.calibration)

@@ -47,6 +47,7 @@ def _summary(results: Results) -> str:
     group, where = results.evaluation.overall, ""
     if results.fit is not None:
         where = " of the tests" if results.tests else " of the recordings it was fitted from"
+        where = " that were held out from a second fit" if results.part else where
     stages = [getattr(group, stage) for stage in CORRECTION_STAGES]
     medians, means = (
         f"{100 * raw:+.1f} cm (raw) to {100 * delays:+.1f} cm (delays corrected) and {100 * full:+.1f} cm (fully "
@@ -69,6 +70,11 @@ def _warnings(results: Results) -> list[Block]:
     told = results.warnings
     if results.fit is not None and not results.tests:
         told.append("no tests were given: the figures below are of the recordings that the fit has seen")
+    if results.part is not None:
+        told.append(
+            "no tests were given: errors below are those of a second fit on a part of the recordings that it has not "
+            "seen; on another day they are larger"
+        )
     for name, finding in results.findings:
         evidence, remedy = (text[:1].upper() + text[1:] for text in (finding.evidence, finding.remedy))
         told.append(f"{name}: {finding.fault}. {evidence}. {remedy}.")
@@ -80,7 +86,8 @@ def _recordings(results: Results) -> list[Block]:
     if not results.recordings:
         return []
     digests = {Path(path).name: digest[:12] for path, digest in results.origin.files.items()}
-    uses = [("fit", r) for r in results.training] + [("test", r) for r in results.tests]
+    tested = "test" if results.part is None else "held out"
+    uses = [("fit", r) for r in results.training] + [(tested, r) for r in results.tests]
     header = ["recording", "used to", "ranges", "seconds", "tags", "pairs", "protocol", "left out", "SHA-256"]
     rows = [
         [
@@ -220,7 +227,7 @@ def _delays(results: Results) -> list[Block]:
         rows = [list(row) for row in offset_rows(calibration)]
         table = Table(["pair", "ranges too long by (cm)", "95 %"], rows)
         return [Heading("Antenna delays"), table, *_sensitivity(results)]
-    planted = results.evaluation.planted if results.recordings else None
+    planted = results.planted if results.recordings else None
     truth: dict[str, Any] = (results.trained.planted or {}).get("delays_ns", {}) if planted else {}
     known = {int(tag): float(delay) for tag, delay in truth.items()}
     shift = planted.shift_ns if planted else 0.0

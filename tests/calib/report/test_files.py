@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 from pypdf import PdfReader
 
@@ -76,13 +77,40 @@ def campaign(folder):
 def test_ranges_alone_are_fitted_and_judged(campaign, tmp_path):
     assert campaign.findings == []
     assert campaign.tracks == []
-    assert campaign.evaluation.overall.full.n == 900
+    assert (len(campaign.training[0]), campaign.evaluation.overall.full.n) == (900, 270)
     (tmp_path / "mine.html").write_text("mine")
     with pytest.raises(FileExistsError):
         campaign.write(tmp_path / "r.html", tmp_path / "mine.html")
     with pytest.raises(calib.BadInputError, match="`figures`"):
         campaign.write(tmp_path / "r.html", figures=tmp_path / "mine.html")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.html"]
+
+
+def test_without_tests_errors_are_those_of_ranges_that_were_held_out(campaign, folder, tmp_path):
+    """The fourth, seventh and last tenth of the time judge a fit to the others; delays are those of a fit to all."""
+    whole = calib.load_ranges(folder / "a.uwb")
+    tenth = np.floor(10 * (whole.time_ns - whole.time_ns[0]) / (whole.time_ns[-1] - whole.time_ns[0]))
+    held = np.isin(tenth, [3, 6, 9, 10])
+    part = calib.fit(whole[~held], loss="l2").calibration
+    errors = part.apply(whole[held]).corrected_m - whole.truth_m[held]
+    assert campaign.evaluation.overall.full.median_m == pytest.approx(np.median(errors), abs=1e-12)
+    assert campaign.calibration.delays_ns == calib.fit(whole, loss="l2").calibration.delays_ns != part.delays_ns
+    campaign.write(tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert f"Over {held.sum()} ranges that were held out" in page
+    assert "30 % of the same recordings" in page
+
+
+def test_ranges_too_few_to_hold_out_are_judged_themselves(folder):
+    """Of the pair 1-3 there are ranges in the last tenth alone, which would be held out."""
+    whole = calib.load_ranges(folder / "a.uwb")
+    late = whole.time_ns > whole.time_ns[0] + 0.9 * (whole.time_ns[-1] - whole.time_ns[0])
+    few = whole[late | (whole.initiator + whole.target == 3)]
+    campaign = calib.run_campaign(few, loss="l2")
+    assert campaign.part is None
+    assert campaign.evaluation.overall.full.n == len(few)
+    with pytest.raises(calib.UnanswerableError):
+        calib.run_campaign(few, loss="l2", hold_out=0.3)
 
 
 def weather(campaign):
@@ -103,7 +131,7 @@ def test_a_section_of_ones_own_is_in_the_report(campaign, tmp_path, sections):
     page = (tmp_path / "r.html").read_text()
     titles = re.findall("<h2 id='s[0-9]+'>(.*?)</h2>", page)
     assert titles[titles.index("Weather") + 1] == "Outliers"
-    assert "Dry over 900 ranges; &lt;wet&gt; tomorrow." in page
+    assert "Dry over 270 ranges; &lt;wet&gt; tomorrow." in page
     assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
 
 
