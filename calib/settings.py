@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from uwblink import KnownDistance
 
 LIFTS: Final = ("mean-of-lifted", "lift-of-mean")
+ATTITUDES: Final = ("poses", "imu", "none")
+ANCHOR_PLACES: Final = ("given", "sought")
+HEIGHTS: Final = ("used", "ignored")
 CONSTANTS: Final = ("tag", "pair")
 FOLDS: Final = ("time", "pair", "session")
 HIGHEST_TAG: Final = 65_535
@@ -291,7 +294,10 @@ def read_distances(texts: Iterable[str]) -> tuple[KnownDistance, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSettings:
-    """What is known of a flight without true distances: the settings of `fit_from_ranges`, which explains them."""
+    """What is known of a flight without true distances: settings of `fit_from_ranges`, which explains them.
+
+    Raises `BadInputError` that names the setting.
+    """
 
     poses_until_s: float | None = setting(
         None,
@@ -303,7 +309,7 @@ class FlightSettings:
     attitudes: str = setting(
         "poses",
         "Source of attitudes: the poses, all along; the IMU; or none.",
-        names=("poses", "imu", "none"),
+        names=ATTITUDES,
         rich_help_panel=FLIGHT_PANEL,
     )
     heading_std_deg: float = setting(
@@ -316,7 +322,7 @@ class FlightSettings:
     anchors: str = setting(
         "given",
         "Positions of bodies that stand still: given by the poses, or sought (estimated).",
-        names=("given", "sought"),
+        names=ANCHOR_PLACES,
         rich_help_panel=FLIGHT_PANEL,
     )
     distances: tuple[Any, ...] = setting(
@@ -332,7 +338,7 @@ class FlightSettings:
     heights: str = setting(
         "used",
         "Readings of height sensors in the recording: used or ignored.",
-        names=("used", "ignored"),
+        names=HEIGHTS,
         rich_help_panel=FLIGHT_PANEL,
     )
     curve_from: Any = setting(  # a Calibration or its path
@@ -341,3 +347,13 @@ class FlightSettings:
         kind=Path | None,
         rich_help_panel=FLIGHT_PANEL,
     )
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        check_choice("attitudes", self.attitudes, ATTITUDES)
+        check_choice("anchors", self.anchors, ANCHOR_PLACES)
+        check_choice("heights", self.heights, HEIGHTS)
+        for name, value in (("poses_until_s", self.poses_until_s), ("heading_std_deg", self.heading_std_deg)):
+            if value is not None and not (_is_finite(value) and value >= 0):
+                raise BadInputError(f"found {value!r}, expected a number of 0 or more", parameter=name)
+        object.__setattr__(self, "distances", tuple(self.distances))

@@ -89,14 +89,14 @@ def fit(
     from uwblink.output import check_output
 
     check_choice("truth", truth, ("recorded", "ranges"))
-    given = {one.name: value for one in fields(flight) if (value := getattr(flight, one.name)) != one.default}
     if truth == "recorded":
-        for name in given:
-            raise BadInputError("goes with a fit whose `truth` is ranges", parameter=name)
+        for one in fields(flight):
+            if getattr(flight, one.name) != one.default:
+                raise BadInputError("goes with a fit whose `truth` is ranges", parameter=one.name)
     check_output(output, force=force)
     with _undetermined_as_json(as_json):
         if truth == "ranges":
-            result = _fit_from_ranges(recordings, settings, given, trim_static=trim_static)
+            result = _fit_from_ranges(recordings, flight, settings, trim_static=trim_static)
         else:
             with waiting("fitting"):
                 ranges = calib.load_ranges(recordings, trim_static=trim_static, need_power=not settings.delays_only)
@@ -136,20 +136,17 @@ class _undetermined_as_json:  # noqa: N801 - a context manager
 
 
 def _fit_from_ranges(
-    recordings: Sequence[Path], settings: FitSettings, given: dict[str, Any], *, trim_static: bool
+    recordings: Sequence[Path], flight: FlightSettings, settings: FitSettings, *, trim_static: bool
 ) -> calib.FitResult:
     """Fit without known distances; raises `BadInputError` for settings that need them."""
     import calib
 
     if len(recordings) != 1:
         raise BadInputError("ranges takes one recording, of one flight", parameter="truth")
-    both = ("fixed_ns", "groups", "lift", "reference_power_dbm", "delays_only", "minimum_norm")
-    others = [one.name for one in fields(settings) if getattr(settings, one.name) != getattr(FitSettings(), one.name)]
-    for name in [name for name in others if name not in both] + ["trim_static"] * trim_static:
-        raise BadInputError("goes with known distances only, not with `truth` ranges", parameter=name)
+    if trim_static:
+        raise BadInputError("goes with known distances only", parameter="trim_static")
     with progress_bar(recordings[0].name) as report:
-        shared = {name: getattr(settings, name) for name in both}
-        return calib.fit_from_ranges(recordings[0], progress=report, **shared, **given)
+        return calib.fit_from_ranges(recordings[0], flight, settings, progress=report)
 
 
 def delay_lines(found: calib.Calibration) -> Iterator[str]:

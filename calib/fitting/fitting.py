@@ -6,7 +6,7 @@ curve that is zero at a reference power: the same boards then get the same delay
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -99,39 +99,82 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
     given = set(fixed) - set(pinned)
     stated = {tag: std for tag, std in calibration.delays_std_ns.items() if tag not in given}
     calibration = replace(calibration, delays_std_ns=stated | std_taken_over(source, given))
+    held = _held_out(ranges, settings) if settings.hold_out else None
+    provenance = {
+        **({"undetermined": found.free} if found.free else {}),
+        **({} if reference is None else {"reference_power_dbm": reference}),
+        "recordings": ranges.source.split(", "),
+        "recording_ids": [name for _, name in ranges.recordings],
+        "recipe": "sequential" if recipe.sequential else "joint",
+        "fitted": _fitted(found, recipe),
+        "gauge": _gauge(found, reference),
+        **({"held_out": _judged(held, settings)} if held else {}),
+    }
+    result = result_of(
+        found,
+        replace(calibration, provenance=provenance),
+        ranges,
+        doubts.sentences,
+        settings=settings,
+        fixed=fixed,
+        more=_stopped(found, settings.loss),
+    )
+    return replace(result, held_out=held)
+
+
+def result_of(
+    found: KnownDistances,
+    calibration: Calibration,
+    ranges: Ranges,
+    findings: Iterable[str],
+    *,
+    settings: FitSettings,
+    fixed: Mapping[int, float],
+    first: Iterable[str] = (),
+    more: Iterable[str] = (),
+) -> FitResult:
+    """Return the result of a fit: its calibration with lasting errors, warnings and provenance, and the residuals.
+
+    `findings` are sentences of the checks of the fit; the warnings of a kind of fit are `first`, or `more` after the
+    limits of the ranges.
+    """
     residuals, inliers, over_sigma = _left(calibration, ranges)
     if calibration.errors is not None:
         known = replace(calibration.errors, lasting=lasting_errors(ranges, over_sigma))
         calibration = replace(calibration, errors=known)
     warnings = [
+        *first,
         *limits(found, ranges, residuals, fixed),
-        *_stopped(found, settings.loss),
-        *doubts.sentences,
+        *more,
+        *findings,
         *one_way(ranges),
         *implausible(calibration.delays_ns, residuals),
         *unlike_powers(ranges, calibration),
-        *_beyond(reference, alpha_dbm, found),
+        *_beyond(calibration.provenance.get("reference_power_dbm"), calibration.alpha_dbm, found),
         *warnings_of(ranges, float(np.mean(inliers)), found.free, found.blocks.seconds),
     ]
-    provenance = _provenance(ranges, found, recipe, inliers, warnings, reference)
+    provenance: dict[str, Any] = {
+        "writer": f"uwbcal {uwblink.__version__}",
+        "exchanges": len(ranges),
+        "inliers": int(np.count_nonzero(inliers)),
+        "excluded": ranges.excluded,
+        "converged": found.success,
+        "standard_errors": f"sandwich over {found.lasting.lasting[0].stretches:.0f} independent stretches of time",
+        "warnings": warnings,
+        "error_std_m": {"raw": float(np.std(ranges.raw_m - ranges.truth_m)), "corrected": float(np.std(residuals))},
+    }
+    if fixed:
+        provenance["fixed_ns"] = {str(tag): delay for tag, delay in sorted(fixed.items())}
     if settings.changed():
         provenance["settings"] = settings.changed()
-    provenance["error_std_m"] = {
-        "raw": float(np.std(ranges.raw_m - ranges.truth_m)),
-        "corrected": float(np.std(residuals)),
-    }
-    held = _held_out(ranges, settings) if settings.hold_out else None
-    if held is not None:
-        provenance["held_out"] = _judged(held, settings)
     return FitResult(
-        calibration=replace(calibration, provenance=provenance),
+        calibration=replace(calibration, provenance=calibration.provenance | provenance),
         ranges=ranges,
         residuals_m=residuals,
         inliers=inliers,
         success=found.success,
         message=f"{'converged' if found.success else 'stopped'} after {found.steps} steps",
         warnings=warnings,
-        held_out=held,
     )
 
 
@@ -189,32 +232,6 @@ def _beyond(reference: float | None, alpha_dbm: float, found: KnownDistances) ->
         f"no ranges at the reference power of {reference:.1f} dBm: delays are stated at "
         f"{alpha_dbm + 10 * np.log10(near):.1f} dBm, the nearest recorded, and compare only with others stated there"
     ]
-
-
-def _provenance(
-    ranges: Ranges, found: KnownDistances, recipe: Recipe, inliers: Bools, warnings: list[str], reference: float | None
-) -> dict[str, Any]:
-    more = dict[str, Any]()
-    if recipe.fixed_ns:
-        more["fixed_ns"] = {str(tag): delay for tag, delay in sorted(recipe.fixed_ns.items())}
-    if found.free:
-        more["undetermined"] = found.free
-    if reference is not None:
-        more["reference_power_dbm"] = reference
-    return more | {
-        "writer": f"uwbcal {uwblink.__version__}",
-        "recordings": ranges.source.split(", "),
-        "recording_ids": [name for _, name in ranges.recordings],
-        "exchanges": len(ranges),
-        "inliers": int(np.count_nonzero(inliers)),
-        "excluded": ranges.excluded,
-        "recipe": "sequential" if recipe.sequential else "joint",
-        "fitted": _fitted(found, recipe),
-        "converged": found.success,
-        "standard_errors": f"sandwich over {found.lasting.lasting[0].stretches:.0f} independent stretches of time",
-        "warnings": warnings,
-        "gauge": _gauge(found, reference),
-    }
 
 
 def _fitted(found: KnownDistances, recipe: Recipe) -> str:

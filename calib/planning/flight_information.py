@@ -13,7 +13,6 @@ from itertools import combinations
 
 import numpy as np
 
-from calib.calibration.power_curves import ALPHA_DBM
 from calib.data.sources import Data
 from calib.errors import UnanswerableError
 from calib.estimator.inverse import Inverse, inverse_of
@@ -23,10 +22,12 @@ from calib.estimator.rows import sum_rows
 from calib.estimator.unknowns import Layout, Priors
 from calib.information import Verdict
 from calib.range_errors.density import error_slopes
-from calib.trajectories.fitting import Asked
+from calib.settings import FitSettings, FlightSettings
+from calib.trajectories.fitting import range_model
 from calib.trajectories.judging import ALONE, verdict_on, with_known_distances
 from calib.trajectories.motion import Distances, Motion, known_rows
-from calib.trajectories.scene import Places, Scene, Usable, scene_from, tapes_of
+from calib.trajectories.samples import Places, tapes_of
+from calib.trajectories.scene import Scene, scene_from
 from calib.trajectories.start import SAMPLE_S, Followed, path_between
 from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
@@ -107,7 +108,7 @@ class Flight:
     @property
     def tapes(self) -> list[tuple[int, int]]:
         """The pairs of tags whose distance is measured beside."""
-        return [(one.first, one.second) for one in self.scene.tapes.told]
+        return [(one.first, one.second) for one in self.scene.tapes.stated]
 
     def known_until(self, seconds: float) -> Flight:
         """Return the flight with positions known so long."""
@@ -153,23 +154,17 @@ class Flight:
         return pairs[int(np.argmin(np.round(means, 9)))]
 
 
-def flight_of(data: Data, usable: Usable, errors: Errors, *, curve: bool, force_std_m_s2: float | None) -> Flight:
+def flight_of(
+    data: Data, settings: FlightSettings, errors: Errors, *, curve: bool, force_std_m_s2: float | None
+) -> Flight:
     """Return a planned flight from what a recording of it would hold, with poses all along.
 
     `force_std_m_s2` is what an accelerometer's mean over a tenth of a second will be off by; None without one.
     Raises what `scene_from` and `RangeModel.of` raise.
     """
-    truth = scene_from(data, Usable(attitudes="poses", heading_std_deg=0.0), need_power=curve)
-    asked = Asked(
-        usable=usable,
-        lift="mean-of-lifted",
-        alpha_dbm=ALPHA_DBM,
-        fixed={},
-        groups={},
-        reference_dbm=ALPHA_DBM,
-        curve=curve,
-    )
-    model, scene = asked.model(scene_from(data, usable, need_power=curve), offsets=False)
+    truth = scene_from(data, FlightSettings(attitudes="poses", heading_std_deg=0.0), need_power=curve)
+    scene = scene_from(data, settings, need_power=curve)
+    model, scene = range_model(scene, FitSettings(), curve=curve, offsets=False)
     for number, name in enumerate(truth.moving):
         if np.count_nonzero(truth.places.body == number) < 2:
             raise UnanswerableError(f"{truth.source}: no positions of body {name}; a plan takes its motion from them")

@@ -19,9 +19,8 @@ from calib.planning.flight_information import Errors, Flight, Predicted, flight_
 from calib.planning.reference_motion import reference_motion
 from calib.planning.result import FlightPlan, NextBest, mean_std_ns
 from calib.planning.settings import FlightPlanSettings
+from calib.settings import FlightSettings
 from calib.spread import TWO_SIDED_95
-from calib.trajectories.fitting import usable_of
-from calib.trajectories.scene import Usable
 from uwblink.arrays import Floats
 
 MORE_KNOWN_S = 10.0
@@ -73,7 +72,12 @@ def _flight(asked: FlightPlanSettings, data: Data | None) -> Flight:
         force = TRUSTED * math.hypot(ACCELEROMETERS[asked.imu] / math.sqrt(WINDOW_S), VIBRATION_M_S2)
     flight = flight_of(
         reference_motion(asked) if data is None else data,
-        _usable(asked),
+        FlightSettings(
+            poses_until_s=asked.poses_until_s,
+            attitudes=asked.attitudes,
+            heading_std_deg=asked.heading_std_deg,
+            anchors=asked.anchor_places,
+        ),
         Errors(noise_m=asked.noise_m, reflected=asked.reflected),
         curve=not asked.delays_only,
         force_std_m_s2=force,
@@ -87,10 +91,6 @@ def _flight(asked: FlightPlanSettings, data: Data | None) -> Flight:
             parameter="taped",
         )
     return flight
-
-
-def _usable(asked: FlightPlanSettings) -> Usable:
-    return usable_of(asked.poses_until_s, asked.attitudes, asked.heading_std_deg, asked.anchor_places, (), "used")
 
 
 def _with_tape(asked: FlightPlanSettings, flight: Flight) -> Flight | None:
@@ -112,7 +112,6 @@ def _plan(asked: FlightPlanSettings, data: Data | None) -> FlightPlan:
     every = TWO_SIDED_95 * np.sqrt(np.diag(found.covariance_ns2))
     return FlightPlan(
         settings=asked,
-        usable=_usable(asked),
         reflected=asked.reflected,
         ranges=len(flight.scene.time_s),
         seconds=float(np.ptp(flight.scene.time_s)),

@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.information import Verdict
 from calib.planning.settings import FlightPlanSettings
-from calib.trajectories.scene import Usable
 from uwblink.arrays import Floats
 
 GUESS_NS = 1.5
@@ -207,7 +206,6 @@ class FlightPlan(_Plan):
     """
 
     settings: FlightPlanSettings
-    usable: Usable
     ranges: int
     seconds: float
     source: str
@@ -247,17 +245,17 @@ class FlightPlan(_Plan):
         yield "Fit delays, curve and trajectories together."
 
     def _known(self) -> Iterator[str]:
-        if self.usable.poses_until_s:
-            yield f"Let all positions be known for the first {self.usable.poses_until_s:g} s, to about 2 cm."
+        if self.settings.poses_until_s:
+            yield f"Let all positions be known for the first {self.settings.poses_until_s:g} s, to about 2 cm."
         if self.stands:
-            given = self.usable.anchors == "given"
+            given = self.settings.anchor_places == "given"
             yield f"Places of the {len(self.stands)} anchors {'are measured' if given else 'are found along'}."
         for first, second in self.taped:
             yield f"Tape the distance of tags {first} and {second}, antenna to antenna{self._while()}."
-        if self.usable.attitudes == "imu":
+        if self.settings.attitudes == "imu":
             yield "Attitudes come from gyroscopes and accelerometers."
-        elif self.usable.attitudes == "poses":
-            yield f"Attitudes come all along, with headings good to {self.usable.heading_std_deg:g} degrees."
+        elif self.settings.attitudes == "poses":
+            yield f"Attitudes come all along, with headings good to {self.settings.heading_std_deg:g} degrees."
 
     def _while(self) -> str:
         return f", while robots stand for the first {self.settings.still_s:g} s" if self.settings.still_s else ""
@@ -278,11 +276,11 @@ class FlightPlan(_Plan):
             name = "flight.uwb"
             yield f"uwblink record {ports} --pairs all --duration {self.seconds:.0f} -o {name}"
             yield f"uwblink poses {name} --from poses.csv --tags robots.toml"
-        usable, still_s = self.usable, self.settings.still_s
-        words = [f"--poses-until {usable.poses_until_s:g}"] if usable.poses_until_s is not None else []
-        words += [f"--attitudes {usable.attitudes}"] if usable.attitudes != "poses" else []
-        words += [f"--heading-std {usable.heading_std_deg:g}"] if usable.heading_std_deg != 3 else []
-        words += [f"--anchors {usable.anchors}"] if self.stands else []
+        flown, still_s = self.settings, self.settings.still_s
+        words = [f"--poses-until {flown.poses_until_s:g}"] if flown.poses_until_s is not None else []
+        words += [f"--attitudes {flown.attitudes}"] if flown.attitudes != "poses" else []
+        words += [f"--heading-std {flown.heading_std_deg:g}"] if flown.heading_std_deg != 3 else []
+        words += [f"--anchors {flown.anchor_places}"] if self.stands else []
         when = f"@0..{still_s:g}" if still_s else ""
         words += [f"--distance {first}-{second}=METRES{when}" for first, second in self.taped]
         yield f"calib fit {name} --truth ranges {' '.join(words)} -o calibration.json"

@@ -215,7 +215,7 @@ def flight(width_in: float, plan: FlightPlan) -> Figure:
     """Draw where bodies fly, from above and in height over time; thick while their positions are known."""
     figure, (above, height) = sheet(width_in, 2, height_in=2.9)
     time = np.linspace(0, plan.seconds, len(plan.path_m))
-    early = time <= (plan.seconds if plan.usable.poses_until_s is None else plan.usable.poses_until_s)
+    early = time <= (plan.seconds if plan.settings.poses_until_s is None else plan.settings.poses_until_s)
     for k, body in enumerate(plan.bodies):
         own = look(k)
         x, y, z = plan.path_m[:, k].T

@@ -91,7 +91,7 @@ class Inertial:
     turn: Floats
     std_m_s2: float = FORCE_STD_M_S2
 
-    def within(self, begin_s: float, end_s: float) -> Inertial:
+    def between(self, begin_s: float, end_s: float) -> Inertial:
         """Return the windows inside a span of time."""
         rows = (self.begin_s >= begin_s) & (self.end_s <= end_s)
         chosen = {name: getattr(self, name)[rows] for name in ("begin_s", "end_s", "force_m_s2", "turn")}

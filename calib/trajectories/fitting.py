@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, replace
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-import uwblink
 from calib.calibration.model import Calibration
-from calib.calibration.power_curves import ALPHA_DBM
 from calib.calibration.power_curves import lift as lift_power
 from calib.checks.fitted import examine_fit
-from calib.checks.limits import limits, warnings_of
-from calib.checks.plausibility import implausible, one_way, refuse_refuted
-from calib.checks.power_levels import unlike_powers
+from calib.checks.plausibility import refuse_refuted
 from calib.data.sources import Data
 from calib.errors import BadInputError, UnanswerableError
 from calib.estimator.known_distances import FEWEST_RANGES, Fitted, KnownDistances, described
@@ -28,60 +24,59 @@ from calib.estimator.range_model import RangeModel
 from calib.estimator.range_rows import Mixture
 from calib.estimator.time_blocks import time_blocks
 from calib.estimator.to_calibration import calibration_of
+from calib.fitting.fitting import result_of
 from calib.fitting.known_delays import imported
 from calib.fitting.result import FitResult
-from calib.settings import FitSettings, check_choice
+from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.judging import Judged, curve_uncertainty, judged
-from calib.trajectories.scene import Scene, Usable, scene_from
+from calib.trajectories.scene import Scene, scene_from
 from calib.trajectories.search import Cauchy, Found, search
 from calib.trajectories.start import begin
 from uwblink.arrays import Floats
-from uwblink.recording.schema import KnownDistance
 
-ATTITUDES = ("poses", "imu", "none")
-ANCHORS = ("given", "sought")
-HEIGHTS = ("used", "ignored")
-INLIER_SIGMAS = 3.0
-FOLLOWED = 0.3
-"""Share of the work that is done when trajectories have been followed, for a bar of progress."""
+SHARED = (
+    "fixed_ns",
+    "groups",
+    "lift",
+    "alpha_dbm",
+    "reference_power_dbm",
+    "delays_only",
+    "minimum_norm",
+    "between_m",
+)
+"""The settings of `fit` that a fit without known distances has, too."""
+
+SHARE_OF_START = 0.3
+"""Share of the work that is done when the search for trajectories has a start, for a bar of progress."""
 
 
-def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each with its default
+def fit_from_ranges(
     data: Data,
+    flight: FlightSettings | None = None,
+    settings: FitSettings | None = None,
     *,
-    poses_until_s: float | None = None,
-    attitudes: str = "poses",
-    heading_std_deg: float = 3.0,
-    anchors: str = "given",
-    distances: Iterable[KnownDistance] = (),
-    heights: str = "used",
-    curve_from: Calibration | str | os.PathLike[str] | None = None,
-    fixed_ns: Mapping[int, float] | None = None,
-    groups: Mapping[str, tuple[int, ...]] | None = None,
-    lift: str = "mean-of-lifted",
-    alpha_dbm: float = ALPHA_DBM,
-    reference_power_dbm: float | None = None,
-    delays_only: bool = False,
-    minimum_norm: bool = False,
     progress: Callable[[float], None] | None = None,
+    **changes: Any,
 ) -> FitResult:
     """Fit antenna delays and curves to the ranges of moving bodies whose trajectories are not known.
 
-    `data` is one recording with the tags' bodies and lever arms. The bodies' positions are taken from its poses during
-    the first `poses_until_s` seconds (all there are, by default) and found from the ranges elsewhere, together with
-    delays and curve. `attitudes` come from the "poses", all along; from the "imu", from the poses' attitude at first;
-    or there are "none". Headings may be wrong by `heading_std_deg`, and wander; 0 takes attitudes as they are.
-    Bodies whose poses stay in one place are anchors: their places are "given", or "sought" with all else.
+    `data` is one recording with the tags' bodies and lever arms. `flight` says what is known of the flight; `settings`
+    are those of `fit`, of which `SHARED` apply; keyword arguments are named like the fields of either.
 
-    `distances` were measured otherwise, beside those that the recording states: between anchors, or between moving
-    bodies while they stood still, in an arrangement of the recording or a span of seconds since the first range
-    ("2..8"). `heights` of the recording's sensors are "used" or "ignored". `curve_from` is a calibration, or its path,
-    whose curve is taken as it is, with its lift and reference power; what is unsure of it is in the delays' intervals.
+    The bodies' positions are taken from the recording's poses during the first `poses_until_s` seconds (all there are,
+    by default). Elsewhere they are estimated from the ranges, together with delays and curve. `attitudes` come from the
+    "poses", all along; from the "imu", which begins with the poses' attitude; or there are "none". Headings have errors
+    of `heading_std_deg` that wander; 0 takes attitudes as exact. Bodies whose poses stay in one place are anchors;
+    their positions (`anchors`) are "given", or "sought" (estimated). `distances` by tape are used beside those that
+    the recording states: between anchors, or between moving bodies while they stood still, in an arrangement of the
+    recording or a span of seconds since the first range ("2..8"). `heights` of the recording's sensors are "used" or
+    "ignored". `curve_from` is a calibration, or its path, whose curve is kept, with its lift and reference power; its
+    uncertainty is in the intervals of the delays.
 
-    The result is what `fit` returns; the truth of its `ranges` is the distances that were found. What the ranges do not
-    determine is named: `UnanswerableError` is raised where no delay is determined, unless `minimum_norm` asks for those
-    nearest to zero, and delays that are not determined have infinite standard errors. `progress` is called with the
-    done fraction, 0 to 1. Raises `BadInputError` for a parameter that cannot be used.
+    The result is what `fit` returns; the truth of its `ranges` is the estimated distances. `UnanswerableError` is
+    raised where no delay is determined, unless `minimum_norm` asks for the delays nearest to zero; delays that are not
+    determined have infinite standard errors. `progress` is called with the done fraction, 0 to 1. Raises
+    `BadInputError` for a setting that cannot be used.
 
     >>> import calib
     >>> result = calib.fit_from_ranges(calib.sample_flight(), poses_until_s=5.0)
@@ -89,98 +84,67 @@ def fit_from_ranges(  # noqa: PLR0913 - keyword-only settings of one fit, each w
     >>> f"{delays[2] - delays[1]:.1f} ns, planted 0.4 ns"
     '0.4 ns, planted 0.4 ns'
     """
-    fixed = {int(tag): float(delay) for tag, delay in (fixed_ns or {}).items()}
-    groups = {name: tuple(map(int, tags)) for name, tags in (groups or {}).items()}
-    known = _curve_source(curve_from, "delays_only" if delays_only else "groups" if groups else "")
-    if known is not None:
-        lift, alpha_dbm = known.lift, known.alpha_dbm
-        reference_power_dbm = known.provenance.get("reference_power_dbm", alpha_dbm)
-    FitSettings(lift=lift, alpha_dbm=alpha_dbm, fixed_ns=fixed, groups=groups, reference_power_dbm=reference_power_dbm)
-    asked = Asked(
-        usable=usable_of(poses_until_s, attitudes, heading_std_deg, anchors, tuple(distances), heights),
-        lift=lift,
-        alpha_dbm=alpha_dbm,
-        fixed=fixed,
-        groups=groups,
-        reference_dbm=alpha_dbm if reference_power_dbm is None else reference_power_dbm,
-        curve=not delays_only and known is None,
-        known=known,
-    )
-    done = progress or (lambda _: None)
-    scene = scene_from(data, asked.usable, need_power=not delays_only)
-    # The same bytes on any machine; SciPy brings a linear algebra of its own, which must be there to be held.
+    flight, settings, known = _settings(flight, settings, changes)
+    report = progress or (lambda _: None)
+    scene = scene_from(data, flight, need_power=not settings.delays_only)
+    # The same bytes on any machine; SciPy brings a linear algebra of its own, which must be loaded to be limited.
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
-        model, scene = asked.model(scene)
-        scene, state, rival = begin(scene, lambda share: done(FOLLOWED * share))
+        model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
+        scene, state, rival = begin(scene, lambda share: report(SHARE_OF_START * share))
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
-        top = search(scene, model, error, state, lambda share: done(FOLLOWED + (1 - FOLLOWED) * share))
+        top = search(scene, model, error, state, lambda share: report(SHARE_OF_START + (1 - SHARE_OF_START) * share))
         found = _described(model, top, known)
         verdict = judged(found, top)
-        result = _result(found, top, verdict, asked, rival)
-    done(1.0)
-    if not minimum_norm:
+        result = _result(found, top, verdict, flight, settings, known, rival)
+    report(1.0)
+    if not settings.minimum_norm:
         _refuse_undetermined(verdict, model, scene)
     return result
 
 
-def usable_of(
-    poses_until_s: float | None,
-    attitudes: str,
-    heading_std_deg: float,
-    anchors: str,
-    distances: tuple[KnownDistance, ...],
-    heights: str,
-) -> Usable:
-    """Return what of a recording may be used; raises `BadInputError` for what cannot be read."""
-    check_choice("attitudes", attitudes, ATTITUDES)
-    check_choice("anchors", anchors, ANCHORS)
-    check_choice("heights", heights, HEIGHTS)
-    for name, value in (("poses_until_s", poses_until_s), ("heading_std_deg", heading_std_deg)):
-        if value is not None and not (np.isfinite(value) and value >= 0):
-            raise BadInputError(f"found {value!r}, expected a number of 0 or more", parameter=name)
-    return Usable(
-        poses_until_s=poses_until_s,
-        attitudes=attitudes,
-        heading_std_deg=heading_std_deg,
-        anchors=anchors,
-        distances=distances,
-        heights=heights,
+def _settings(
+    flight: FlightSettings | None, settings: FitSettings | None, changes: Mapping[str, Any]
+) -> tuple[FlightSettings, FitSettings, Calibration | None]:
+    """Return all settings with changes, and the calibration whose curve is kept; refuses what does not go together."""
+    names = {one.name for one in fields(FlightSettings)}
+    flight = replace(flight or FlightSettings(), **{name: changes[name] for name in changes if name in names})
+    settings = replace(settings or FitSettings(), **{name: changes[name] for name in changes if name not in names})
+    for name in settings.changed():
+        if name not in SHARED:
+            raise BadInputError("goes with known distances only", parameter=name)
+    known = _curve_source(
+        flight.curve_from, "delays_only" if settings.delays_only else "groups" * bool(settings.groups)
     )
+    if known is not None:
+        reference = known.provenance.get("reference_power_dbm", known.alpha_dbm)
+        settings = replace(settings, lift=known.lift, alpha_dbm=known.alpha_dbm, reference_power_dbm=reference)
+    return flight, settings, known
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
-    """What a fit was asked for."""
-
-    usable: Usable
-    lift: str
-    alpha_dbm: float
-    fixed: dict[int, float]
-    groups: Mapping[str, tuple[int, ...]]
-    reference_dbm: float
-    curve: bool
-    known: Calibration | None = None
-
-    def model(self, scene: Scene, *, offsets: bool = True) -> tuple[RangeModel, Scene]:
-        """Return unknowns and parts of delays, curves and offsets, and the scene of their ranges."""
-        if len(scene.ranges) < FEWEST_RANGES:
-            raise UnanswerableError(
-                f"{scene.source}: {len(scene.ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
-            )
-        # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
-        numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
-        model = RangeModel.of(
-            numbered,
-            lift=self.lift,
-            alpha_dbm=self.alpha_dbm,
-            fixed_ns=self.fixed,
-            groups=self.groups,
-            curve=self.curve,
-            reference=float(lift_power(np.array(self.reference_dbm), self.alpha_dbm)),
-            offsets=offsets,
+def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bool = True) -> tuple[RangeModel, Scene]:
+    """Return unknowns and parts of delays, curves and offsets, and the scene of their ranges."""
+    if len(scene.ranges) < FEWEST_RANGES:
+        raise UnanswerableError(
+            f"{scene.source}: {len(scene.ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
         )
-        return model, scene.only(model.ranges.truth_m.astype(np.int64))
+    # The truth is not known. In its place stands the number of the row, which says what rows the model keeps.
+    numbered = replace(scene.ranges, truth_m=np.arange(len(scene.ranges), dtype=np.float64))
+    model = RangeModel.of(
+        numbered,
+        lift=settings.lift,
+        alpha_dbm=settings.alpha_dbm,
+        fixed_ns=dict(settings.fixed_ns),
+        groups=settings.groups,
+        curve=curve,
+        reference=float(lift_power(np.array(_reference_dbm(settings)), settings.alpha_dbm)),
+        offsets=offsets,
+    )
+    return model, scene.only(model.ranges.truth_m.astype(np.int64))
+
+
+def _reference_dbm(settings: FitSettings) -> float:
+    return settings.alpha_dbm if settings.reference_power_dbm is None else settings.reference_power_dbm
 
 
 def _curve_source(curve_from: Calibration | str | os.PathLike[str] | None, other: str) -> Calibration | None:
@@ -224,45 +188,46 @@ def _described(model: RangeModel, top: Found, known: Calibration | None) -> Know
     return found
 
 
-def _result(found: KnownDistances, top: Found, judgement: Judged, asked: Asked, rival: str) -> FitResult:
-    ranges = found.model.ranges
+def _result(
+    found: KnownDistances,
+    top: Found,
+    judgement: Judged,
+    flight: FlightSettings,
+    settings: FitSettings,
+    known: Calibration | None,
+    rival: str,
+) -> FitResult:
+    fixed = dict(settings.fixed_ns)
+    refuse_refuted(
+        dict(zip(found.model.tags, found.delays.tolist(), strict=False)), found.residuals, found.model.ranges
+    )
     doubts = examine_fit(found)
     covariance = judgement.beyond_linear(doubts.covariance_ns2)
     calibration = calibration_of(
-        found, covariance, lift=asked.lift, alpha_dbm=asked.alpha_dbm, fixed=asked.fixed, groups=asked.groups
+        found,
+        covariance,
+        lift=settings.lift,
+        alpha_dbm=settings.alpha_dbm,
+        fixed=fixed,
+        groups=settings.groups,
+        between_m=settings.between_m,
     )
-    if asked.known is not None:
-        calibration = _with_curve(calibration, asked.known)
-    std = calibration.delays_std_ns | dict.fromkeys(judgement.free_tags, math.inf)
-    calibration = replace(calibration, delays_std_ns=std)
-    applied = replace(calibration, errors=None).apply(ranges)
-    residuals = applied.corrected_m - ranges.truth_m
-    refuse_refuted(calibration.delays_ns, residuals, ranges)
-    inliers = np.abs(residuals) < INLIER_SIGMAS * applied.sigma_m
-    warnings = [
-        *judgement.left_open(covariance),
-        *_of_search(top, rival),
-        *top.scene.tapes.left_out,
-        *limits(found, ranges, residuals, asked.fixed),
-        *judgement.sentences,
-        *doubts.sentences,
-        *one_way(ranges),
-        *implausible(calibration.delays_ns, residuals),
-        *unlike_powers(ranges, calibration),
-        *warnings_of(ranges, float(np.mean(inliers)), [], found.blocks.seconds),
-    ]
-    provenance = _provenance(found, top, judgement, asked, covariance) | {
-        "inliers": int(np.count_nonzero(inliers)),
-        "warnings": warnings,
-    }
-    return FitResult(
-        calibration=replace(calibration, provenance=provenance),
-        ranges=ranges,
-        residuals_m=residuals,
-        inliers=inliers,
-        success=top.success,
-        message=f"{'converged' if top.success else 'stopped'} after {top.steps} steps",
-        warnings=warnings,
+    if known is not None:
+        calibration = _with_curve(calibration, known)
+    calibration = replace(
+        calibration,
+        delays_std_ns=calibration.delays_std_ns | dict.fromkeys(judgement.free_tags, math.inf),
+        provenance=_provenance(found, top, judgement, flight, settings, covariance),
+    )
+    return result_of(
+        found,
+        calibration,
+        found.model.ranges,
+        doubts.sentences,
+        settings=settings,
+        fixed=fixed,
+        first=[*judgement.left_open(covariance), *_of_search(top, rival), *top.scene.tapes.left_out],
+        more=judgement.sentences,
     )
 
 
@@ -295,40 +260,39 @@ def _refuse_undetermined(judgement: Judged, model: RangeModel, scene: Scene) -> 
 
 
 def _provenance(
-    found: KnownDistances, top: Found, judgement: Judged, asked: Asked, covariance: Floats
+    found: KnownDistances,
+    top: Found,
+    judgement: Judged,
+    flight: FlightSettings,
+    settings: FitSettings,
+    covariance: Floats,
 ) -> dict[str, Any]:
-    scene, ranges, known = top.scene, found.model.ranges, top.scene.places.time_s
+    """Return what a calibration of trajectories states beside what all fits state."""
+    scene, places_s, reference_dbm = top.scene, top.scene.places.time_s, _reference_dbm(settings)
     more: dict[str, Any] = {}
     if judgement.free_tags:
-        more |= {"undetermined": [judgement.free_tags], "left_open": judgement.left_open(covariance)[0]}
-    if asked.fixed:
-        more["fixed_ns"] = {str(tag): delay for tag, delay in sorted(asked.fixed.items())}
-    pinned = set(found.model.tags) <= set(asked.fixed)
+        more = {"undetermined": [judgement.free_tags], "left_open": judgement.left_open(covariance)[0]}
+    pinned = set(found.model.tags) <= set(settings.fixed_ns)
     return more | {
-        "writer": f"uwbcal {uwblink.__version__}",
         "recordings": [scene.source],
-        "exchanges": len(ranges),
-        "excluded": ranges.excluded,
         "recipe": "trajectories",
         "truth": "ranges",
         "fitted": "delays only" if found.model.curve is None else "curve only" if pinned else "delays and curve",
         "rests_on": {
-            "known_s": float(np.ptp(known)) if len(known) else 0.0,
+            "known_s": float(np.ptp(places_s)) if len(places_s) else 0.0,
             "moving": list(scene.moving),
             "anchors_given": [body for body, place in scene.still.items() if place is not None],
             "anchors_sought": scene.sought,
-            "attitudes": asked.usable.attitudes if scene.attitudes else "none",
-            "heading_std_deg": asked.usable.heading_std_deg,
-            "distances": len(scene.tapes.told),
+            "attitudes": flight.attitudes if scene.attitudes else "none",
+            "heading_std_deg": flight.heading_std_deg,
+            "distances": len(scene.tapes.stated),
             "heights": sorted({scene.moving[body] for body in scene.heights.body.tolist()}),
         },
         "distance_std_m": judgement.distance_std_m,
         "absorbed": judgement.absorbed,
         "used": top.used,
         "jerk_m_s3": top.jerk_m_s3,
-        "converged": top.success,
-        "reference_power_dbm": asked.reference_dbm,
-        "standard_errors": f"sandwich over {found.lasting.lasting[0].stretches:.0f} independent stretches of time",
-        "gauge": f"the bias curve{' was taken, and' if asked.known else ''} is zero at {asked.reference_dbm:g} dBm; "
-        "the delays carry the constant",
+        "reference_power_dbm": reference_dbm,
+        "gauge": f"the bias curve{' was kept, and' if flight.curve_from else ''} is zero at {reference_dbm:g} dBm; the "
+        "delays carry the constant",
     }

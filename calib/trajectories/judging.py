@@ -174,7 +174,7 @@ def _of_tapes(top: Found) -> Iterator[str]:
     if not isinstance(rows, TapeRows):
         return
     left, moved = rows.residuals(top.optimum.x), rows.geometry.distances(top.optimum.x)[1]
-    for number, one in enumerate(top.scene.tapes.told):
+    for number, one in enumerate(top.scene.tapes.stated):
         mine = np.flatnonzero(top.scene.tapes.number == number)
         row = np.zeros(top.optimum.layout.size)
         np.add.at(row, rows.geometry.columns[mine], moved[mine] / len(mine))

@@ -241,7 +241,7 @@ class _Search:
                 },
             )
         if isinstance(height := known.get("height"), NormalRows):
-            scene = replace(scene, heights=scene.heights.weighed(height.left(self.x) / height.std))
+            scene = replace(scene, heights=scene.heights.reweighted(height.left(self.x) / height.std))
         self.motion = replace(self.motion, scene=scene)
         self.known = known_rows(self.motion, self.layout)
 

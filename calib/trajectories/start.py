@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.trajectories.motion import Motion
-from calib.trajectories.scene import Places, Scene
+from calib.trajectories.samples import Places
+from calib.trajectories.scene import Scene
 from calib.trajectories.search import JERK_M_S3, Settled, State, settle
 from uwblink.arrays import Floats
 

@@ -13,7 +13,7 @@ from calib.cli.commands import app
 from calib.planning import FlightPlanSettings, flight_information
 from calib.planning.flight_information import Errors, Information, flight_of
 from calib.planning.reference_motion import reference_motion
-from calib.trajectories.scene import Usable
+from calib.settings import FlightSettings
 from tests import processes
 from tests.calib.trajectories.sines import flight
 
@@ -36,7 +36,9 @@ def rehearsed(**other):
 
 def covariance_ns2(seen, *, noise_m=0.04, reflected=0.08, curve=True, force=None, **usable):
     errors = Errors(noise_m=noise_m, reflected=reflected)
-    return flight_of(seen, Usable(**usable), errors, curve=curve, force_std_m_s2=force).predicted().covariance_ns2
+    return (
+        flight_of(seen, FlightSettings(**usable), errors, curve=curve, force_std_m_s2=force).predicted().covariance_ns2
+    )
 
 
 def foreseen_ns(seen, **given):
@@ -57,7 +59,7 @@ def test_with_everything_known_a_plan_is_a_fit_with_known_distances():
     seen = flight(seconds=12.0)
     planned = flight_of(
         seen,
-        Usable(poses_until_s=None, heading_std_deg=0.0),
+        FlightSettings(poses_until_s=None, heading_std_deg=0.0),
         Errors(noise_m=0.04, reflected=0.0),
         curve=False,
         force_std_m_s2=None,
@@ -149,7 +151,7 @@ def test_trajectories_are_held_as_jerky_as_they_are_planned():
         for k in (1, 2, 3)
     ]
     inside = (time[:-3] > 1.0) & (time[:-3] < 15.0)
-    planned = Information(flight_of(seen, Usable(poses_until_s=8.0), PLAIN, curve=True, force_std_m_s2=None))
+    planned = Information(flight_of(seen, FlightSettings(poses_until_s=8.0), PLAIN, curve=True, force_std_m_s2=None))
     # A spline with points 0.4 s apart takes off some of the quickest part.
     assert planned.jerk_m_s3 == pytest.approx(math.sqrt(np.mean([j[inside] ** 2 for j in jerks])), rel=0.15)
 
@@ -176,7 +178,11 @@ def test_a_tape_between_robots_that_stand_says_what_all_delays_share():
 
 def test_the_best_tape_is_the_best_of_all():
     seen = flight_of(
-        rehearsed(seconds=8.0), Usable(poses_until_s=4.0, anchors="sought"), PLAIN, curve=True, force_std_m_s2=None
+        rehearsed(seconds=8.0),
+        FlightSettings(poses_until_s=4.0, anchors="sought"),
+        PLAIN,
+        curve=True,
+        force_std_m_s2=None,
     )
     spreads = {
         pair: float(np.trace(seen.taped([pair], 0.0, 0.01).predicted().covariance_ns2))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.trajectories.scene import heights_of, tapes_of
+from calib.trajectories.samples import heights_of, tapes_of
 from tests.calib.trajectories.sines import DELAYS_NS, flight
 from uwblink import Arrangement, KnownDistance
 
@@ -87,7 +87,7 @@ def test_a_distance_says_as_much_whether_it_holds_for_long_or_short():
     assert found.time_s[found.number == 1] == pytest.approx([1.2, 1.6, 2.0, 2.4, 2.8])
     for number, one in enumerate(stated):
         assert np.sum(found.std_m[found.number == number] ** -2.0) == pytest.approx(one.sigma_m**-2.0)
-    assert found.within(10.0, 12.0).number.tolist() == [0]
+    assert found.between(10.0, 12.0).number.tolist() == [0]
     without = tapes_of(stated[2:], [], BODIES, {"c", "d"}, 0, 20.0)
     assert len(without) == 0
     assert "the distance of tags 2 and 3 is not used" in without.left_out[0]
@@ -101,7 +101,7 @@ def test_a_reading_that_sees_a_table_counts_less():
     found = heights_of(table, ["b", "a"], 0, 20.0)
     assert len(found.time_s) == 200
     assert set(found.body.tolist()) == {1}
-    weighed = found.weighed((found.height_m - 1.0) / found.std_m)
+    weighed = found.reweighted((found.height_m - 1.0) / found.std_m)
     table_m = (found.time_s > 7) & (found.time_s < 8)
     assert np.median(weighed.std_m[table_m]) > 3 * np.median(weighed.std_m[~table_m])
 
@@ -117,7 +117,7 @@ def test_heights_count_by_how_far_they_are_off(off_m, std_m):
     off[50] *= 10
     table = {"time_ns": np.arange(101) * 10**8, "body": np.full(101, "a"), "height_m": 1.0 + off}
     found = heights_of(table, ["a"], 0, 20.0)
-    weighed = found.weighed((found.height_m - 1.0) / found.std_m).std_m
+    weighed = found.reweighted((found.height_m - 1.0) / found.std_m).std_m
     usual = np.delete(weighed, 50)
     if abs(off_m) < 1:
         assert usual == pytest.approx(std_m, rel=1e-3)

@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 
 import calib
 import uwbsim
+from calib.settings import FlightSettings
 from calib.trajectories.attitudes import Attitude
-from calib.trajectories.scene import Usable, scene_from
+from calib.trajectories.scene import scene_from
 from calib.trajectories.start import Followed, turned_right
 
 BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
@@ -39,7 +40,7 @@ def flown():
 
 def test_attitudes_by_gyroscope_stay_near_those_of_motion_capture(flown):
     began = flown.exchanges.time_ns[0] * 1e-9
-    scene = scene_from(flown, Usable(poses_until_s=4.0, attitudes="imu"))
+    scene = scene_from(flown, FlightSettings(poses_until_s=4.0, attitudes="imu"))
     time = np.arange(0.5, 15.0, 0.5)
     for body in BOXES:
         poses = flown.poses[flown.poses.body == body]
@@ -57,8 +58,8 @@ def test_attitudes_by_gyroscope_stay_near_those_of_motion_capture(flown):
 
 
 def test_headings_that_are_wrong_by_a_right_angle_are_found_over_the_flight(flown):
-    scene = scene_from(flown, Usable(poses_until_s=0.0, attitudes="imu")).between(0.0, 8.0)
-    known = scene_from(flown, Usable(poses_until_s=0.0)).between(0.0, 8.0)
+    scene = scene_from(flown, FlightSettings(poses_until_s=0.0, attitudes="imu")).between(0.0, 8.0)
+    known = scene_from(flown, FlightSettings(poses_until_s=0.0)).between(0.0, 8.0)
     time = np.array([2.0, 5.0])
 
     def off(turned):

@@ -5,8 +5,9 @@ import pytest
 
 from calib.estimator.rows import NormalRows
 from calib.estimator.unknowns import Layout
+from calib.settings import FlightSettings
 from calib.trajectories.motion import Distances, Grid, Motion, known_rows
-from calib.trajectories.scene import Usable, scene_from
+from calib.trajectories.scene import scene_from
 from calib.trajectories.search import Cauchy, Coarseness
 from tests.calib.trajectories.sines import flight
 from uwblink import KnownDistance
@@ -35,7 +36,7 @@ def laid_out():
         KnownDistance(1, 12, 3.0, 0.01, "0..1"),
         KnownDistance(3, 6, 2.0, 0.01, "1..2"),
     )
-    scene = scene_from(flown, Usable(poses_until_s=1.0, anchors="sought", distances=tapes))
+    scene = scene_from(flown, FlightSettings(poses_until_s=1.0, anchors="sought", distances=tapes))
     motion = Motion.of(scene)
     layout = Layout(motion.unknowns({}, 8.0))
     rng = np.random.default_rng(2)
