@@ -24,13 +24,13 @@ from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 
 CURVE_SERIES = 5
-"""So many values of a smooth curve are about independent."""
+"""Number of independent values of a smooth curve."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """Unknowns (k,) whose errors last alike: the `combinations` (m, k) of them, of which so many are independent, tell
-    for how long."""
+    """Unknowns (k,) whose errors have one persistence, estimated from `combinations` (m, k) of which so many are
+    independent."""
 
     indices: Ints
     combinations: Floats
@@ -39,11 +39,11 @@ class Kept:
 
     @classmethod
     def delays(cls, indices: Ints, each: float) -> Kept:
-        """Return delays that pairs of so many ranges `each` determine.
+        """Return delays; pairs have so many ranges `each`.
 
-        What all of them share is the curve's constant, and would hide how long their errors last. What the errors of a
-        pair are made of is known from its own ranges, so that intervals are those of Student's t with as many degrees
-        of freedom as a pair has ranges beyond one.
+        Their common part is the constant of the curve and is excluded from the persistence. The parameters of a pair's
+        errors are known from its own ranges, so intervals are those of Student's t with as many degrees of freedom as a
+        pair has ranges beyond one.
         """
         count = len(indices)
         apart = np.eye(count) - (1 / count if count > 1 else 0.0)
@@ -57,9 +57,9 @@ class Kept:
 
 @dataclass(frozen=True, kw_only=True)
 class Covariance:
-    """Covariance (k, k) of all kept unknowns in their order, and how long the errors of each sort last.
+    """Covariance (k, k) of all kept unknowns in their order, and the persistence of each group.
 
-    1.96 of its standard errors make 95 % intervals: what a small sample takes is in it already.
+    1.96 standard errors make 95 % intervals: the factor of small samples is included.
     """
 
     matrix: Floats
@@ -70,9 +70,9 @@ class Covariance:
 def sandwich(
     optimum: Optimum, rows: RangeRows, kept: Sequence[Kept], blocks: TimeBlocks, beside: Sequence[Rows] = ()
 ) -> Covariance:
-    """Return the covariance of the kept unknowns at an optimum of ranges, which lie in blocks of time.
+    """Return the covariance of the kept unknowns at an optimum of ranges in blocks of time.
 
-    What is known `beside` ranges (poses, tapes) is taken to be as uncertain as it is said to be.
+    The standard errors of rows `beside` ranges (poses, tapes) are taken as stated.
     """
     keep = np.concatenate([sort.indices for sort in kept])
     reach = optimum.covariance[:, keep]
@@ -100,11 +100,11 @@ def sandwich(
 
 
 def of_weights(optimum: Optimum, keep: Ints) -> Floats:
-    """Return the covariance (k, k) that not knowing the weights of priors adds to that of some unknowns (k,).
+    """Return the covariance (k, k) that uncertain weights of priors add to that of some unknowns (k,).
 
-    A prior pulls the unknowns by covariance times precision times what they are off its centre, for each unit of the
-    weight's logarithm, which is known to 2 over what the prior leaves free, as a variance of so many values is (the
-    first-order correction of Kass and Steffey 1989).
+    A change of the logarithm of a weight moves the unknowns by covariance times precision times their distance from the
+    prior's centre. The variance of that logarithm is 2 over the degrees of freedom of the prior, as for the variance of
+    so many values (first-order correction of Kass and Steffey 1989).
     """
     found = np.zeros((len(keep),) * 2)
     priors = optimum.priors

@@ -1,8 +1,8 @@
-"""What the errors of ranges yet to come are made of, from those that were fitted.
+"""The error model of future ranges, from fitted ones.
 
-Reflections last, so a pair's share in one recording says less of its share in another than as many independent ranges
-would: how much less is read off the slopes by the shares, summed over blocks of time. Pairs are drawn to what they have
-in common by that, and what stays unknown of a share is in the share that is predicted.
+Reflections last, so the share of reflections of a pair in one recording predicts its share in another less well than
+independent ranges would. The loss of information is estimated from sums of slopes over blocks of time. Parameters of
+pairs are shrunk to their common value accordingly, and the remaining uncertainty of a share enters the predicted share.
 """
 
 from __future__ import annotations
@@ -25,22 +25,20 @@ if TYPE_CHECKING:
     from calib.estimator.known_distances import DescribedErrors
 
 NODES = 8
-"""Powers at which noise and share are stated; both are straight between them."""
+"""Number of powers at which noise and share are stated; between them both are linear."""
 
 JUDGED = 20_000
-"""Ranges by which quantiles and the total sigma are put right; more would say nothing else."""
+"""Number of ranges from which quantiles and the total sigma are corrected; more change nothing."""
 
 FEWEST_JUDGED = 200
-"""Of fewer the model's own quantiles are the better guess."""
+"""With fewer ranges the quantiles of the model are not corrected."""
 
 LEVELS = (0.005, 0.025, 0.05, 0.16, 0.5, 0.84, 0.95, 0.975, 0.995)
-"""Shares of errors at which the model's quantiles are put right."""
+"""Shares of errors at which the model's quantiles are corrected."""
 
 BEYOND_MEANS = 8.0
-"""Errors longer than so many means of the longer detours are no part of the total sigma.
-
-An exponential leaves 0.03 % of its values beyond, which carry 1.4 % of their mean square.
-"""
+"""Errors longer than so many means of the longer detours are excluded from the total sigma. An exponential distribution
+has 0.03 % of its values beyond, which carry 1.4 % of its mean square."""
 
 SMALLEST_SHARE = 1e-4
 WIDEST_ODDS, WIDEST_DETOUR = 4.0, 1.0
@@ -49,17 +47,17 @@ a third and three times the common detour. What a few lasting reflections leave 
 
 
 SPELLS = 8
-"""Parts of a recording between which what stays for a spell is compared."""
+"""Number of spells of a recording that are compared."""
 
 
 def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks) -> ErrorModel:
-    """Return what errors are made of, from residuals (n,) in the order of the model's ranges."""
+    """Return the error model of residuals (n,), in the order of the model's ranges."""
     values, number = errors.values, model.pairs.number
     found = error_slopes(residual - errors.location_m, errors.parameters, span_m=errors.span_m)
     lasting = lasting_in_pairs(found.by["odds"], number, blocks)
     pairs = len(model.pairs.ends)
     told = np.bincount(number, found.by["odds"] ** 2, pairs)
-    # One wall has one detour: a mean is known from as many reflections as there were, not from as many ranges.
+    # A wall has one detour: the number of reflections counts for the mean, not the number of ranges.
     reflected = np.bincount(number, found.reflected, pairs)
     odds, odds_var, any_odds, any_odds_var = _drawn(values["odds of pair"], lasting / np.maximum(told, 1e-6))
     detour, detour_var, any_detour, any_detour_var = _drawn(
@@ -103,10 +101,11 @@ def error_model(model: RangeModel, residual: Floats, errors: DescribedErrors, bl
 def between_recordings(
     model: RangeModel, residual: Floats, errors: DescribedErrors, blocks: TimeBlocks, pairs_m: float | None
 ) -> float:
-    """Return the standard deviation in metres of what another recording has in the ranges of a pair that this has not.
+    """Return the standard deviation, in metres, of the difference of a pair's offset between this and another
+    recording.
 
-    One recording shows offsets of pairs (`pairs_m`, None where they are not determined) and of pairs in spells of it,
-    which are as large as those of another day (public flights: 3 to 4 cm both).
+    One recording shows offsets of pairs (`pairs_m`, None if they are not determined) and of pairs in spells. Both are
+    as large as the differences between days (public flights: 3 to 4 cm).
     """
     found = error_slopes(residual - errors.location_m, errors.parameters, span_m=errors.span_m)
     pair, score = model.pairs.number, found.by[RESIDUAL]
@@ -115,18 +114,19 @@ def between_recordings(
     slope, known = (
         np.bincount(cell, column, pairs * SPELLS).reshape(pairs, SPELLS) / lasting for column in (score, score**2)
     )
-    # What is the same in all spells is the pair's.
+    # The common part of all spells is the offset of the pair.
     slope -= known * slope.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1e-300)
     spells_m = math.sqrt(mean_variance(known.ravel(), slope.ravel(), TYPICAL_OFFSET_M, OFFSETS[1:]))
     return math.hypot(spells_m, spells_m if pairs_m is None else pairs_m)
 
 
 def mean_variance(information: Floats, slope: Floats, typical: float, bounds: tuple[float, float]) -> float:
-    """Return the posterior mean of the variance of draws (k,), of which data tell independently.
+    """Return the posterior mean of the variance of independent draws (k,).
 
-    `information` (k,) and `slope` (k,) are those of the log likelihood of each draw at zero: under a variance s it is
-    (1 + s l)^-1/2 exp(b^2 s / (1 + s l) / 2). The standard deviation is half-normal beforehand, about `typical`, within
-    `bounds` (Gelman 2006). A likeliest variance would be zero where few values are uncertain.
+    `information` (k,) and `slope` (k,) are those of the log likelihood of each draw at zero: its marginal likelihood
+    under a variance s is (1 + s l)^-1/2 exp(b^2 s / (1 + s l) / 2). The prior of the standard deviation is half-normal
+    with scale `typical`, within `bounds` (Gelman 2006). The maximum of the likelihood would be zero with few uncertain
+    values.
     """
     deviation = np.geomspace(*bounds, 200)
     variance = deviation[:, None] ** 2
@@ -153,9 +153,9 @@ def _at_nodes(model: RangeModel, values: dict[str, Floats]) -> tuple[Floats, Flo
 
 
 def _drawn(value: Floats, variance: Floats) -> tuple[Floats, Floats, float, float]:
-    """Draw values (pairs,) with known variances to a common one; return them, their variances, and those of another.
+    """Shrink values (pairs,) with known variances to their mean; return them, their variances, and those of a new pair.
 
-    The variance between pairs is the likeliest of normal values (by expectation-maximisation).
+    The variance between pairs is the maximum of a normal likelihood (by expectation-maximisation).
     """
     between = float(np.var(value)) + 1e-3
     for _ in range(50):
@@ -179,7 +179,7 @@ def _share(log_odds: Floats) -> Floats:
 
 
 def _put_right(model: ErrorModel, of: RangeModel, residual: Floats) -> ErrorModel:
-    """Let quantiles and the total standard deviation hold in what was fitted, as far as one number for all can."""
+    """Correct the quantiles and the total standard deviation so that they hold for the fitted ranges on average."""
     rows = np.linspace(0, len(residual) - 1, min(JUDGED, len(residual))).astype(np.int64)
     if len(rows) < FEWEST_JUDGED:
         return model

@@ -1,4 +1,4 @@
-"""What errors of ranges are made of, group by group: in bins of power, of each pair, of one listener."""
+"""The error model by group: by bins of power, by pair, or for one listener."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from uwblink.arrays import Floats
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroupedErrors:
-    """The parts of errors by group (groups,): centre and standard deviation of direct ranges, reflections, outliers.
+    """The error model by group (groups,): centre and standard deviation of direct ranges, reflections, outliers.
 
-    `centre_std_m` is the standard error of the centre, as if errors were independent; `reflected` and `outliers` are
-    shares of all, `detour_m` is the mean detour of reflections.
+    `centre_std_m` is the standard error of the centre for independent errors; `reflected` and `outliers` are shares of
+    all ranges, `detour_m` is the mean detour of reflections.
     """
 
     centre_m: Floats
@@ -34,10 +34,11 @@ class GroupedErrors:
 
 
 def fit_grouped_errors(groups: Sequence[Floats], most: int = 20_000) -> GroupedErrors:
-    """Return the likeliest parts of groups of errors, metres; of larger groups `most` errors, evenly spaced, are taken.
+    """Return the maximum likelihood error model of groups of errors in metres; larger groups are thinned evenly to
+    `most`.
 
     The density is that of `calib.range_errors.density`. Centre and noise belong to a group; shares and detours of
-    groups scatter about common ones, as those of pairs do in a fit (`RangeModel.error_model`).
+    groups scatter about common values, as those of pairs do in a fit (`RangeModel.error_model`).
     """
     members = [own[:: -(-len(own) // most)] for own in groups]
     count, size = len(members), np.array([len(own) for own in members])

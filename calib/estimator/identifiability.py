@@ -47,7 +47,7 @@ def identifiable_directions(square: Floats, tags: list[int], pairs: Ints) -> tup
 
 
 def _connected(tags: set[int], pairs: set[tuple[int, int]]) -> list[list[int]]:
-    """Return the parts of a graph of pairs that hang together, among some tags."""
+    """Return the connected components of a graph of pairs, among some tags."""
     left, groups = set(tags), []
     while left:
         group, waiting = set(), [min(left)]

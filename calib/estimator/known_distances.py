@@ -1,7 +1,7 @@
-"""The fit of antenna delays and curves to ranges whose distances are known (ICRA 2023, sections III and IV).
+"""The fit of antenna delays and curves to ranges with known distances (ICRA 2023, sections III and IV).
 
-Delays, curve, offsets of pairs and sessions and what errors are made of are estimated together, by the likelihood of
-`calib.range_errors`; with a robust loss, or one after the other as in ICRA 2023, on request.
+Delays, curves, offsets of pairs and sessions, and the parameters of errors are estimated together by the likelihood of
+`calib.range_errors`. A robust loss, and the two-step procedure of ICRA 2023, are options.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ from calib.spread import robust_spread
 from uwblink.arrays import Bools, Floats, Ints
 
 FEWEST_RANGES = 100
-"""Of fewer ranges no share of reflections, no curve and no delays of several tags can be told at once."""
+"""Minimum number of ranges: fewer do not determine delays, a curve and a share of reflections together."""
 
 PILOT = 6000
-"""Rows of the sample on which a start is found."""
+"""Ranges of the sample on which the initial guess is found."""
 
 ASTRAY_M = 0.3
-"""Beyond what any pair's reflections move its median: a likelihood can climb to where a pair is left out."""
+"""If the median residual of a pair grows beyond this, the likelihood has taken the whole pair for reflections, and the
+robust fit is kept."""
 
 FIRST_SAMPLE, GROWTH = 9000, 6
-"""Rows of the first sample on which the likelihood is climbed, and how much larger each next one is."""
+"""Ranges of the first sample on which the likelihood is maximised, and the growth of the next samples."""
 
 SCALE_OF_SPREAD = 0.5
 """Scale of a robust loss over the robust spread of the residuals.
@@ -46,10 +47,10 @@ loss two thirds of least squares' efficiency on clean data.
 """
 
 LARGEST_SPREAD_M = 3.0
-"""Errors that spread by more are not those of ranges, whose likelihood would say nothing of them."""
+"""With a larger spread of residuals the likelihood of range errors does not apply."""
 
 LEAST_SCALE_M = 0.0005
-"""A tenth of a tick; ranges without any error have no scale."""
+"""Smallest scale of a loss, a tenth of a tick: simulated ranges may have no errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,7 @@ class KnownDistances:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """How ranges are fitted; what `calib.fit` says of these settings."""
+    """Settings of a fit to known distances; `calib.FitSettings` explains them."""
 
     loss: str = MIXTURE
     scale_m: float | None = None
@@ -106,9 +107,9 @@ class Recipe:
 
 
 def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
-    """Fit everything together.
+    """Fit delays, curves, offsets and errors.
 
-    Raises `UnanswerableError` where there are too few ranges, or pairs do not determine the delays, and
+    Raises `UnanswerableError` if there are too few ranges or if the pairs do not determine the delays, and
     `BadInputError` for pinned tags or groups that are not in the ranges.
     """
     model = model_of(ranges, recipe)
@@ -132,9 +133,9 @@ def fit_known_distances(ranges: Ranges, recipe: Recipe) -> KnownDistances:
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """Where a search ended, and the rows that it was of; `residuals` (n,) in the order of the model's ranges.
+    """The end of a search and its rows; `residuals` (n,) are in the order of the model's ranges.
 
-    `beside` are rows of what is known beside ranges.
+    `beside` are the rows of other measurements than ranges.
     """
 
     rows: RangeRows
@@ -172,7 +173,7 @@ def model_of(ranges: Ranges, recipe: Recipe, *, trimmed: bool = True) -> RangeMo
 
 
 def _free_tags(model: RangeModel, recipe: Recipe) -> list[list[int]]:
-    """Return the tags whose delays pairs leave free, in groups; raises `UnanswerableError` unless that is asked for."""
+    """Return groups of tags whose delays the pairs leave free; raises `UnanswerableError` without `minimum_norm`."""
     ranges, free = model.ranges, [k for k, tag in enumerate(model.tags) if tag not in recipe.fixed_ns]
     if recipe.constants == "pair" or not free:
         return []
@@ -212,7 +213,7 @@ def robust_fit(
     gauge = tuple(model.gauge_rows(layout))
     rows, x = every, _from(layout, start)
     if sample is not None and sample < len(error):
-        # Any fixed choice will do that no schedule of pairs keeps in step with.
+        # A fixed random choice: a regular one could coincide with the schedule of pairs.
         rows = every.sample(np.sort(np.random.default_rng(0).permutation(len(error))[:sample]))
     priors, steps = Priors(layout), 0
     for turn in range(2 if start is not None else 4):
@@ -229,7 +230,7 @@ def robust_fit(
         if ended.success and _convex(ended):
             found, rows = ended, final
         else:
-            # Of few ranges most may lie where a loss bends the other way; weights then say what a range tells.
+            # With few ranges most may lie where the loss is concave; weights then replace the curvature.
             rows = replace(rows, errors=errors)
     return Fitted(
         rows=rows,
@@ -243,14 +244,14 @@ def robust_fit(
 
 
 def _farthest_pair(model: RangeModel, residual: Floats) -> float:
-    """Return the largest median residual of a pair, in metres either way."""
+    """Return the largest absolute median residual of a pair, in metres."""
     order = np.argsort(model.pairs.number, kind="stable")
     parts = np.split(residual[order], np.flatnonzero(np.diff(model.pairs.number[order])) + 1)
     return max(abs(float(np.median(part))) for part in parts)
 
 
 def _convex(optimum: Optimum) -> bool:
-    """Return whether what rows and priors know of the unknowns is positive in all directions."""
+    """Return whether the information of rows and priors is positive definite."""
     known = optimum.information + optimum.priors.precision()
     whole = np.asarray(known.todense() if sparse.issparse(known) else known)
     free = optimum.layout.free()
@@ -260,7 +261,8 @@ def _convex(optimum: Optimum) -> bool:
 
 
 def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
-    """Return the likeliest unknowns, climbed on samples of growing size from a robust start, everything last."""
+    """Return the maximum of the likelihood, found from a robust start on samples of growing size and then on all
+    ranges."""
     errors, unknowns, parts = model.error_model(pilot.residuals)
     layout, rows = model.build(error, errors, unknowns, parts)
     gauge, asked = tuple(model.gauge_rows(layout)), layout.indices([u.kind for u in model.unknowns])
@@ -283,7 +285,7 @@ def likeliest(model: RangeModel, error: Floats, pilot: Fitted) -> Fitted:
 
 
 def _from(layout: Layout, start: Fitted | None) -> Floats:
-    """Return where a search begins: where another one ended, as far as both have the same unknowns."""
+    """Return the initial values: those of another search for the unknowns that both have."""
     x = layout.start()
     if start is not None:
         for kind, where in start.optimum.layout.where.items():
@@ -323,14 +325,15 @@ def described(model: RangeModel, fitted: Fitted, blocks: TimeBlocks, free: list[
 
 
 SHAPE = 0.1
-"""Noise by which a range is off that is surely reflected, if detours are not of the shape of the model:
-detours of gamma's shape, or of two lengths, put delays off by as much (`make worlds`)."""
+"""Shift of a reflected range, in units of noise, when detours do not have the shape of the model. Gamma-distributed
+detours, or two lengths, shift delays by as much (`make worlds`)."""
 
 
 def _of_another_shape(optimum: Optimum, delays: Ints) -> Floats:
-    """Return the covariance (tags, tags) of delays by reflections of another shape, which shift the ranges of a pair.
+    """Return the covariance (tags, tags) of delays due to reflections of another shape, which shift the ranges of a
+    pair.
 
-    Ranges that are longer by b move all unknowns by the covariance times what they tell of an offset of the pair.
+    Ranges that are longer by b move all unknowns by the covariance times their information on an offset of the pair.
     """
     noise = np.exp(optimum.of("noise level") + optimum.of("noise of pair"))
     share = 1 / (1 + np.exp(-optimum.of("odds level") - optimum.of("odds of pair")))
@@ -343,14 +346,14 @@ def _of_another_shape(optimum: Optimum, delays: Ints) -> Floats:
 def _in_sequence(
     model: RangeModel, error: Floats, recipe: Recipe, blocks: TimeBlocks, groups: list[list[int]]
 ) -> KnownDistances:
-    """Fit delays first, then the curves on what they leave, as in ICRA 2023, sections III and IV, with splines.
+    """Fit delays first, then the curves to the residuals, as in ICRA 2023, sections III and IV, with splines.
 
-    The curves keep their constants and the delays are those of the first step, unless a reference is asked for.
+    The curves keep their constants and the delays are those of the first step, unless a reference power is given.
     """
     free = replace(model, gauged=(False,) * len(model.gauged))
     first = described(free, robust_fit(free, error, recipe.loss, recipe.scale_m, ("delay",)), blocks, groups)
     kinds = free.curve_kinds()
-    # The curve bends with powers that are few at either end: it is fitted to those between them.
+    # Few ranges have the outer powers, and they would bend the curve: it is fitted to the others.
     inside = (free.lifted >= free.span[0]) & (free.lifted <= free.span[1])
     second = robust_fit(free, first.residuals, recipe.loss, first.searches[0].scale_m, kinds, weight=inside)
     curves = described(free, second, blocks, groups)
@@ -370,7 +373,8 @@ def _in_sequence(
 
 
 def _stated(model: RangeModel, values: dict[str, Floats], recipe: Recipe) -> dict[str, Floats]:
-    """Return delays for which each curve is zero at the reference power: a constant of a group's curve is theirs."""
+    """Return delays and curves with each curve zero at the reference power: the constant of a group's curve moves to
+    the delays of its tags."""
     if model.curve is None or recipe.reference is None:
         return values
     at = Spline.at(np.array([recipe.reference]), model.curve.knots)
@@ -387,9 +391,9 @@ def _stated(model: RangeModel, values: dict[str, Floats], recipe: Recipe) -> dic
 
 @dataclass(frozen=True, kw_only=True)
 class DescribedErrors:
-    """What the errors of a fit are made of: unknowns by kind, the covariance of the noise, and what each range has.
+    """The error model of a fit: unknowns by kind, the covariance of the noise, and the parameters of each range.
 
-    `parameters` are those of every range (n,), in the order of the model's ranges, about errors less `location_m`.
+    `parameters` are those of every range (n,), in the order of the model's ranges, for errors less `location_m`.
     """
 
     values: dict[str, Floats]
@@ -400,11 +404,12 @@ class DescribedErrors:
 
 
 DESCRIBED = 400_000
-"""Ranges by which errors are described beside a robust loss: all of 800,000 move shares by half a percentage point."""
+"""Ranges from which the error model is estimated after a robust fit: all of 800,000 change shares by half a percentage
+point."""
 
 
 def described_errors(found: KnownDistances) -> DescribedErrors:
-    """Return what errors are made of: as they were fitted, or fitted to the residuals of a robust loss."""
+    """Return the error model: as it was fitted, or fitted to the residuals of a robust loss."""
     search, model, location = found.searches[-1], found.model, 0.0
     values, covariances = found.values, found.covariances
     rows, x = search.rows, search.optimum.x

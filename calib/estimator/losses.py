@@ -1,4 +1,4 @@
-"""Robust losses: how much a residual counts for, by its size over the scale of the loss."""
+"""Robust losses: weights of residuals over the scale of the loss."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _l2(u: Floats) -> tuple[Floats, Floats]:
 
 
 MIXTURE: Final = "mixture"
-"""The loss that is no loss of residuals: the likelihood of `calib.range_errors`, begun from a Cauchy fit."""
+"""The name of the likelihood of `calib.range_errors`, which starts from a Cauchy fit."""
 
 TRIED_AT: Final = np.array([-7.3, -2.1, -0.83, -0.37, 0.37, 0.83, 2.1, 7.3])
 """Residuals over scale at which a new loss must agree with its own slope; no common loss has a kink at one."""
@@ -126,6 +126,6 @@ LOSSES: Final[Registry[RobustLoss]] = Registry("loss", "uwbcal.losses", _OWN, ch
 
 
 def check_loss(name: str | None) -> None:
-    """Raise `BadInputError` for the name of a loss that nobody knows."""
+    """Raise `BadInputError` for an unknown loss."""
     if name not in (None, MIXTURE) and name not in LOSSES:
         raise BadInputError(f"found {name!r}, allowed: {', '.join(known_losses())}", parameter="loss")

@@ -1,4 +1,4 @@
-"""Which pair of tags each range is of, whoever initiated it."""
+"""The pair of tags of each range, in either direction."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What ranges depend on beside their distances: delays, curves over power, offsets, and what their errors are made of.
+"""The model of ranges besides their distances: delays, curves over power, offsets, and parameters of errors.
 
-`RangeModel.of` makes unknowns and parts of these for any ranges; known distances, surveys and flights share it, and
-differ only in where distances come from.
+`RangeModel.of` makes unknowns and parts of these for any ranges. Fits to known distances, surveys and flights share it,
+and differ only in the source of distances.
 """
 
 from __future__ import annotations
@@ -25,40 +25,35 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 METRES_A_NS = SPEED_OF_LIGHT * 1e-9
 DELAY_NS = 600.0
-"""How far a delay may be from what was configured: that of a board that is programmed with none is 514 ns.
-
-It holds combinations that no range determines, at the smallest delays that agree with the data, and weighs nothing
-elsewhere.
-"""
+"""Prior standard deviation of a delay: a board without a programmed delay has 514 ns. The prior decides only
+combinations that no range determines, and chooses the smallest delays there."""
 
 CURVE_M = 0.5
-"""How large a bias over power may be: published curves reach 0.2 m (DW1000 user manual, APS011)."""
+"""Prior standard deviation of the bias over power: published curves reach 0.2 m (DW1000 user manual, APS011)."""
 
 NOISE_M, NOISE_WORTH = 0.06, 20.0
-"""Noise of a range before anything is measured, and how many ranges that knowledge is worth.
-
-Two stamps of a DW1000 have 0.15 ns each in the open (its user manual, 8.3), 3 to 10 cm of a range.
-"""
+"""Prior of the noise of a range, and the number of ranges that it counts for. A stamp of a DW1000 has 0.15 ns of noise
+in the open (its user manual, 8.3), which gives 3 to 10 cm."""
 
 SEGMENTS_A_FOLD, SEGMENTS = 4.5, (10, 28)
-"""Pieces of a bias curve where lifted power grows e-fold, and bounds of their number; roughness is estimated, so that
-more change nothing (the study of `make accuracy`)."""
+"""Segments of a bias curve per factor e of lifted power, and their bounds. Roughness is estimated, so more segments
+change nothing (the study of `make accuracy`)."""
 
 FEWEST_OF_GROUP = 20
-"""Ranges from which a curve of a group is estimated: fewer do not tell its level."""
+"""Minimum number of ranges for the curve of a group."""
 
 SAME_POWER = 1e-6
-"""Lifted powers that differ by no more are one."""
+"""Lifted powers that differ by less count as equal."""
 
 DETOUR_M, DETOUR_WORTH, LEAST_DETOUR_M = 0.2, 5.0, 0.03
-"""Mean of the shorter kind of exponential detours before anything is measured, how many reflections that knowledge is
-worth, and the detour that all have at least (published ones are 0.1 to 0.5 m: MILUV's and STAR-loc's flights)."""
+"""Prior of the mean of the shorter kind of exponential detours, the number of reflections that it counts for, and the
+least detour (published detours are 0.1 to 0.5 m: MILUV, STAR-loc)."""
 
 ODDS = -2.2
-"""Log odds of a reflection before anything is measured: one range in ten."""
+"""Prior log odds of a reflection: one range in ten."""
 
 LONG_ODDS = -1.1
-"""Log odds that a reflection is of the longer kind: one in four, between 11 and 48 % in two cases of three."""
+"""Prior log odds that a reflection is of the longer kind: one in four; 11 to 48 % within one standard deviation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,10 +85,10 @@ class Spline:
 
 @dataclass(frozen=True, kw_only=True)
 class RangeModel:
-    """Unknowns and parts of `ranges` (n,), whose curves lie over `lifted` powers between those of `span`.
+    """Unknowns and parts of `ranges` (n,), with curves over `lifted` powers within `span`.
 
-    `unknowns` hold delays, curves and offsets; `error_model` begins what errors are made of.
-    `gauged` are the groups whose curve is zero at `reference`; the others keep a constant that pinned delays fix.
+    `unknowns` are delays, curves and offsets; `error_model` adds those of errors. `gauged` tells for each group whether
+    its curve is zero at `reference`; the others keep a constant that pinned delays determine.
     """
 
     ranges: Ranges
@@ -127,14 +122,15 @@ class RangeModel:
         offsets: bool = True,
         trimmed: bool = True,
     ) -> RangeModel:
-        """Return the model of ranges; `reference` is the lifted power at which curves are zero, if they are.
+        """Return the model of ranges; `reference` is the lifted power at which curves are zero, None for no such
+        condition.
 
-        With `trimmed`, ranges at the half per cent of powers at either end are left out: what a curve is there is not
-        for them to say. Raises `BadInputError` for tags and groups that are not in the ranges.
+        With `trimmed`, ranges at the outer half per cent of powers at either end are left out, because they do not
+        determine the curve there. Raises `BadInputError` for tags and groups that are not in the ranges.
         """
         lifted = lifted_power(ranges.fpp1_dbm, ranges.fpp2_dbm, lift, alpha_dbm)
         powered = np.isfinite(lifted)
-        # What has no power stands at the middle of the others, where it bends nothing.
+        # Ranges without power get the median power, where they do not bend the curve.
         lifted = np.where(powered, lifted, np.median(lifted[powered]) if powered.any() else 1.0)
         ordered = np.sort(lifted)
         low, high = populated(ordered)
@@ -192,7 +188,7 @@ class RangeModel:
         return [block.kind for block in self.unknowns if block.kind.split(" ")[0] == "curve"]
 
     def key(self) -> Ints:
-        """Return numbers (n,) of which equal ones stand for the same unknowns."""
+        """Return a number for each range (n,); ranges with equal numbers depend on the same unknowns."""
         key = self.pairs.number.astype(np.int64)
         if self.ranges.sessions[1:]:
             key = key * (int(self.ranges.session.max()) + 1) + self.ranges.session
@@ -202,7 +198,7 @@ class RangeModel:
         return key
 
     def gauge_rows(self, layout: Layout) -> list[NormalRows]:
-        """Return rows that hold curves at zero at the reference power, where delays make up for a constant."""
+        """Return rows that set curves to zero at the reference power, where delays can take the constant."""
         if self.curve is None or self.reference is None:
             return []
         at = Spline.at(np.array([self.reference]), self.curve.knots)
@@ -218,7 +214,7 @@ class RangeModel:
         ]
 
     def error_model(self, residual: Floats) -> tuple[Mixture, tuple[Unknown, ...], tuple[Part, ...]]:
-        """Return the mixture with its unknowns and parts, begun at robust spreads of residuals (n,)."""
+        """Return the error model with its unknowns and parts, started from robust spreads of residuals (n,)."""
         spread = max(robust_spread(residual), 1e-3)
         names = tuple(f"{a}-{b}" for a, b in self.pairs.ends.tolist())
         everyone = np.zeros((1, 1), dtype=np.int64)
@@ -261,7 +257,7 @@ class RangeModel:
         geometry: Geometry | None = None,
         only: Sequence[str] | None = None,
     ) -> tuple[Layout, RangeRows]:
-        """Return the layout of all unknowns and the rows of ranges with such residuals (n,) less unknown distances."""
+        """Return the layout of all unknowns, and the rows of ranges with residuals (n,) less unknown distances."""
         unknowns = [u for u in self.unknowns if only is None or u.kind in only]
         kinds = {u.kind for u in unknowns}
         layout = Layout((*unknowns, *more))
@@ -310,16 +306,16 @@ def _curve(kind: str, spline: Spline) -> Unknown:
 
 
 TYPICAL_OFFSET_M = 0.035
-"""Standard deviation of such offsets between days, and between halves of a flight (3 to 4 cm: MILUV, STAR-loc)."""
+"""Prior standard deviation of offsets between days and between halves of a flight (3 to 4 cm: MILUV, STAR-loc)."""
 
 OFFSETS = (0.01, 1e-4, 1.0)
-"""Standard deviation of what else is constant in the ranges of a pair, such as a wall: start, least and most, m."""
+"""Standard deviation of other constants in the ranges of a pair, such as a wall: start and bounds, m."""
 
 
 def _add_offsets(
     ranges: Ranges, pairs: Pairs, tags: list[int], unknowns: list[Unknown], parts: list[Part], *, identifiable: bool
 ) -> None:
-    """Add what is constant in the ranges of a pair, and of pairs and tags in one of several sessions."""
+    """Add offsets of pairs, and of pairs and tags in each of several sessions."""
     names = tuple(f"{a}-{b}" for a, b in pairs.ends.tolist())
     number = pairs.number[:, None]
     if identifiable:
@@ -367,7 +363,7 @@ def _check_tags(
 
 
 def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple[str, Floats | None]]:
-    """Return for each group its share of the curve in each range (n,): a half for each end; None for all of it."""
+    """Return the weight of each group's curve in each range (n,): a half for each end; None for a single curve."""
     if not groups:
         return [("", None)]
     shares: list[tuple[str, Floats | None]] = [
@@ -383,7 +379,7 @@ def _shares(ranges: Ranges, groups: Mapping[str, tuple[int, ...]]) -> list[tuple
 
 
 def _delays_absorb(pairs: Pairs, tags: list[int], fixed: Mapping[int, float], group: tuple[int, ...] | None) -> bool:
-    """Return whether delays that are free can make up for a constant of a group's curve."""
+    """Return whether free delays can compensate a constant of a group's curve."""
     free = [tag for tag in tags if tag not in fixed]
     if not free:
         return False
@@ -394,9 +390,10 @@ def _delays_absorb(pairs: Pairs, tags: list[int], fixed: Mapping[int, float], gr
 
 
 def _knots(ordered: Floats, low: float, high: float) -> Floats:
-    """Return clamped knots from `low` to `high`, halfway between equal counts and equal lengths, both of square roots.
+    """Return clamped knots from `low` to `high`, halfway between equal counts and equal lengths of the root of lifted
+    power.
 
-    Curves are steep where lifted power is small: there the roots lie dense, and few ranges do not spread them.
+    Curves are steep at small lifted powers, where roots are dense.
     """
     segments = int(np.clip(round(SEGMENTS_A_FOLD * np.log(high / low)), *SEGMENTS))
     counts = np.interp(np.linspace(0, len(ordered) - 1, segments + 1), np.arange(len(ordered)), ordered)

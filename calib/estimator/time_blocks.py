@@ -22,18 +22,16 @@ from uwblink.arrays import Bools, Floats, Ints
 MOST_BLOCKS: Final = 1000
 SHORTEST_S: Final = 0.1
 FEWEST_BLOCKS: Final = 30
-"""Blocks are no shorter than a tenth of a second, unless a recording has few: sums over fewer blocks than there are
-delays and splines, some twenty, do not vary in all directions, and their covariance is too small."""
+"""Shortest block in seconds, unless a recording has few blocks: with fewer blocks than unknowns (some twenty) the
+covariance of block sums is singular and too small."""
 
 GAP_S: Final = 10.0
 USUAL_STEPS: Final = 20
-"""Ranges further apart than ten seconds, and than twenty usual steps, have a gap in between.
-
-The errors that recordings show last for seconds (docs/accuracy.md); slow schedules, and pairs in turn, are no gaps.
-"""
+"""Ranges that are further apart than ten seconds, and than twenty usual intervals, have a gap in between. Errors in
+recordings last for seconds (docs/accuracy.md); slow schedules and pairs in turn make no gaps."""
 
 PIECE: Final = 0.75
-"""Length of pieces over that of an average session, so that sessions of unlike lengths have pieces too."""
+"""Length of pieces over the mean length of sessions, so that sessions of different lengths have pieces too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,25 +106,25 @@ def time_blocks(time_ns: Ints, session: Ints) -> TimeBlocks:
 
 
 FEWEST_GROUPS: Final = 8
-"""Sums of so few groups of blocks are looked at, and no fewer."""
+"""Minimum number of groups of blocks that are compared."""
 
 FEWEST_STRETCHES: Final = 20.0
-"""Of fewer independent stretches of time an interval is a guess."""
+"""With fewer independent stretches of time an interval is a guess."""
 
 NESTED: Final = 2.0
-"""Sums over 2 and over 4 blocks are made of the same blocks: what they say together counts so many times less."""
+"""Sums over 2 and over 4 blocks share blocks: their joint information counts so many times less."""
 
 SHARES: Final = np.concatenate([[0.0], np.linspace(0.01, 1, 40) ** 1.5])
 DURATIONS: Final = 40
 LONGEST: Final = 6.0
-"""Errors that last longer than such a part of a recording cannot be told from delays."""
+"""Errors that last longer than this share of a recording cannot be distinguished from delays."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Persistence:
-    """What persistence does: `factor` on variances, their degrees of freedom, and how many stretches are independent.
+    """The effect of persistence: `factor` on variances, degrees of freedom, and the number of independent stretches.
 
-    `stretch_s` is how long a stretch of time is in which errors have to be taken for one.
+    `stretch_s` is the length of a stretch of time whose errors count as one.
     """
 
     factor: float
@@ -141,8 +139,7 @@ class Persistence:
 
 
 def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks, spans: int = 1) -> float:
-    """Return by how much more sums of slopes (n,) by pair (n,) vary, in so many spans, than those of independent
-    ranges would."""
+    """Return the variance of sums of slopes (n,) by pair (n,) in so many spans, over that of independent ranges."""
     pairs = int(pair.max()) + 1
     flat = np.bincount(blocks.number * pairs + pair, slope, blocks.count * pairs)
     sums: Floats = flat.astype(np.float64).reshape(blocks.count, pairs)
@@ -151,10 +148,10 @@ def lasting_in_pairs(slope: Floats, pair: Ints, blocks: TimeBlocks, spans: int =
 
 
 def persistence(slopes: Floats, time: TimeBlocks, independent: int, within: int = 1) -> Persistence:
-    """Return what persistence does to sums of slopes (blocks, k), of whose columns so many are independent.
+    """Return the effect of persistence on sums of slopes (blocks, k), of whose columns so many are independent.
 
-    How long errors last is looked at within sessions, and `within` so many spans of time: what differs between them is
-    a matter of its own (`calib.checks.fitted`).
+    Persistence is measured within sessions and within so many spans of time (`within`). Differences between these are
+    tested separately (`calib.checks.fitted`).
     """
     slopes, columns = time.pieces(slopes, within), slopes.shape[1]
     independent *= max(slopes.shape[1] // max(columns, 1) // within, 1)
@@ -196,7 +193,7 @@ def _ratio(series: Floats, scale: int) -> float:
 
 
 def _expected(share: Floats, keep: Floats, factor: Floats, scale: int, blocks: int) -> Floats:
-    """Return what `_ratio` is on average, where the sum over all blocks is held at zero."""
+    """Return the mean of `_ratio` under the condition that the sum over all blocks is zero."""
     # The sum over lags h below the scale s of (1 - h/s) rho^h.
     lasting = keep / (1 - keep) * (1 - (1 - keep**scale) / (scale * (1 - keep)))
     free = 1 + 2 * share * lasting

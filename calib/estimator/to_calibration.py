@@ -1,4 +1,4 @@
-"""From what was fitted to a calibration: delays, curves, their uncertainty, and what errors are made of."""
+"""A calibration from a fit: delays, curves, their uncertainty, and the error model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uwblink.recording.antenna_delays import known_delays
 from uwblink.ticks import SPEED_OF_LIGHT
 
 LEAST_SPREAD_M = 1e-6
-"""Errors without any spread have no distribution."""
+"""Smallest noise: errors without spread have no distribution."""
 
 
 def calibration_of(
@@ -32,9 +32,9 @@ def calibration_of(
     groups: Mapping[str, tuple[int, ...]],
     between_m: float | None = None,
 ) -> Calibration:
-    """Return the calibration of a fit, with a covariance of its delays (tags, tags).
+    """Return the calibration of a fit; `covariance` (tags, tags) is that of its delays.
 
-    `between_m` is by how much pairs differ between recordings, None to estimate it.
+    `between_m` is the standard deviation of a pair's offset between recordings, None to estimate it.
     """
     model, search = found.model, found.searches[0]
     names = model.unknowns[0].names
@@ -93,7 +93,7 @@ def _between_pairs(found: KnownDistances) -> float | None:
 
 
 def bias_curves(found: KnownDistances) -> dict[str, Curve]:
-    """Return the curve of every group; where delays take its constant it is zero at the reference power."""
+    """Return the curve of each group, zero at the reference power where delays take its constant."""
     model = found.model
     if model.curve is None:
         return dict.fromkeys(model.groups or ("",), flat_curve(0.0, model.span))
@@ -146,7 +146,7 @@ def _flat_sigma(model: RangeModel, sigma: float, count: int) -> tuple[dict[str, 
 
 
 def _bias_covariance(found: KnownDistances) -> Floats:
-    """Return the covariance of the coefficients of the plain curve, which is the groups' average."""
+    """Return the covariance of the coefficients of the average of the groups' curves."""
     if found.model.curve is None:
         return np.zeros((DEGREE + 1,) * 2)
     count = len(found.model.curve_kinds())

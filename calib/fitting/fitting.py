@@ -1,7 +1,8 @@
-"""`calib.fit`: settings in, a calibration with its warnings out.
+"""`calib.fit`: from settings and ranges to a calibration with warnings.
 
-A constant in the curve and a shift common to all delays are the same thing (docs/theory.md), so delays are stated for a
-curve that is zero at a reference power: the same boards then get the same delays whatever powers a recording holds.
+A constant of the curve and a common shift of all delays cannot be distinguished (docs/theory.md). Delays are therefore
+stated for a curve that is zero at a reference power: the same boards then get the same delays whatever powers a
+recording holds.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from uwblink.ticks import SPEED_OF_LIGHT
 
 INLIER_SIGMAS = 3.0
 ROBUST_LOSS = "cauchy"
-"""The loss of ICRA 2023. Without a curve errors follow power, which the likelihood would take for reflections."""
+"""The loss of ICRA 2023. Without a curve errors depend on power, which the likelihood would take for reflections."""
 
 
 def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **changes: Any) -> FitResult:
@@ -81,7 +82,7 @@ def fit(data: Data | Iterable[Data], settings: FitSettings | None = None, **chan
         constants=settings.constants,
         sequential=sequential,
     )
-    # The same bytes on any machine: sums of several threads end in other last digits, and slow small matrices down.
+    # One thread: sums of several threads differ in the last digits, and threads slow small matrices down.
     with threadpool_limits(limits=1, user_api="blas"):
         found = fit_known_distances(ranges, recipe)
         fitted = dict(zip(found.model.tags, found.delays.tolist(), strict=False))
@@ -200,8 +201,8 @@ def _judged(held: HeldOut, settings: FitSettings) -> dict[str, Any]:
 
 
 def _left(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Bools, Floats]:
-    """Return the errors of ranges (n,) that a calibration leaves, which are within three sigmas, and all over sigma."""
-    # What errors are made of is known, and of no use for this.
+    """Return the corrected errors of ranges (n,), whether they are within three sigmas, and the errors over sigma."""
+    # The error model is not needed here.
     applied = replace(calibration, errors=None).apply(ranges)
     left = applied.corrected_m - ranges.truth_m
     over_sigma = left / applied.sigma_m
@@ -221,7 +222,7 @@ def _stopped(found: KnownDistances, asked_for: str | None) -> list[str]:
 
 
 def _beyond(reference: float | None, alpha_dbm: float, found: KnownDistances) -> list[str]:
-    """Warn where the reference power is not among those recorded, so that the delays are stated at the nearest."""
+    """Return a warning if no range has the reference power, so that delays are stated at the nearest power."""
     if reference is None or not any(found.model.gauged):
         return []
     low, high = found.model.span
@@ -235,7 +236,7 @@ def _beyond(reference: float | None, alpha_dbm: float, found: KnownDistances) ->
 
 
 def _fitted(found: KnownDistances, recipe: Recipe) -> str:
-    """Say what was looked for."""
+    """Return what was fitted, in words."""
     constants = "constants of pairs" if recipe.constants == "pair" else "delays"
     if found.model.curve is None:
         return constants if recipe.constants == "pair" else "delays only"
@@ -244,7 +245,7 @@ def _fitted(found: KnownDistances, recipe: Recipe) -> str:
 
 
 def _gauge(found: KnownDistances, reference: float | None) -> str:
-    """Say which of the delays that fit equally well were chosen."""
+    """Return in words how the common constant of delays and curve was chosen."""
     carrier = "constants of pairs" if found.model.constants == "pair" else "delays"
     if found.model.curve is None:
         return f"no curve; the {carrier} carry the constant"

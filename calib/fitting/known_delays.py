@@ -1,4 +1,4 @@
-"""Delays that a fit takes over from a calibration, as they are."""
+"""Delays that a fit takes from a calibration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from calib.errors import BadInputError
 
 
 def imported(source: Calibration | str | os.PathLike[str] | None, parameter: str = "delays_from") -> Calibration | None:
-    """Return the calibration from which something is taken over; `parameter` is named where it is none."""
+    """Return the calibration that is given as an object or as its path; errors name `parameter`."""
     if source is None:
         return None
     known = load_calibration(source) if isinstance(source, str | os.PathLike) else source
@@ -39,5 +39,5 @@ def taken_over(known: Calibration | None, ranges: Ranges, *, curve: bool) -> dic
 
 
 def std_taken_over(known: Calibration | None, tags: Iterable[int]) -> dict[int, float]:
-    """Return the standard errors that a calibration states for delays that were taken over from it."""
+    """Return the standard errors of delays that were taken from a calibration."""
     return {} if known is None else {tag: known.delays_std_ns[tag] for tag in tags if tag in known.delays_std_ns}

@@ -1,4 +1,4 @@
-"""The delay of a new tag, from ranges with tags that are calibrated already."""
+"""The delay of a new tag, from ranges with calibrated tags."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calib.settings import check_tag
 from uwblink.recording.antenna_delays import delays_differ, known_delays
 
 MIN_RANGES = 50
-"""Of so many the one delay is known to a seventh of the noise of a range, 0.03 ns."""
+"""With so many ranges one delay has a standard error of a seventh of the noise of a range, 0.03 ns."""
 
 
 def add_tag(data: Data | Iterable[Data], calibration: Calibration, tag: int, loss: str = MIXTURE) -> Calibration:

@@ -1,7 +1,7 @@
-"""What the ranges of a planned flight would say of delays: Fisher's information, at trajectories that are planned.
+"""Prediction for a planned flight: Fisher's information at the planned trajectories.
 
-It is the information of `calib fit --truth ranges`: the same unknowns, the same rows of ranges and of what is known
-beside them, without data. Only what a fit learns of its errors is assumed.
+It is the information of `calib fit --truth ranges`: the same unknowns and the same rows, without data. Only the error
+model is assumed.
 """
 
 from __future__ import annotations
@@ -24,32 +24,33 @@ from calib.information import Verdict
 from calib.range_errors.density import error_slopes
 from calib.settings import FitSettings, FlightSettings
 from calib.trajectories.fitting import range_model
-from calib.trajectories.judging import ALONE, verdict_on, with_known_distances
+from calib.trajectories.judging import GEOMETRY_ALONE_FACTOR, verdict_on, with_known_distances
 from calib.trajectories.motion import Distances, Motion, known_rows
 from calib.trajectories.samples import Places, tapes_of
 from calib.trajectories.scene import Scene, scene_from
-from calib.trajectories.start import SAMPLE_S, Followed, path_between
+from calib.trajectories.start import SAMPLE_S, Trajectories, interpolated
 from uwblink.arrays import Floats
 from uwblink.recording.schema import KnownDistance
 
 CURVE_M, CURVE_BENDS = 0.05, 3.0
-"""A curve over lifted power as boards have it, for how smooth a fit will find it: so many metres, so many radians."""
+"""Amplitude (m) and phase over the power range (rad) of a typical bias curve, which sets the smoothness that a fit will
+estimate."""
 
 EVIDENCE_STEPS = 12
-"""Steps in which the smoothness of curves is found, as in a fit."""
+"""Iterations of the smoothness of curves, as in a fit."""
 
 ENDS = 4
-"""Control points at either end of a path that a plan's positions do not determine well."""
+"""Control points at either end of a path that planned positions do not determine well."""
 
 STEADIEST_M_S3 = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Errors:
-    """What a range will be off by: noise, and a share of reflected ones that are longer by `detour_m` on average.
+    """The expected errors of ranges: noise, and a share of reflections that are longer by `detour_m` on average.
 
-    It is the error density of ranges (`calib.estimator.range_rows.Errors`) whose residuals are all zero, and each tell
-    what ranges tell on average.
+    It is an error density (`calib.estimator.range_rows.Errors`) with residuals of zero and the mean information of a
+    range.
     """
 
     noise_m: float
@@ -58,12 +59,12 @@ class Errors:
     parameters: tuple[str, ...] = ()
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats]:
-        """Return log densities and slopes that are zero, and what each residual tells (n,)."""
+        """Return log densities and slopes of zero, and the information of each residual (n,)."""
         zero = np.zeros_like(values[RESIDUAL])
         return zero, {RESIDUAL: zero}, zero + self.informed()
 
     def informed(self) -> float:
-        """Return what a range says of its distance, 1/m^2: its mean squared slope of the log likelihood."""
+        """Return the information of a range on its distance, 1/m^2: the mean squared slope of the log likelihood."""
         longest = 12 * self.detour_m if self.reflected else 0.0
         error = np.linspace(-8 * self.noise_m, 8 * self.noise_m + longest, 4001)
         share = max(self.reflected, 1e-9)
@@ -83,7 +84,7 @@ class Errors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Predicted:
-    """What a fit will say: the covariance (tags, tags) of the delays in ns^2, and the verdict on them."""
+    """The prediction: covariance (tags, tags) of the delays in ns^2, and the verdict on them."""
 
     tags: tuple[int, ...]
     covariance_ns2: Floats
@@ -92,26 +93,26 @@ class Predicted:
 
 @dataclass(frozen=True, kw_only=True)
 class Flight:
-    """A planned flight: what a fit will be given (`scene`), where everything truly is, and what is looked for.
+    """A planned flight: the inputs of a fit (`scene`), true positions, and the model of ranges.
 
-    `path` is where the moving bodies are, `stands` are all that do not move; `known` are the places of moving bodies
-    all along, of which the scene has the first.
+    `path` has the positions of moving bodies, `stands` those of standing bodies; `known` are positions of moving bodies
+    over the whole flight, of which the scene has the first part.
     """
 
     scene: Scene
     model: RangeModel
     errors: Errors
     known: Places
-    path: Followed
+    path: Trajectories
     stands: Mapping[str, Floats]
 
     @property
     def tapes(self) -> list[tuple[int, int]]:
-        """The pairs of tags whose distance is measured beside."""
+        """The pairs of tags whose distance is taped."""
         return [(one.first, one.second) for one in self.scene.tapes.stated]
 
     def known_until(self, seconds: float) -> Flight:
-        """Return the flight with positions known so long."""
+        """Return the flight with positions known for the first seconds."""
         return replace(self, scene=replace(self.scene, places=self.known[self.known.time_s < seconds]))
 
     def with_anchors_given(self) -> Flight:
@@ -119,7 +120,7 @@ class Flight:
         return replace(self, scene=replace(self.scene, still=dict(self.stands)))
 
     def taped(self, pairs: Sequence[tuple[int, int]], still_s: float, sigma_m: float) -> Flight:
-        """Return the flight with distances of tags measured beside, while bodies stand at first or between anchors."""
+        """Return the flight with taped distances, of bodies that stand at first or of anchors."""
         when = f"0..{still_s:g}" if still_s else ""
         stated = [KnownDistance(first, second, 1.0, sigma_m, when) for first, second in pairs]
         bodies = {tag: body for tag, (body, _) in self.scene.arms.items()}
@@ -127,13 +128,13 @@ class Flight:
         return replace(self, scene=replace(self.scene, tapes=tapes))
 
     def pairs_to_tape(self, still_s: float) -> list[tuple[int, int]]:
-        """Return the pairs of tags whose distance says something: of bodies that stand where nobody knows."""
+        """Return the pairs of tags whose taped distance adds information: of bodies that stand at unknown positions."""
         stand = set(self.scene.sought) | (set(self.scene.moving) if still_s else set())
         body = {tag: one for tag, (one, _) in self.scene.arms.items() if one in stand}
         return [(a, b) for a, b in combinations(sorted(body), 2) if body[a] != body[b]]
 
     def with_headings(self, std_rad: float) -> Flight:
-        """Return the flight with headings known so well."""
+        """Return the flight with this standard deviation of headings."""
         better = {
             body: replace(known, std_rad=np.array([*known.std_rad[:2], std_rad]))
             for body, known in self.scene.attitudes.items()
@@ -141,11 +142,11 @@ class Flight:
         return replace(self, scene=replace(self.scene, attitudes=better))
 
     def predicted(self) -> Predicted:
-        """Return what a fit of the flight will say of the delays."""
+        """Return the prediction for a fit of the flight."""
         return Information(self).predicted()
 
     def best_tape(self, still_s: float, sigma_m: float) -> tuple[int, int] | None:
-        """Return the pair of tags whose taped distance narrows the delays most; None where none would say anything."""
+        """Return the pair of tags whose taped distance reduces the variance of delays most; None if none does."""
         pairs = [pair for pair in self.pairs_to_tape(still_s) if pair not in self.tapes]
         if not pairs:
             return None
@@ -157,10 +158,10 @@ class Flight:
 def flight_of(
     data: Data, settings: FlightSettings, errors: Errors, *, curve: bool, force_std_m_s2: float | None
 ) -> Flight:
-    """Return a planned flight from what a recording of it would hold, with poses all along.
+    """Return a planned flight from a recording with poses over the whole flight.
 
-    `force_std_m_s2` is what an accelerometer's mean over a tenth of a second will be off by; None without one.
-    Raises what `scene_from` and `RangeModel.of` raise.
+    `force_std_m_s2` is the standard error of an accelerometer's mean over a tenth of a second; None without one. Raises
+    what `scene_from` and `RangeModel.of` raise.
     """
     truth = scene_from(data, FlightSettings(attitudes="poses", heading_std_deg=0.0), need_power=curve)
     scene = scene_from(data, settings, need_power=curve)
@@ -168,7 +169,7 @@ def flight_of(
     for number, name in enumerate(truth.moving):
         if np.count_nonzero(truth.places.body == number) < 2:
             raise UnanswerableError(f"{truth.source}: no positions of body {name}; a plan takes its motion from them")
-    # Attitudes as they truly are, with what will be known of their errors.
+    # True attitudes, with the errors that a fit will assume.
     attitudes = {
         body: replace(known, time_s=truth.attitudes[body].time_s, quaternion=truth.attitudes[body].quaternion)
         for body, known in scene.attitudes.items()
@@ -182,7 +183,7 @@ def flight_of(
         model=model,
         errors=errors,
         known=truth.places,
-        path=path_between(
+        path=interpolated(
             truth.places, np.arange(times.min(), times.max() + SAMPLE_S / 2, SAMPLE_S), len(truth.moving)
         ),
         stands={body: place for body, place in truth.still.items() if place is not None},
@@ -190,7 +191,7 @@ def flight_of(
 
 
 class Information:
-    """What is known of a flight's unknowns near its planned trajectories."""
+    """The information on a flight's unknowns at its planned trajectories."""
 
     def __init__(self, flight: Flight) -> None:
         """Sum the information of all rows at the planned trajectories."""
@@ -232,15 +233,15 @@ class Information:
         return self._inverse()
 
     def predicted(self) -> Predicted:
-        """Return what a fit will say."""
+        """Return the prediction."""
         tags = tuple(self.flight.model.tags)
         known = self.of_ranges + self.priors.precision()
         with_truth = with_known_distances(known, self.layout, self.layout.indices(["delay"]))
-        covariance = self.delays[1] * (ALONE**2 if self.flight.scene.by_geometry_alone else 1.0)
+        covariance = self.delays[1] * (GEOMETRY_ALONE_FACTOR**2 if self.flight.scene.by_geometry_alone else 1.0)
         return Predicted(tags=tags, covariance_ns2=covariance, verdict=verdict_on(covariance, with_truth, tags))
 
     def tape(self, pair: tuple[int, int], still_s: float) -> Floats:
-        """Return the derivatives (p,) of the distance of two tags, halfway through their standing."""
+        """Return the derivatives (p,) of the distance of two tags, in the middle of their standstill."""
         tapes = self.flight.taped([pair], still_s, 1.0).scene.tapes
         time = np.where(np.isnan(tapes.time_s), self.flight.scene.time_s[0], tapes.time_s)
         middle = [len(time) // 2]
@@ -251,7 +252,8 @@ class Information:
         return found
 
     def mean_variance_with(self, row: Floats, sigma_m: float) -> float:
-        """Return the mean variance of the delays, ns^2, when what a row (p,) stands for is known to so much."""
+        """Return the mean variance of the delays, ns^2, after a measurement of standard error `sigma_m` with
+        derivatives `row` (p,)."""
         columns, covariance = self.delays
         own = float(row @ (self.inverse @ row))
         return float(np.mean(np.diag(covariance) - (row @ columns) ** 2 / (own + sigma_m**2)))

@@ -1,4 +1,4 @@
-"""Plans of flights: how well delays will be known when distances are found together with them, and what brings more."""
+"""Plans of flights: the precision of delays that are fitted with trajectories, and the gain of further measurements."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ MORE_ANCHORS = 4
 STANDS_S = 5.0
 HEADING_DEG = 0.5
 DELAY_STD_NS = 0.05
-"""How well another calibration, or a survey, says the delay of one tag."""
+"""Standard error of the delay of one tag from another calibration or a survey."""
 
 ACCELEROMETERS = {"consumer": 3e-3, "industrial": 1e-3, "tactical": 3e-4}
 """Noise in m/s^2 a root of Hz, orders of magnitude of data sheets."""
 
 VIBRATION_M_S2 = 0.2
-"""What propellers leave of their shaking in a mean over a tenth of a second."""
+"""Vibration that is left in a mean over a tenth of a second."""
 
 WINDOW_S = 0.1
 TRUSTED = 3.0
-"""By how much less a fit trusts an accelerometer than its residuals say."""
+"""Factor on the residuals of an accelerometer in a fit."""
 
 Robots = int | Sequence[Sequence[int]]
 
@@ -59,7 +59,7 @@ def plan_flight(robots: Robots | Data, settings: FlightPlanSettings | None = Non
     """
     data = None if isinstance(robots, int | Sequence) and not isinstance(robots, str) else robots
     asked = replace(settings or FlightPlanSettings(), robots=robots if data is None else None, **changes)
-    # As in a fit; SciPy brings a linear algebra of its own, which must be there to be held.
+    # As in a fit: SciPy has its own linear algebra, which must be loaded to be limited.
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
         return _plan(asked, data)
@@ -94,7 +94,7 @@ def _flight(asked: FlightPlanSettings, data: Data | None) -> Flight:
 
 
 def _with_tape(asked: FlightPlanSettings, flight: Flight) -> Flight | None:
-    """Return the flight with one distance more, the best one; None where there is none."""
+    """Return the flight with the best further taped distance; None if there is none."""
     best = flight.best_tape(asked.still_s, asked.tape_sigma_m)
     return best and flight.taped([*flight.tapes, best], asked.still_s, asked.tape_sigma_m)
 
@@ -130,12 +130,12 @@ def _plan(asked: FlightPlanSettings, data: Data | None) -> FlightPlan:
 
 
 def _mean_ns(covariance: Floats) -> float:
-    """Return the root mean square of half intervals, of which each is known to a guess at worst."""
+    """Return the root mean square half interval, where each delay has the prior of a guess."""
     return TWO_SIDED_95 * mean_std_ns(np.asarray(np.linalg.pinv(covariance, hermitian=True), np.float64))
 
 
 def _more(asked: FlightPlanSettings, flight: Flight, found: Predicted) -> Iterator[NextBest]:
-    """Yield what one thing more would bring; intervals are of the same tags."""
+    """Yield the gain of single further measurements, for the same tags."""
     now = _mean_ns(found.covariance_ns2)
     for what, changed in (*_better_known(asked, flight), *_flown_otherwise(asked)):
         with_it = changed().predicted()
@@ -151,7 +151,7 @@ Change = tuple[str, Callable[[], Flight]]
 
 
 def _better_known(asked: FlightPlanSettings, flight: Flight) -> Iterator[Change]:
-    """Yield what might be known better of the same flight."""
+    """Yield changes of what is known of the same flight."""
     longer = (asked.poses_until_s or 0.0) + MORE_KNOWN_S
     if longer < float(flight.scene.time_s[-1]):
         yield f"positions known for the first {longer:g} s", lambda: flight.known_until(longer)
@@ -167,7 +167,7 @@ def _better_known(asked: FlightPlanSettings, flight: Flight) -> Iterator[Change]
 
 
 def _flown_otherwise(asked: FlightPlanSettings) -> Iterator[Change]:
-    """Yield other flights."""
+    """Yield changes of the flight."""
     if asked.robots is None:
         return
     others: dict[str, dict[str, Any]] = {}
@@ -183,7 +183,7 @@ def _flown_otherwise(asked: FlightPlanSettings) -> Iterator[Change]:
     if asked.imu is None and asked.attitudes == "poses":
         others["inertial readings"] = {"imu": "consumer"}
     for text, changes in others.items():
-        # What a plan does not take is not proposed.
+        # Invalid changes are not proposed.
         with suppress(BadInputError):
             yield text, partial(_flight, replace(asked, **changes), None)
 
@@ -194,7 +194,7 @@ def _more_anchors(asked: FlightPlanSettings, count: int) -> tuple[int, ...]:
 
 
 def _one_delay(found: Predicted) -> tuple[int, float]:
-    """Return which tag's delay is best known from elsewhere, and the mean half interval with it."""
+    """Return the tag whose delay is most useful to know from elsewhere, and the mean half interval with it."""
     c = found.covariance_ns2
     after = [c - np.outer(c[k], c[k]) / (c[k, k] + DELAY_STD_NS**2) for k in range(len(c))]
     means = [_mean_ns(one) for one in after]

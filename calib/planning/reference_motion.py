@@ -1,4 +1,4 @@
-"""A flight as it might be flown, for a plan: bodies on sums of sines in a room, ranging in turn, without any error."""
+"""A reference flight for a plan: bodies on sums of sines in a room, ranging in turn, without errors."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ FADING_DB = 3.0
 GRAVITY_M_S2 = 9.81
 EDGE = 0.05
 SAMPLE_S = 0.02
-"""Motion is sampled so often: cubic splines through it are then right to micrometres and 1e-4 m/s^2."""
+"""Sampling interval of motion: cubic splines through the samples are exact to micrometres and 1e-4 m/s^2."""
 
 STARTING_S = 3.0
-"""How long it takes from standing to flying."""
+"""Seconds from standstill to full speed."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceFlight:
-    """What a recording of the flight would hold, without errors or delays."""
+    """A recording of the flight without errors or delays."""
 
     exchanges: Exchanges
     poses: Poses

@@ -1,7 +1,7 @@
-"""How likely errors of ranges are, direct and reflected, and what noise is in them: one place for all who weigh them.
+"""Densities of the errors of direct and reflected ranges, and the noise in them.
 
-A direct range has normal noise, a reflected one a detour besides: a least one, and beyond it an exponential one, of one
-of two kinds with means of their own.
+A direct range has normal noise. A reflected range has a detour besides: a least one plus an exponential one of one of
+two kinds with different means.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Densities:
         return found
 
     def _part(self, kind: Kind) -> Floats:
-        """Return how likely reflected ranges are of a kind, 0 where no kind reaches."""
+        """Return the probability that a reflected range is of a kind, 0 where both densities vanish."""
         return np.asarray(kind.density / (self.reflected + np.finfo(float).tiny))
 
 

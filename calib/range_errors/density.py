@@ -15,7 +15,7 @@ from calib.range_errors.densities import LONG_FACTOR, LongDetours, densities
 from uwblink.arrays import Floats
 
 OUTLIERS_OVER_M = 10.0
-"""Outliers are spread over a room at least: over the span of a few errors they would pass for long detours."""
+"""Smallest span of outliers, that of a room: with a smaller span they would be taken for long detours."""
 
 
 @dataclass(frozen=True, slots=True)

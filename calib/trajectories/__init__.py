@@ -1,1 +1,1 @@
-"""Trajectories of moving bodies, found from ranges together with antenna delays and curves."""
+"""Trajectories of moving bodies, estimated from ranges together with antenna delays and curves."""

@@ -1,4 +1,4 @@
-"""Attitudes of bodies: as they are given, or by integrated gyroscopes; and mean specific forces of accelerometers."""
+"""Attitudes of bodies, given or integrated from gyroscopes, and mean specific forces of accelerometers."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from uwblink.arrays import Bools, Floats
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attitude:
-    """Attitudes at `time_s` (k,) as quaternions x y z w (k, 4), body to world, and what is known of their errors.
+    """Attitudes at `time_s` (k,) as quaternions x y z w (k, 4), body to world, and their errors.
 
-    Errors are turns about the world's axes: `std_rad` (3,) is how large they are at any time, infinite where that is
-    not known, and `wander_rad` (3,) by how much they change within a second (a random walk). Where both are zero the
-    attitudes are taken as they are. `begun` says whether the first heading is known.
+    Errors are rotations about the world's axes: `std_rad` (3,) is their standard deviation, infinite where it is
+    unknown, and `wander_rad` (3,) the standard deviation of their change in a second (a random walk). Attitudes are
+    exact where both are zero. `heading_known` tells whether the first heading is known.
     """
 
     time_s: Floats
     quaternion: Floats
     std_rad: Floats
     wander_rad: Floats
-    begun: bool = True
+    heading_known: bool = True
 
-    def headed(self, heading_rad: float) -> Attitude:
-        """Return them turned about the world's vertical."""
+    def turned_by(self, heading_rad: float) -> Attitude:
+        """Return a copy that is rotated about the world's vertical."""
         return replace(self, quaternion=(_about_vertical(heading_rad) * Rotation.from_quat(self.quaternion)).as_quat())
 
     @property
     def exact(self) -> bool:
-        """Whether they are taken as they are."""
+        """Whether the attitudes have no errors."""
         return not (self.std_rad.any() or self.wander_rad.any())
 
     def at(self, time_s: Floats) -> Floats:
-        """Return rotation matrices (n, 3, 3) at instants (n,), along the chords of quaternions; held at the ends."""
+        """Return rotation matrices (n, 3, 3) at instants (n,), interpolated between quaternions, constant outside."""
         time = np.clip(time_s, self.time_s[0], self.time_s[-1])
         if len(self.time_s) == 1:
             return np.asarray(Rotation.from_quat(np.tile(self.quaternion[0], (len(time), 1))).as_matrix())
@@ -58,31 +58,31 @@ def _about_vertical(heading_rad: float) -> Rotation:
 
 GRAVITY_M_S2 = 9.81
 WINDOW_S = 0.1
-"""Specific forces are averaged over so long: vibrations go, and accelerations of a spline hardly change."""
+"""Specific forces are averaged over this time: vibrations cancel, and the acceleration of a spline hardly changes."""
 
 STRONGEST_M_S2 = 4.0
-"""Mean accelerations beyond this are knocks, not flight."""
+"""Windows with larger mean accelerations are left out: they are impacts, not flight."""
 
 FORCE_STD_M_S2 = 0.5
-"""What a mean specific force is off by, before the data say it better."""
+"""Standard error of a mean specific force before residuals are known."""
 
 LEVELLING = 0.1
-"""Share of a tilt against the mean specific force that is taken back in a second (Mahony, Hamel, Pflimlin 2008)."""
+"""Share of the tilt against the specific force that is corrected per second (Mahony, Hamel and Pflimlin 2008)."""
 
 TILT_STD = float(np.radians(2.0))
 TILT_WANDER = float(np.radians(0.5))
 HEADING_WANDER = float(np.radians(0.5))
-"""Errors of integrated attitudes: tilts, which the accelerometer holds, and how all change in a second."""
+"""Standard deviations of integrated attitudes (rad) and of their random walk (rad per root second)."""
 
 BIAS_STEP_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inertial:
-    """Windows of an accelerometer, which begin and end at `begin_s` and `end_s` (k,).
+    """Windows of an accelerometer from `begin_s` to `end_s` (k,).
 
-    `force_m_s2` (k, 3) is the mean specific force in the world's axes by the given attitudes, `turn` (k, 3, 3) their
-    mean; `std_m_s2` is what a mean is off by.
+    `force_m_s2` (k, 3) is the mean specific force in the world's axes by the given attitudes, `turn` (k, 3, 3) the mean
+    rotation, `std_m_s2` the standard error of a mean.
     """
 
     begin_s: Floats
@@ -97,8 +97,8 @@ class Inertial:
         chosen = {name: getattr(self, name)[rows] for name in ("begin_s", "end_s", "force_m_s2", "turn")}
         return replace(self, **chosen)
 
-    def headed(self, heading_rad: float) -> Inertial:
-        """Return them turned about the world's vertical."""
+    def turned_by(self, heading_rad: float) -> Inertial:
+        """Return a copy that is rotated about the world's vertical."""
         turn = _about_vertical(heading_rad).as_matrix()
         return replace(self, force_m_s2=self.force_m_s2 @ turn.T, turn=turn @ self.turn)
 
@@ -128,7 +128,7 @@ class Readings:
 
 
 def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
-    """Return the windows of an accelerometer from the first range to the last."""
+    """Return the windows of an accelerometer between the first and the last range."""
     time = readings.time_s
     inside = (time >= max(0.0, float(attitude.time_s[0]))) & (time < min(last_s, float(attitude.time_s[-1])))
     turn = attitude.at(time[inside])
@@ -147,10 +147,10 @@ def windows(readings: Readings, attitude: Attitude, last_s: float) -> Inertial:
 
 
 def integrated(readings: Readings, known: Attitude | None, until_s: float) -> Attitude:
-    """Return attitudes by the gyroscope, levelled by the accelerometer.
+    """Return attitudes integrated from the gyroscope and levelled by the accelerometer.
 
-    They are those `known` before `until_s`, which also tell the gyroscope's bias, and go on from there. Without any,
-    the heading at first is 0 and unknown.
+    Before `until_s` they are the `known` ones, from which the gyroscope's bias is estimated. Without known attitudes
+    the first heading is 0 and unknown.
     """
     early = known is not None and bool(np.any(known.time_s < until_s)) and until_s > 0
     bias, turn = np.zeros(3), _level(readings)
@@ -170,12 +170,12 @@ def integrated(readings: Readings, known: Attitude | None, until_s: float) -> At
         quaternion=found,
         std_rad=np.array([TILT_STD, TILT_STD, np.inf]),
         wander_rad=wander,
-        begun=early,
+        heading_known=early,
     )
 
 
 def _carried_on(readings: Readings, first: int, turn: Floats, bias: Floats) -> Floats:
-    """Return quaternions (n - first, 4) from a first attitude on."""
+    """Return quaternions (n - first, 4) integrated from the attitude `turn` of reading `first`."""
     steps = np.minimum(np.diff(readings.time_s[first:], append=readings.time_s[-1]), 0.1)
     rates, pulls = readings.gyro[first:] - bias, _smoothed(readings)[first:]
     sizes = np.linalg.norm(pulls, axis=1)
@@ -191,14 +191,14 @@ def _carried_on(readings: Readings, first: int, turn: Floats, bias: Floats) -> F
 
 
 def _smoothed(readings: Readings) -> Floats:
-    """Return specific forces averaged over about a window (n, 3)."""
+    """Return specific forces (n, 3), smoothed over one window."""
     count = max(int(WINDOW_S / max(float(np.median(np.diff(readings.time_s))), 1e-4)), 1)
     kernel = np.ones(count) / count
     return np.column_stack([np.convolve(column, kernel, mode="same") for column in readings.force.T])
 
 
 def _level(readings: Readings) -> Floats:
-    """Return the attitude whose vertical is that of the first second's mean specific force."""
+    """Return the attitude whose vertical is the mean specific force of the first second."""
     early = readings.time_s < readings.time_s[0] + 1.0
     up = readings.force[early].mean(axis=0)
     up = up / np.linalg.norm(up)
@@ -208,7 +208,7 @@ def _level(readings: Readings) -> Floats:
 
 
 def _gyro_bias(readings: Readings, known: Attitude, until_s: float) -> Floats:
-    """Return by how much the gyroscope reads more than known attitudes turn, rad/s."""
+    """Return the bias of the gyroscope (3,), rad/s: the median of its readings less the known turn rates."""
     last = min(until_s, float(known.time_s[-1]), float(readings.time_s[-1]))
     first = max(float(known.time_s[0]), float(readings.time_s[0]))
     edges = np.arange(first, last, BIAS_STEP_S)

@@ -28,7 +28,7 @@ from calib.fitting.fitting import result_of
 from calib.fitting.known_delays import imported
 from calib.fitting.result import FitResult
 from calib.settings import FitSettings, FlightSettings
-from calib.trajectories.judging import Judged, curve_uncertainty, judged
+from calib.trajectories.judging import Judgement, curve_uncertainty, judge_delays
 from calib.trajectories.scene import Scene, scene_from
 from calib.trajectories.search import Cauchy, Found, search
 from calib.trajectories.start import begin
@@ -47,7 +47,7 @@ SHARED = (
 """The settings of `fit` that a fit without known distances has, too."""
 
 SHARE_OF_START = 0.3
-"""Share of the work that is done when the search for trajectories has a start, for a bar of progress."""
+"""Share of the work, for the progress bar, that is done when the search has its initial guess."""
 
 
 def fit_from_ranges(
@@ -87,7 +87,7 @@ def fit_from_ranges(
     flight, settings, known = _settings(flight, settings, changes)
     report = progress or (lambda _: None)
     scene = scene_from(data, flight, need_power=not settings.delays_only)
-    # The same bytes on any machine; SciPy brings a linear algebra of its own, which must be loaded to be limited.
+    # One thread: the same bytes on any machine. SciPy has its own linear algebra, which must be loaded to be limited.
     import_module("scipy.linalg")
     with threadpool_limits(limits=1, user_api="blas"):
         model, scene = range_model(scene, settings, curve=not settings.delays_only and known is None)
@@ -95,7 +95,7 @@ def fit_from_ranges(
         error = model.ranges.raw_m if known is None else model.ranges.raw_m - known.bias_curve(model.lifted)
         top = search(scene, model, error, state, lambda share: report(SHARE_OF_START + (1 - SHARE_OF_START) * share))
         found = _described(model, top, known)
-        verdict = judged(found, top)
+        verdict = judge_delays(found, top)
         result = _result(found, top, verdict, flight, settings, known, rival)
     report(1.0)
     if not settings.minimum_norm:
@@ -106,7 +106,10 @@ def fit_from_ranges(
 def _settings(
     flight: FlightSettings | None, settings: FitSettings | None, changes: Mapping[str, Any]
 ) -> tuple[FlightSettings, FitSettings, Calibration | None]:
-    """Return all settings with changes, and the calibration whose curve is kept; refuses what does not go together."""
+    """Return the settings with changes, and the calibration whose curve is kept.
+
+    Raises `BadInputError` for settings that exclude each other.
+    """
     names = {one.name for one in fields(FlightSettings)}
     flight = replace(flight or FlightSettings(), **{name: changes[name] for name in changes if name in names})
     settings = replace(settings or FitSettings(), **{name: changes[name] for name in changes if name not in names})
@@ -123,7 +126,7 @@ def _settings(
 
 
 def range_model(scene: Scene, settings: FitSettings, *, curve: bool, offsets: bool = True) -> tuple[RangeModel, Scene]:
-    """Return unknowns and parts of delays, curves and offsets, and the scene of their ranges."""
+    """Return the model of delays, curves and offsets, and the scene with the ranges that the model keeps."""
     if len(scene.ranges) < FEWEST_RANGES:
         raise UnanswerableError(
             f"{scene.source}: {len(scene.ranges)} usable exchanges are too few, at least {FEWEST_RANGES} are needed"
@@ -148,9 +151,9 @@ def _reference_dbm(settings: FitSettings) -> float:
 
 
 def _curve_source(curve_from: Calibration | str | os.PathLike[str] | None, other: str) -> Calibration | None:
-    """Return the calibration whose curve is taken; raises `BadInputError` for one that has not one curve of all.
+    """Return the calibration whose curve is kept.
 
-    `other` names a parameter of the fit that says otherwise what curves there are, or is empty.
+    Raises `BadInputError` if it has more than one curve, or if the setting `other` ("" for none) excludes it.
     """
     known = imported(curve_from, "curve_from")
     if known is not None and other:
@@ -162,7 +165,7 @@ def _curve_source(curve_from: Calibration | str | os.PathLike[str] | None, other
 
 
 def _described(model: RangeModel, top: Found, known: Calibration | None) -> KnownDistances:
-    """Return what was found as a fit to the distances that were found, which knows how far they are uncertain."""
+    """Return the fit as one to the estimated distances, whose uncertainty is in its covariance."""
     distances = top.geometry.distances(top.optimum.x)[0]
     model = replace(model, ranges=replace(model.ranges, truth_m=distances))
     errors = top.rows.errors
@@ -180,7 +183,7 @@ def _described(model: RangeModel, top: Found, known: Calibration | None) -> Know
         steps=top.steps,
         beside=tuple(top.known.values()),
     )
-    # What the ranges determine is judged later, with what trajectories take of it.
+    # Identifiability is judged later, with the uncertainty of trajectories.
     found = described(model, fitted, time_blocks(model.ranges.time_ns, model.ranges.session), [])
     if known is not None:
         more = curve_uncertainty(found, known)
@@ -191,7 +194,7 @@ def _described(model: RangeModel, top: Found, known: Calibration | None) -> Know
 def _result(
     found: KnownDistances,
     top: Found,
-    judgement: Judged,
+    judgement: Judgement,
     flight: FlightSettings,
     settings: FitSettings,
     known: Calibration | None,
@@ -202,7 +205,7 @@ def _result(
         dict(zip(found.model.tags, found.delays.tolist(), strict=False)), found.residuals, found.model.ranges
     )
     doubts = examine_fit(found)
-    covariance = judgement.beyond_linear(doubts.covariance_ns2)
+    covariance = judgement.widened(doubts.covariance_ns2)
     calibration = calibration_of(
         found,
         covariance,
@@ -226,13 +229,13 @@ def _result(
         doubts.sentences,
         settings=settings,
         fixed=fixed,
-        first=[*judgement.left_open(covariance), *_of_search(top, rival), *top.scene.tapes.left_out],
+        first=[*judgement.undetermined_sentences(covariance), *_of_search(top, rival), *top.scene.tapes.left_out],
         more=judgement.sentences,
     )
 
 
 def _with_curve(calibration: Calibration, known: Calibration) -> Calibration:
-    """Return a calibration with the curve of another, and what is known of it."""
+    """Return a calibration with the curve of another one and the covariance of that curve."""
     uncertainty = calibration.uncertainty
     if uncertainty is not None:
         size = len(known.bias_curve.coefficients)
@@ -248,13 +251,13 @@ def _of_search(top: Found, rival: str) -> Iterator[str]:
         yield rival
 
 
-def _refuse_undetermined(judgement: Judged, model: RangeModel, scene: Scene) -> None:
+def _refuse_undetermined(judgement: Judgement, model: RangeModel, scene: Scene) -> None:
     free = judgement.free_tags
     if not free or len(free) < len([tag for tag in model.tags if tag in judgement.tags]):
         return
     raise UnanswerableError(
-        f"{scene.source}: {judgement.said}; let positions be known for some seconds (`poses_until_s`), give the "
-        "places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits regardless, and says so)",
+        f"{scene.source}: {judgement.undetermined_text}; let positions be known for some seconds (`poses_until_s`), "
+        "give the places of anchors, or pin a delay with `fixed_ns` (`minimum_norm` fits regardless, and says so)",
         undetermined=[free],
     )
 
@@ -262,16 +265,16 @@ def _refuse_undetermined(judgement: Judged, model: RangeModel, scene: Scene) -> 
 def _provenance(
     found: KnownDistances,
     top: Found,
-    judgement: Judged,
+    judgement: Judgement,
     flight: FlightSettings,
     settings: FitSettings,
     covariance: Floats,
 ) -> dict[str, Any]:
-    """Return what a calibration of trajectories states beside what all fits state."""
+    """Return the provenance that only fits of trajectories have."""
     scene, places_s, reference_dbm = top.scene, top.scene.places.time_s, _reference_dbm(settings)
     more: dict[str, Any] = {}
     if judgement.free_tags:
-        more = {"undetermined": [judgement.free_tags], "left_open": judgement.left_open(covariance)[0]}
+        more = {"undetermined": [judgement.free_tags], "left_open": judgement.undetermined_sentences(covariance)[0]}
     pinned = set(found.model.tags) <= set(settings.fixed_ns)
     return more | {
         "recordings": [scene.source],

@@ -1,4 +1,4 @@
-"""What ranges say of delays when trajectories are unknown too: which are determined, and what contradicts the rest."""
+"""Which delays the ranges determine when trajectories are unknown, and which inputs contradict the ranges."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ from calib.trajectories.search import MOTION, Found
 from uwblink.arrays import Floats, Ints
 
 PRIOR_NS = 2.0
-"""Delays of boards of one kind differ by less: what a direction is known by where nothing else says anything."""
+"""Prior standard deviation of a delay: delays of boards of one type differ by less."""
 
-GUESS_NS, LOOSEST = 0.2, 0.5
-"""A direction of delays counts as determined if it is known to half of so much (3 cm of range), by standard error.
+SCALE_NS, LOOSEST = 0.2, 0.5
+"""A direction of delays is determined if its standard error is at most LOOSEST * SCALE_NS (3 cm of range).
 
-Calibrated by simulation (docs/accuracy.md): intervals beyond were seen not to hold.
+The value comes from simulations (docs/accuracy.md): wider intervals did not hold.
 """
 
 GROWTH = 3.0
-"""Few ranges leave delays less known than that even where distances are given; then so many times as much will do."""
+"""If a fit with known distances is less certain than that, a direction may be so many times less certain."""
 
-ALONE = 3.0
-"""By geometry alone a fit is linear no further: errors of up to 4.2 of its standard errors were seen, which are so many
-times as large there as linear propagation has them (docs/accuracy.md)."""
+GEOMETRY_ALONE_FACTOR = 3.0
+"""Factor on standard errors where only geometry determines distances: there the problem is not linear, and errors up to
+4.2 linearised standard errors were observed (docs/accuracy.md)."""
 
-LOOKED_AT = 400
-"""Distances whose standard errors are averaged."""
+SAMPLED_RANGES = 400
+"""Ranges whose distances give `distance_std_m`."""
 
-TAPE_ALONE, TAPE_SURELY, TAPE_MATTERS_M = 0.999, 4.0, 0.03
-"""A tape that is known by itself alone, to such a share, contradicts nothing; others do by so many standard errors."""
+TAPE_UNCHECKED, TAPE_MIN_DEVIATION, TAPE_MIN_ERROR_M = 0.999, 4.0, 0.03
+"""A tape that no range checks (leverage above the first) is not tested. Others contradict the fit if their deleted
+residual exceeds so many standard errors and so many metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
-    """The verdict on the delays of `tags` that are not pinned, whose covariance (tags, tags) is `covariance_ns2`.
+class Judgement:
+    """The verdict on the delays of `tags` that are not pinned; `covariance_ns2` (tags, tags) is their covariance.
 
-    `absorbed` says for the least known direction of delays how many times its variance grew because distances are not
-    known; `distance_std_m` is the root mean square of standard errors of distances, `sentences` say what contradicts.
+    `absorbed` is the largest factor, over all directions of delays, by which unknown distances increase the variance.
+    `distance_std_m` is the root mean square standard error of the distances. `sentences` name contradictions.
     """
 
     tags: tuple[int, ...]
@@ -66,16 +67,16 @@ class Judged:
         return [int(tag) for tag in self.verdict.named("delay") if tag]
 
     @property
-    def said(self) -> str:
-        """Return as a sentence what is not determined."""
-        return "".join(self.left_open(self.covariance_ns2))
+    def undetermined_text(self) -> str:
+        """Return a sentence on the delays that are not determined, "" if all are."""
+        return "".join(self.undetermined_sentences(self.covariance_ns2))
 
-    def beyond_linear(self, covariance: Floats) -> Floats:
-        """Return a covariance of delays, wider where geometry alone tells them."""
-        return covariance * ALONE**2 if self.by_geometry_alone else covariance
+    def widened(self, covariance: Floats) -> Floats:
+        """Return a covariance of delays, inflated where only geometry determines distances."""
+        return covariance * GEOMETRY_ALONE_FACTOR**2 if self.by_geometry_alone else covariance
 
-    def left_open(self, covariance_ns2: Floats) -> list[str]:
-        """Return as a sentence what is not determined; none where everything is. Delays have a covariance by tag."""
+    def undetermined_sentences(self, covariance_ns2: Floats) -> list[str]:
+        """Return a sentence on the delays that are not determined; none if all are. `covariance_ns2` is by tag."""
         free = self.free_tags
         if not free:
             return []
@@ -96,18 +97,18 @@ class Judged:
         ]
 
 
-def judged(found: KnownDistances, top: Found) -> Judged:
-    """Return the verdict on a fit's delays, and what contradicts its trajectories."""
+def judge_delays(found: KnownDistances, top: Found) -> Judgement:
+    """Return the verdict on the delays of a fit, and contradictions to its trajectories."""
     layout, optimum = top.optimum.layout, top.optimum
     where = layout.where["delay"]
     own = np.intersect1d(np.arange(where.start, where.stop), layout.free())
     tags = tuple(int(layout.blocks[0].names[k - where.start]) for k in own)
     some = np.ix_(own - where.start, own - where.start)
     by_geometry_alone = top.scene.by_geometry_alone
-    covariance = found.covariances["delay"][some] * (ALONE**2 if by_geometry_alone else 1.0)
+    covariance = found.covariances["delay"][some] * (GEOMETRY_ALONE_FACTOR**2 if by_geometry_alone else 1.0)
     information = sum_rows([top.rows, *top.gauge], optimum.x).information + optimum.priors.precision()
     with_truth = with_known_distances(information, layout, own)
-    return Judged(
+    return Judgement(
         tags=tags,
         verdict=verdict_on(covariance, with_truth, tags),
         covariance_ns2=covariance,
@@ -119,9 +120,9 @@ def judged(found: KnownDistances, top: Found) -> Judged:
 
 
 def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floats:
-    """Return the covariance of some unknowns (k, k) that a fit with known distances would leave.
+    """Return the covariance (k, k) that some unknowns would have if all distances were known.
 
-    `information` (p, p) is what ranges and priors know; nothing of motion is unknown then.
+    `information` (p, p) is that of ranges and priors; the unknowns of motion are held.
     """
     others = np.setdiff1d(layout.free(), layout.indices(MOTION))
     some = information[others][:, others]
@@ -131,10 +132,10 @@ def with_known_distances(information: Matrix, layout: Layout, own: Ints) -> Floa
 
 
 def verdict_on(covariance: Floats, with_truth: Floats, tags: Sequence[int]) -> Verdict:
-    """Return what delays of a covariance (tags, tags) are determined, beside that of a fit with known distances."""
+    """Return the verdict on delays with a covariance (tags, tags), compared with that for known distances."""
     if not tags:
         return judge(np.eye(1) * 1e6, [Unknown("delay", "")])
-    guess = np.maximum(GUESS_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
+    guess = np.maximum(SCALE_NS, GROWTH / LOOSEST * np.sqrt(np.maximum(np.diag(with_truth), 0.0)))
     information = np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) + np.eye(len(covariance)) / PRIOR_NS**2
     unknowns = [Unknown("delay", str(tag), scale) for tag, scale in zip(tags, guess.tolist(), strict=True)]
     return judge((information + information.T) / 2, unknowns, loosest=LOOSEST)
@@ -152,7 +153,7 @@ def _absorbed(covariance: Floats, with_truth: Floats) -> float:
 
 def _distance_std(top: Found) -> float:
     """Return the root mean square of the standard errors of some distances."""
-    some = np.unique(np.linspace(0, len(top.rows) - 1, LOOKED_AT).astype(np.int64))
+    some = np.unique(np.linspace(0, len(top.rows) - 1, SAMPLED_RANGES).astype(np.int64))
     moved, columns = top.geometry.distances(top.optimum.x, some)[1], top.geometry.columns[some]
     rows = np.zeros((len(some), top.optimum.layout.size))
     np.add.at(rows, (np.arange(len(some))[:, None], columns), moved)
@@ -160,16 +161,16 @@ def _distance_std(top: Found) -> float:
 
 
 def _of_motion(top: Found) -> Iterator[str]:
-    if top.coarse.shows:
+    if top.coarseness.shows:
         yield (
             f"bodies move faster than control points every {top.motion.places.step_s:.1f} s follow: about "
-            f"{100 * top.coarse.motion_m:.0f} cm of their motion is not in the trajectories, and distances are off by "
-            "it; fly more calmly"
+            f"{100 * top.coarseness.motion_m:.0f} cm of their motion is not in the trajectories, and distances are off "
+            "by it; fly more calmly"
         )
 
 
 def _of_tapes(top: Found) -> Iterator[str]:
-    """Yield in sentences which distances are not what the fit would say without them (deleted residuals; Cook 1982)."""
+    """Yield a sentence for each tape that the ranges contradict, by deleted residuals (Cook and Weisberg 1982)."""
     rows = top.known.get("tape")
     if not isinstance(rows, TapeRows):
         return
@@ -180,9 +181,9 @@ def _of_tapes(top: Found) -> Iterator[str]:
         np.add.at(row, rows.geometry.columns[mine], moved[mine] / len(mine))
         share = min(float(row @ (top.optimum.covariance @ row)) / one.sigma_m**2, 1.0)
         off = -float(left[mine].mean())
-        if share > TAPE_ALONE or abs(off) < TAPE_SURELY * one.sigma_m * math.sqrt(1 - share):
+        if share > TAPE_UNCHECKED or abs(off) < TAPE_MIN_DEVIATION * one.sigma_m * math.sqrt(1 - share):
             continue
-        if abs(off) < TAPE_MATTERS_M * (1 - share):
+        if abs(off) < TAPE_MIN_ERROR_M * (1 - share):
             continue
         deviation, without = off / (one.sigma_m * math.sqrt(1 - share)), -off / (1 - share)
         way = "more" if without > 0 else "less"
@@ -193,14 +194,14 @@ def _of_tapes(top: Found) -> Iterator[str]:
 
 
 def curve_uncertainty(found: KnownDistances, known: Calibration) -> Floats:
-    """Return what a taken curve's own covariance adds to that of the delays (tags, tags) in ns^2; 0 without one."""
+    """Return the covariance (tags, tags) in ns^2 that the uncertainty of a kept curve adds to the delays."""
     optimum, rows, model = found.searches[0].optimum, found.searches[0].rows, found.model
     size = len(found.delays)
     if known.uncertainty is None or len(known.uncertainty.bias_m2) != len(known.bias_curve.coefficients):
         return np.zeros((size, size))
     low, high = known.bias_curve.range
     splines = basis(np.clip(model.lifted, low, high), np.array(known.bias_curve.knots))[rows.order]
-    # By how much unknowns move with an error of each range: their covariance times what it tells of them.
+    # Derivatives of the unknowns by an error of each range: covariance times information.
     linked, at = np.zeros((optimum.layout.size, splines.shape[1])), 0
     for terms, score in rows.terms_and_scores(optimum.x):
         here = slice(at, at + len(score))

@@ -1,7 +1,8 @@
-"""Where bodies are and how they are turned, as unknowns of a fit: splines of places, errors of attitudes, anchors.
+"""Positions and attitudes of bodies as unknowns of a fit.
 
-Places are uniform cubic B-splines; what attitudes are wrong by are turns about the world's axes, straight lines between
-points a second apart. `Distances` makes distances between antennas of them, `known_rows` all that is known beside.
+Positions are uniform cubic B-splines. Errors of attitudes are rotations about the world's axes, linear between points a
+second apart. `Distances` gives distances between antennas and their derivatives, `known_rows` the rows of what is known
+beside ranges.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from calib.trajectories.scene import Ends, Scene, ends_of
 from uwblink.arrays import Floats, Ints
 
 POINT_S = 0.4
-"""Time between control points of a place: a multirotor does not change its acceleration faster."""
+"""Time between control points of a path: a multirotor does not change its acceleration faster."""
 
 TURN_S = 1.0
-"""Time between control points of what attitudes are wrong by."""
+"""Time between points of the errors of attitudes."""
 
 GRAVITY_M_S2 = 9.81
 
@@ -37,11 +38,11 @@ class Grid:
 
     @property
     def times_s(self) -> Floats:
-        """Return when each control point has its greatest weight (count,)."""
+        """Return the times (count,) at which control points have their greatest weight."""
         return np.asarray(self.start_s + self.step_s * np.arange(self.count), dtype=np.float64)
 
     def piece(self, time_s: Floats, low: int, high: int) -> tuple[Ints, Floats]:
-        """Return the piece of each instant and how far into it the instant lies; the pieces at the ends go on."""
+        """Return the segment of each instant and the position inside it; the first and last segments are extended."""
         place = (time_s - self.start_s) / self.step_s
         first = np.clip(np.floor(place).astype(np.int64), low, self.count - high)
         return first, place - first
@@ -56,17 +57,18 @@ class Grid:
         return first[:, None] - 1 + np.arange(4), share
 
     def straight(self, time_s: Floats) -> tuple[Ints, Floats]:
-        """Return the control points (n, 2) and weights (n, 2) of straight lines between control points."""
+        """Return the control points (n, 2) and weights (n, 2) of linear interpolation."""
         first, x = self.piece(time_s, 0, 2)
         return first[:, None] + np.arange(2), np.column_stack([1 - x, x])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """How the unknowns of a scene's motion are laid out.
+    """The layout of the unknowns of motion.
 
     Kinds are "path" (points, moving, 3), "turn" (points, turning, 3), "stand" (sought, 3), "bias" (sensed, 3) of
-    accelerometers and "level" (levelled,) of height sensors. `turning`, `sensed` and `levelled` number moving bodies.
+    accelerometers and "level" (levelled,) of height sensors. `turning`, `sensed` and `levelled` are numbers of moving
+    bodies.
     """
 
     scene: Scene
@@ -78,8 +80,8 @@ class Motion:
 
     @classmethod
     def of(cls, scene: Scene, point_s: float = POINT_S) -> Motion:
-        """Return the motion of a scene with control points so far apart."""
-        # On multiples of their distance, so that those of a part of the scene are those of the whole.
+        """Return the motion of a scene with control points `point_s` seconds apart."""
+        # At multiples of the interval, so that parts of a scene have the control points of the whole.
         begin = float(np.floor(scene.time_s[0] / TURN_S) * TURN_S)
         length = float(scene.time_s[-1]) - begin
         names = list(enumerate(scene.moving))
@@ -93,7 +95,8 @@ class Motion:
         )
 
     def unknowns(self, start: Mapping[str, Floats], jerk_m_s3: float) -> tuple[Unknown, ...]:
-        """Return the blocks of unknowns, at `start` or zero; the jerk of paths is estimated, begun at `jerk_m_s3`."""
+        """Return the blocks of unknowns at `start`, or at zero. The variance of jerk is estimated, starting at
+        `jerk_m_s3`."""
         scene, count, moving = self.scene, self.places.count, len(self.scene.moving)
         third = sparse.diags([-1.0, 3.0, -3.0, 1.0], [0, 1, 2, 3], shape=(count - 3, count)) / self.places.step_s**3
         each = sparse.kron(third, sparse.eye(3 * moving), format="csc")
@@ -109,7 +112,7 @@ class Motion:
         held = [(2, calm * self.places.step_s**2), (1, np.full(moving, SLOW_M_S * self.places.step_s))]
         path = tuple(_differences(count, order, np.repeat(std, 3)) for order, std in held)
         attitudes = [scene.attitudes[scene.moving[k]] for k in self.turning]
-        # What is not known at all is infinitely unsure, and says nothing.
+        # Unknown components have an infinite standard deviation: zero information.
         wander = np.ravel([attitude.wander_rad * np.sqrt(self.turns.step_s) for attitude in attitudes])
         turn = [(0, np.ravel([attitude.std_rad for attitude in attitudes])), (1, wander)]
         turns = tuple(_differences(self.turns.count, order, std) for order, std in turn)
@@ -140,19 +143,19 @@ class Motion:
         return np.arange(where.start, where.stop).reshape(-1, max(bodies[kind], 1), 1 if kind == "level" else 3)
 
     def state(self, layout: Layout, x: Floats) -> dict[str, Floats]:
-        """Return the unknowns of motion by their kind, in their shapes."""
+        """Return the unknowns of motion by kind, in their shapes."""
         kinds = ("path", "turn", "stand", "bias", "level")
         return {kind: x[self.numbers(layout, kind)] for kind in kinds if kind in layout.where}
 
     def positions(self, path: Floats, time_s: Floats) -> Floats:
-        """Return where the moving bodies are at instants (k,), shape (k, bodies, 3)."""
+        """Return the positions (k, bodies, 3) of the moving bodies at instants (k,)."""
         point, share = self.places.cubic(time_s)
         return np.asarray(np.einsum("kp,kpba->kba", share, path.reshape(self.places.count, -1, 3)[point]))
 
     def refined(self, start: Mapping[str, Floats]) -> tuple[Motion, dict[str, Floats]]:
-        """Return twice as many control points that make the same paths (Lane and Riesenfeld 1980).
+        """Return the same paths with twice as many control points (Lane and Riesenfeld 1980).
 
-        A new point is the mean of two, or one with an eighth of either side.
+        A new point is the mean of two old ones, or 6/8 of one and 1/8 of both neighbours.
         """
         finer = Motion.of(self.scene, self.places.step_s / 2)
         points = start["path"].reshape(self.places.count, -1, 3)
@@ -166,7 +169,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One end of each distance, with columns (n, k, 3) and shares (n, k) of where it is and how it is turned."""
+    """One end of each distance: columns (n, k, 3) and weights (n, k) of the unknowns of its position and attitude."""
 
     ends: Ends
     place: Ints
@@ -213,12 +216,12 @@ class Distances:
         columns = np.concatenate(
             [part.reshape(count, -1) for side in sides for part in (side.place, side.turn, side.stand)], axis=1
         )
-        # What an end does not depend on stands for zero in a column that the other end has, which costs nothing.
-        # Between anchors at given places nothing is unknown, and any column will do.
+        # Where an end does not depend on an unknown, its entry is zero in a column that the other end uses.
+        # Between anchors at given positions no entry is used, and any column is valid.
         return cls((sides[0], sides[1]), np.maximum(np.where(columns < 0, columns.max(axis=1)[:, None], columns), 0))
 
     def antennas(self, x: Floats, rows: Ints | slice = slice(None)) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return where the antennas of both ends are (n, 3), and their lever arms in the world's axes (n, 3)."""
+        """Return the antennas of both ends (n, 3), and their lever arms in the world's axes (n, 3)."""
         found = []
         for side in self.sides:
             place = np.einsum("nk,nka->na", side.place_share[rows], x[side.place[rows]])
@@ -234,7 +237,7 @@ class Distances:
         return found[0], found[2], found[1], found[3]
 
     def distances(self, x: Floats, rows: Ints | slice = slice(None)) -> tuple[Floats, Floats]:
-        """Return the distances (m,) of some ranges at unknowns (p,), metres, and their derivatives (m, k)."""
+        """Return the distances (m,) of some ranges in metres, and their derivatives (m, k) by the unknowns (p,)."""
         first, second, *arms = self.antennas(x, rows)
         away = second - first
         distance = np.linalg.norm(away, axis=1)
@@ -252,14 +255,14 @@ class Distances:
 
 @dataclass(frozen=True)
 class TapeRows:
-    """Distances that were measured otherwise."""
+    """Rows of distances by tape."""
 
     geometry: Distances
     measured_m: Floats
     std_m: Floats
 
     def residuals(self, x: Floats) -> Floats:
-        """Return measured less found distances (n,)."""
+        """Return taped less estimated distances (n,)."""
         return self.measured_m - self.geometry.distances(x)[0]
 
     def terms(self, x: Floats) -> Iterator[Terms]:
@@ -272,25 +275,25 @@ LEAST_JERK, MOST_JERK = 0.2, 2000.0
 """Bounds of jerk, m/s^3."""
 
 FAR_M = 30.0
-"""Places are within so much of where they are thought to be at first; it holds what nothing else does."""
+"""Prior standard deviation of a control point around its initial guess: it holds points without any range."""
 
 STANDS_M = 100.0
 BIAS_M_S2 = 0.4
-"""What an accelerometer's bias may be."""
+"""Prior standard deviation of an accelerometer's bias."""
 
 LEVEL_M = 0.15
-"""What a height sensor may be off by all along."""
+"""Prior standard deviation of the constant offset of a height sensor."""
 
 CALM_M_S2, CALM_SENSED_M_S2 = 5.0, 50.0
-"""Accelerations that a body may have without surprise; it holds a path where ranges fail for a while. Where an
-accelerometer says them, ten times as much."""
+"""Prior standard deviation of accelerations, which holds a path where ranges are missing; the second where an
+accelerometer measures them."""
 
 SLOW_M_S = 3.0
-"""Speeds that a body in a room may have without surprise."""
+"""Prior standard deviation of speeds in a room."""
 
 
 def known_rows(motion: Motion, layout: Layout) -> dict[str, NormalRows | TapeRows]:
-    """Return what is known beside the ranges, by what it is."""
+    """Return the rows of positions, forces, heights and tapes, by kind."""
     scene, path = motion.scene, motion.numbers(layout, "path")
     found: dict[str, NormalRows | TapeRows] = {}
     known = scene.places
@@ -312,7 +315,7 @@ def known_rows(motion: Motion, layout: Layout) -> dict[str, NormalRows | TapeRow
         )
     tapes = scene.tapes
     if len(tapes):
-        # What holds always is between bodies that stand: any instant will do.
+        # Distances that always hold are between standing bodies: any instant is valid.
         time = np.where(np.isnan(tapes.time_s), scene.time_s[0], tapes.time_s)
         geometry = Distances.of(motion, layout, (tapes.first, tapes.second), time)
         found["tape"] = TapeRows(geometry, tapes.distance_m, tapes.std_m)
@@ -320,7 +323,8 @@ def known_rows(motion: Motion, layout: Layout) -> dict[str, NormalRows | TapeRow
 
 
 def _differences(count: int, order: int, std: Floats) -> Prior:
-    """Return independent differences between `count` points of several columns, each +- `std` (columns,)."""
+    """Return the prior of independent differences between `count` points of several columns, of deviation `std`
+    (columns,)."""
     step = sparse.csr_matrix(sparse.eye(count))
     for _ in range(order):
         step = step[1:] - step[:-1]
@@ -329,7 +333,7 @@ def _differences(count: int, order: int, std: Floats) -> Prior:
 
 
 def _rows(columns: Ints, entries: Floats, value: Floats | float, std: Floats | float) -> NormalRows:
-    """Return one row for each but the last axis of columns (..., K), with entries, values and deviations broadcast."""
+    """Return a row for each element of columns (..., K) but the last axis; entries, value and std are broadcast."""
     shape = columns.shape[:-1]
     return NormalRows(
         value=np.broadcast_to(value, shape).ravel(),
@@ -340,7 +344,7 @@ def _rows(columns: Ints, entries: Floats, value: Floats | float, std: Floats | f
 
 
 def _forces(motion: Motion, layout: Layout) -> NormalRows:
-    """Mean accelerations are mean specific forces, turned, less the bias, and gravity: v2 - v1 = (R (f - b) + g) dt."""
+    """Return rows of mean accelerations: (v2 - v1) / dt = R (f - b) + g with bias b and rotation R."""
     path, turn, bias = (motion.numbers(layout, kind) for kind in ("path", "turn", "bias"))
     parts = []
     for own, body in enumerate(motion.sensed):
@@ -359,7 +363,7 @@ def _forces(motion: Motion, layout: Layout) -> NormalRows:
                 force = sensed.force_m_s2
                 entries += [-force[:, [last]] * part, force[:, [following]] * part]
             else:
-                # As wide as those of other bodies.
+                # As many columns as other bodies have.
                 columns += [path[late, body, axis]]
                 entries += [np.zeros(late.shape)]
             aim = sensed.force_m_s2[:, axis] - GRAVITY_M_S2 * (axis == 2)

@@ -75,7 +75,7 @@ class Heights(Samples):
     std_m: Floats
 
     def reweighted(self, residual: Floats) -> Heights:
-        """Return them with standard errors by their residuals (k,), which are in units of the present ones."""
+        """Return the readings with standard errors from their residuals (k,), in units of the present ones."""
         if not len(residual):
             return self
         residual_m = residual * self.std_m

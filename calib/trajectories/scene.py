@@ -1,4 +1,4 @@
-"""What a fit of trajectories is given: ranges, who carries which tag, and all that is known of places and attitudes."""
+"""The inputs of a fit of trajectories: ranges, lever arms, and what is known of positions and attitudes."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ NOWHERE = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Ranges (n,) at `time_s` (n,) between tags of bodies that move or stand still.
+    """Ranges (n,) at `time_s` (n,) between tags of bodies that move or stand.
 
-    `moving` names the bodies that move; `still` has those that do not, with their place or None where it is to be
-    found. `arms` says of each tag its body and lever arm. `attitudes` are those of moving bodies; a body without any
-    has its tags in its middle. `tapes` are distances that were measured otherwise, `heights` readings of sensors.
+    `moving` names the moving bodies. `still` gives the position of each standing body, None if it is estimated. `arms`
+    gives the body and the lever arm of each tag. `attitudes` are those of moving bodies; without an attitude the tags
+    of a body are at its centre. `tapes` are distances by tape, `heights` readings of height sensors.
     """
 
     source: str
@@ -48,37 +48,41 @@ class Scene:
 
     @property
     def sought(self) -> list[str]:
-        """Return the bodies that stand still at places that are to be found."""
+        """Return the standing bodies whose positions are estimated."""
         return [body for body, place in self.still.items() if place is None]
 
     @property
     def by_geometry_alone(self) -> bool:
-        """Whether nothing says how far anything is but how ranges between lever arms fit together in space."""
+        """Whether only the geometry of lever arms determines the scale of distances."""
         given = sum(place is not None for place in self.still.values())
         return given < 2 and not (len(self.places) or len(self.heights) or self.inertial or len(self.tapes))
 
     def between(self, begin_s: float, end_s: float) -> Scene:
-        """Return what lies within a span of time."""
+        """Return the part of the scene within a span of time."""
         rows = np.flatnonzero((self.time_s >= begin_s) & (self.time_s <= end_s))
         samples = {name: getattr(self, name).between(begin_s, end_s) for name in ("places", "heights", "tapes")}
         inertial = {body: windows.between(begin_s, end_s) for body, windows in self.inertial.items()}
         return replace(self.only(rows), inertial=inertial, **samples)
 
     def at(self, places: Places) -> Scene:
-        """Return the scene with these places, and nothing else that is known beside its attitudes."""
+        """Return the scene with these known positions instead of all positions, forces, heights and tapes."""
         return replace(self, places=places, inertial={}, heights=no_heights(), tapes=no_tapes())
 
     @property
     def without_heading(self) -> list[str]:
-        """Return the bodies whose first heading is not known."""
-        return [body for body, known in self.attitudes.items() if not np.isfinite(known.std_rad[2]) and not known.begun]
+        """Return the bodies whose first heading is unknown."""
+        return [
+            body
+            for body, known in self.attitudes.items()
+            if not np.isfinite(known.std_rad[2]) and not known.heading_known
+        ]
 
-    def headed(self, heading: Mapping[str, float]) -> Scene:
-        """Return the scene with the attitudes of some bodies turned about the vertical by their headings."""
+    def turned_by(self, heading: Mapping[str, float]) -> Scene:
+        """Return the scene with attitudes of some bodies rotated about the vertical."""
         if not heading:
             return self
-        attitudes = {body: known.headed(heading.get(body, 0.0)) for body, known in self.attitudes.items()}
-        inertial = {body: some.headed(heading.get(body, 0.0)) for body, some in self.inertial.items()}
+        attitudes = {body: known.turned_by(heading.get(body, 0.0)) for body, known in self.attitudes.items()}
+        inertial = {body: some.turned_by(heading.get(body, 0.0)) for body, some in self.inertial.items()}
         return replace(self, attitudes=attitudes, inertial=inertial)
 
     def only(self, rows: Ints) -> Scene:
@@ -89,11 +93,11 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """One end of each range (n,): what carries the antenna there.
+    """One end of each range (n,).
 
-    `mover` and `stander` number the moving body or the one whose place is sought, -1 for neither; `base_m` (n, 3) is
-    the antenna of a body at a known place, or how far it is from the middle of a standing one; `arm_m` (n, 3) is how
-    far it is from the middle of a moving body by its given attitude.
+    `mover` and `stander` are the numbers of the moving body or of the body whose position is estimated, -1 for neither.
+    `base_m` (n, 3) is the antenna's position on a body with a known position, or its offset from the centre of a
+    standing body. `arm_m` (n, 3) is its offset from the centre of a moving body, by the given attitude.
     """
 
     mover: Ints
@@ -103,7 +107,7 @@ class Ends:
 
 
 def ends_of(scene: Scene, ids: Ints, time_s: Floats) -> Ends:
-    """Return the ends at tags `ids` (n,) at instants (n,)."""
+    """Return the ends of tags `ids` (n,) at instants (n,)."""
     count = len(ids)
     mover, stander = np.full(count, NOWHERE), np.full(count, NOWHERE)
     base, arm = np.zeros((count, 3)), np.zeros((count, 3))
@@ -125,20 +129,21 @@ def ends_of(scene: Scene, ids: Ints, time_s: Floats) -> Ends:
 
 
 STILL_M = 0.1
-"""A body whose poses reach no further stands."""
+"""A body whose poses stay within this distance stands still."""
 
 PLACE_STD_M = 0.02
 PLACE_EVERY_S = 0.1
-"""Known places count so often, each with so large an error: what they are wrong by lasts."""
+"""Known positions are thinned to this interval and have this standard error: errors of motion capture last."""
 
 TILT_STD = float(np.radians(1.0))
 TILT_WANDER = float(np.radians(0.2))
 HEADING_WANDER = float(np.radians(0.5))
-"""What tilts of an attitude reference are wrong by, and by how much its errors change in a second."""
+"""Standard deviation of the tilt of an attitude reference (rad), and random walks of tilt and heading (rad per root
+second)."""
 
 
 def scene_from(data: Data, settings: FlightSettings, *, need_power: bool = True) -> Scene:
-    """Return the scene of a recording; raises `UnanswerableError` where it holds no ranges or nothing moves."""
+    """Return the scene of a recording; raises `UnanswerableError` if it has no ranges or no body moves."""
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
         poses, tags, planted = source.poses, list(source.tags), getattr(source, "planted", None)
@@ -199,7 +204,7 @@ def _ranges_between(
     need_power: bool,
 ) -> tuple[Ints, Ranges]:
     """Return the usable ranges between known tags in order of time, and their rows among the exchanges."""
-    # In the place of distances, which nobody knows, the number of the row: it says which rows are left.
+    # The truth is not known. In its place stands the number of the row, which tells what rows are left.
     numbered = Ranges.from_exchanges(
         exchanges,
         np.arange(len(exchanges), dtype=np.float64),
@@ -232,23 +237,23 @@ class _BodyPoses:
 
     @property
     def stands(self) -> bool:
-        """Whether all poses are of one place."""
+        """Whether all poses have one position."""
         here = self.position_m[self.placed]
         return bool(len(here)) and bool(np.ptp(here, axis=0).max() <= STILL_M)
 
     @property
     def middle(self) -> Floats:
-        """Return where a standing body is."""
+        """Return the position of a standing body (3,)."""
         return np.asarray(np.median(self.position_m[self.placed], axis=0))
 
     @property
     def turned(self) -> Floats:
-        """Return how a standing body is turned."""
+        """Return the rotation of a standing body (3, 3)."""
         known = self.quaternion[self.known]
         return np.asarray(Rotation.from_quat(known[0]).as_matrix()) if len(known) else np.eye(3)
 
     def sampled_rows(self, until_s: float) -> Ints:
-        """Return the rows of places that count, `PLACE_EVERY_S` apart, since the first range."""
+        """Return the rows of positions since the first range, `PLACE_EVERY_S` apart."""
         rows = np.flatnonzero(self.placed & (self.time_s >= 0) & (self.time_s < until_s))
         slot = np.floor(self.time_s[rows] / PLACE_EVERY_S)
         return rows[np.diff(slot, prepend=-np.inf) > 0]
@@ -268,7 +273,7 @@ def _places(tracks: list[_BodyPoses], until_s: float) -> Places:
 def _attitude(
     body: str, track: _BodyPoses, sensed: Readings | None, settings: FlightSettings, until_s: float, source: str
 ) -> Attitude | None:
-    """Return the attitudes of a moving body; None where nothing says any."""
+    """Return the attitudes of a moving body; None if there are none."""
     given = _of_poses(track, settings) if track.known.any() else None
     if settings.attitudes == "imu":
         if sensed is None:

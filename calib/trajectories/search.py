@@ -1,8 +1,8 @@
-"""The search: the likeliest delays, curve, errors and trajectories together, from where trajectories are thought to be.
+"""Maximum likelihood of delays, curve, errors and trajectories together, from an initial guess of trajectories.
 
-Ranges first have Cauchy's likelihood, which descends from anywhere, then that of `calib.range_errors`, whose parameters
-and the motion are fitted in turn. The variance of jerk is estimated along, and so are the standard deviations of
-accelerometers and height sensors.
+Ranges first have Cauchy's likelihood, which converges from far away, then that of `calib.range_errors`. The parameters
+of errors and the motion are fitted in turn. The variance of jerk and the standard deviations of accelerometers and
+height sensors are estimated as well.
 """
 
 from __future__ import annotations
@@ -28,57 +28,58 @@ State = Mapping[str, Floats]
 """Unknowns of motion by their kind."""
 
 MOTION = ("path", "turn", "stand", "bias", "level")
-"""The kinds of unknowns that distances are made of, and what is known beside them."""
+"""Kinds of unknowns of motion."""
 
 JERK_M_S3, QUICK_M_S3 = 8.0, 100.0
-"""By how much accelerations change in a second, before the data say it better, and where control points are closer."""
+"""Standard deviation of jerk before it is estimated; the second for refined control points."""
 
 FIRST_SCALE_M, LEAST_SCALE_M = 0.15, 0.01
-"""Scale of the first loss, while neither delays nor curve are known, and the least one."""
+"""First scale of Cauchy's loss, while delays and curve are unknown, and its lower bound."""
 
 ROUNDS = 3
-"""Rounds in which the scale of a loss, or the share of ranges that paths use up, is found again."""
+"""Iterations of the scale of Cauchy's loss."""
 
-LITTLE_TAKEN, MOST_TAKEN = 0.5, 0.9
-"""Ranges of which unknowns take no more say what errors are; shares are held below the most, as roots are divided by
-what is left."""
+LITTLE_LEVERAGE, MAX_LEVERAGE = 0.5, 0.9
+"""Ranges with a leverage up to the first inform about errors. Leverages are limited to the second, because residuals
+are divided by the root of 1 - leverage."""
 
-FEWEST_A_PAIR = 15
-"""Of fewer ranges a pair on average, beside those that paths use up, errors of all pairs are taken to be alike."""
+MIN_RANGES_PER_PAIR = 15
+"""With fewer ranges per pair, less those that the unknowns use up, all pairs share one error model."""
 
-MOST_TURNS, STILL = 8, 0.1
-"""Turns in which motion and errors are fitted, at most; the last moves no delay by more of its standard error."""
+MAX_TURNS, STILL = 8, 0.1
+"""Maximum number of alternations of motion and errors. They end when no delay moves by more than this share of its
+standard error."""
 
-FINEST_S = 0.11
-"""Control points are not put twice as densely again below this."""
+MIN_POINT_S = 0.11
+"""Control points are not refined below this interval."""
 
 TRUSTED = 3.0
-"""How much less than its residuals say a sensor is trusted: what it is off by lasts for some windows."""
+"""Factor on the residuals of a sensor: its errors last for some windows."""
 
-FORCES_M_S2 = (0.02, 5.0)
-"""Bounds of what a mean specific force is off by."""
+FORCE_BOUNDS_M_S2 = (0.02, 5.0)
+"""Bounds of the standard error of a mean specific force."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """Cauchy's likelihood of residuals, with a curvature that descends from anywhere (`Errors`)."""
+    """Cauchy's likelihood of residuals, with a curvature that converges from far away (an error density, `Errors`)."""
 
     scale_m: float
     parameters: tuple[str, ...] = ()
 
     def slopes(self, values: dict[str, Floats]) -> tuple[Floats, dict[str, Floats], Floats | None]:
-        """Return log densities (n,), slopes by the residual (n,) and what each tells (n,)."""
+        """Return log densities (n,), slopes by the residual (n,) and information (n,)."""
         u = values[RESIDUAL] / self.scale_m
         weight = 2 / self.scale_m**2 / (1 + u**2)
         curvature = weight * (1 - u**2) / (1 + u**2)
-        # Where the loss bends upwards there is none: a fifth of the weight, as of reweighted least squares.
+        # Where the curvature is negative, a fifth of the weight of reweighted least squares replaces it.
         tells = np.maximum(curvature, 0.2 * weight)
         return -np.log1p(u**2), {RESIDUAL: -weight * values[RESIDUAL]}, tells
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settled:
-    """Motion that fits the raw ranges of a scene: its unknowns, the residuals of the ranges (n,), its likelihood."""
+class MotionFit:
+    """Motion that fits the raw ranges of a scene: unknowns, residuals (n,) and log likelihood."""
 
     motion: Motion
     state: State
@@ -86,11 +87,11 @@ class Settled:
     value: float
 
     def positions(self, time_s: Floats) -> Floats:
-        """Return where the moving bodies are at instants (k,), shape (k, bodies, 3)."""
+        """Return the positions (k, bodies, 3) of the moving bodies at instants (k,)."""
         return self.motion.positions(self.state["path"], time_s)
 
 
-def settle(
+def fit_motion(
     scene: Scene,
     start: State,
     scales_m: tuple[float, ...],
@@ -98,8 +99,8 @@ def settle(
     *,
     steps: int = 25,
     tolerance: float = 1.0,
-) -> Settled:
-    """Return the motion that fits raw ranges best near a start, by Cauchy's likelihood of one scale after the other."""
+) -> MotionFit:
+    """Return the motion near a start that fits raw ranges best, by Cauchy's likelihood with decreasing scales."""
     motion = Motion.of(scene)
     layout = Layout(motion.unknowns(start, jerk_m_s3))
     ends = scene.ranges.initiator, scene.ranges.target
@@ -111,14 +112,14 @@ def settle(
         these: list[Rows] = [replace(rows, errors=Cauchy(scale)), *known]
         found = maximize(these, priors, x, steps=steps, tolerance=tolerance, evidence_steps=0)
         x, value = found.x, found.value
-    return Settled(motion=motion, state=motion.state(layout, x), residuals=rows.residuals(x), value=value)
+    return MotionFit(motion=motion, state=motion.state(layout, x), residuals=rows.residuals(x), value=value)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """The top: all unknowns, and what is needed to judge them.
+    """The optimum: all unknowns, and what the verdict needs.
 
-    `used` is the share of the ranges that the unknowns use up, `coarse` how much of motion they leave out.
+    `used` is the share of the ranges that the unknowns use up, `coarseness` the motion that the paths miss.
     """
 
     scene: Scene
@@ -129,31 +130,31 @@ class Found:
     optimum: Optimum
     geometry: Distances
     used: float
-    coarse: Coarseness
+    coarseness: Coarseness
     jerk_m_s3: float
     steps: int
     success: bool
 
 
 def search(scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]) -> Found:
-    """Return the likeliest unknowns; `error_m` (n,) are the ranges of the scene, less a curve that is known."""
+    """Return the likeliest unknowns; `error_m` (n,) are the ranges of the scene, less a known curve."""
     state = _Search(scene, model, error_m, start, done)
-    state.robustly()
-    while state.coarse().shows and state.motion.places.step_s > FINEST_S:
+    state.fit_robustly()
+    while state.coarseness().shows and state.motion.places.step_s > MIN_POINT_S:
         state.refine()
-        state.robustly()
-    return state.likeliest()
+        state.fit_robustly()
+    return state.fit_likelihood()
 
 
 class _Search:
-    """A search under way: each method changes one part of it."""
+    """The state of a search; each method changes one part of it."""
 
     def __init__(
         self, scene: Scene, model: RangeModel, error_m: Floats, start: State, done: Callable[[float], None]
     ) -> None:
         self.model, self.error_m, self.done = model, error_m, done
         self.motion, self.origin, self.steps = Motion.of(scene), start, 0
-        self.taken: Floats = np.zeros(len(error_m))
+        self.leverage: Floats = np.zeros(len(error_m))
         self.weights: dict[tuple[str, int], float] = {}
         self.values: dict[str, Floats] = dict(start)
         self.build(Cauchy(FIRST_SCALE_M))
@@ -161,7 +162,7 @@ class _Search:
     def build(
         self, errors: Errors, more: tuple[tuple[Unknown, ...], tuple[Part, ...]] = ((), ()), jerk: float = JERK_M_S3
     ) -> None:
-        """Lay all unknowns out anew, with what is known of them by now."""
+        """Build layout, priors and rows with the present values."""
         model, ranges = self.model, self.model.ranges
         self.errors, self.more = errors, more
         self.layout = Layout((*model.unknowns, *self.motion.unknowns(self.origin, jerk), *more[0]))
@@ -185,8 +186,8 @@ class _Search:
         """Return kind and number of each prior."""
         return [(block.kind, k) for block in self.layout.blocks for k in range(len(block.priors))]
 
-    def climb(self, *, evidence_steps: int = 12, tolerance: float = 0.1, steps: int = 60) -> Optimum:
-        """Go to the top, and see what the unknowns use up of the ranges there."""
+    def optimize(self, *, evidence_steps: int = 12, tolerance: float = 0.1, steps: int = 60) -> Optimum:
+        """Maximise the likelihood, and update values and leverages."""
         rows: list[Rows] = [replace(self.rows, errors=self.errors), *self.known.values(), *self.gauge]
         asked = self.layout.indices(["delay", *self.model.curve_kinds()])
         found = maximize(
@@ -196,47 +197,47 @@ class _Search:
         self.rows = replace(self.rows, errors=self.errors)
         self.values = {kind: found.x[where] for kind, where in self.layout.where.items()}
         self.weights = dict(zip(self._keys(), self.priors.weights, strict=True))
-        self.taken = taken_shares(self.rows, found)
+        self.leverage = leverages(self.rows, found)
         self.done(1 - 0.97**self.steps)
         return found
 
-    def robustly(self) -> None:
-        """Go to the top of Cauchy's likelihood, as wide as the data ask for."""
+    def fit_robustly(self) -> None:
+        """Maximise Cauchy's likelihood, whose scale is estimated."""
         scale = FIRST_SCALE_M
         for turn in range(ROUNDS):
             self.errors = Cauchy(scale)
-            self.climb(evidence_steps=12 if turn else 0)
+            self.optimize(evidence_steps=12 if turn else 0)
             scale = self.scale()
-        self.trust()
+        self.update_sensor_errors()
 
     def scale(self) -> float:
-        """Return the scale of residuals, and what is known of noise beforehand, each by how many ranges it is worth."""
+        """Return the scale of residuals, combined with the prior of noise by their numbers of ranges."""
         free = len(self.rows) * (1 - self.used)
-        square = free * robust_spread(self.residuals()[self.telling()]) ** 2 + NOISE_WORTH * NOISE_M**2
+        square = free * robust_spread(self.residuals()[self.informative_rows()]) ** 2 + NOISE_WORTH * NOISE_M**2
         return float(np.sqrt(square / (free + NOISE_WORTH)))
 
     def residuals(self) -> Floats:
-        """Return the residuals of the ranges (n,), as large as they were if the unknowns had taken nothing of them."""
-        return np.asarray(self.rows.residuals(self.x) / np.sqrt(1 - self.taken))
+        """Return the residuals of the ranges (n,), divided by the root of 1 - leverage."""
+        return np.asarray(self.rows.residuals(self.x) / np.sqrt(1 - self.leverage))
 
     @property
     def used(self) -> float:
-        """Return the share of the ranges that the unknowns use up."""
-        return float(np.mean(self.taken))
+        """Return the mean leverage of the ranges."""
+        return float(np.mean(self.leverage))
 
-    def telling(self) -> Ints:
-        """Return the ranges of which the unknowns take the least: half of them, and all that they take little of."""
-        return np.flatnonzero(self.taken <= max(LITTLE_TAKEN, float(np.median(self.taken))))
+    def informative_rows(self) -> Ints:
+        """Return the half of the ranges with the lowest leverage, and all with little."""
+        return np.flatnonzero(self.leverage <= max(LITTLE_LEVERAGE, float(np.median(self.leverage))))
 
-    def trust(self) -> None:
-        """Trust accelerometers and height sensors as far as their residuals say."""
+    def update_sensor_errors(self) -> None:
+        """Update the standard errors of accelerometers and height sensors from their residuals."""
         scene, known = self.motion.scene, self.known
         if isinstance(force := known.get("force"), NormalRows):
             factor = TRUSTED * robust_spread(force.left(self.x) / force.std, 0.0)
             scene = replace(
                 scene,
                 inertial={
-                    body: replace(some, std_m_s2=float(np.clip(some.std_m_s2 * factor, *FORCES_M_S2)))
+                    body: replace(some, std_m_s2=float(np.clip(some.std_m_s2 * factor, *FORCE_BOUNDS_M_S2)))
                     for body, some in scene.inertial.items()
                 },
             )
@@ -245,65 +246,65 @@ class _Search:
         self.motion = replace(self.motion, scene=scene)
         self.known = known_rows(self.motion, self.layout)
 
-    def coarse(self) -> Coarseness:
-        """Return how much of the bodies' motion is not in their paths."""
+    def coarseness(self) -> Coarseness:
+        """Return the motion of the bodies that their paths miss."""
         return coarseness(self.motion, self.rows, self.geometry, self.x)
 
     def refine(self) -> None:
-        """Put twice as many control points, which may be followed by quick motion."""
+        """Double the number of control points, and allow quicker motion."""
         finer = self.motion.refined(self.values)
         self.origin = self.motion.refined(self.origin)[1]
         self.motion, self.values = finer[0], dict(finer[1])
         self.weights.pop(("path", 0))
         self.build(self.errors, jerk=QUICK_M_S3)
-        self.climb(evidence_steps=0)
+        self.optimize(evidence_steps=0)
 
-    def likeliest(self) -> Found:
-        """Go to the top of the likelihood of ranges that are direct, reflected or outliers.
+    def fit_likelihood(self) -> Found:
+        """Maximise the likelihood of direct, reflected and outlying ranges.
 
-        Motion and errors are fitted in turn: the likelihood of both together is greatest where paths go through some
-        ranges exactly and the noise of those is zero.
+        Motion and errors are fitted in turn: the joint likelihood is unbounded where a path goes exactly through some
+        ranges and their noise is zero.
         """
         mixture, unknowns, parts = self.model.error_model(self.residuals())
-        few = len(self.rows) * (1 - self.used) < FEWEST_A_PAIR * len(self.model.pairs.ends)
+        few = len(self.rows) * (1 - self.used) < MIN_RANGES_PER_PAIR * len(self.model.pairs.ends)
         if few:
             unknowns = tuple(u if len(u.names) == 1 else _as_known(u, u.start) for u in unknowns)
         errors, delays, settled = replace(mixture, expected=True), self.values["delay"], False
-        for turn in range(MOST_TURNS):
+        for turn in range(MAX_TURNS):
             self.fit_errors(mixture, unknowns, parts)
             known = tuple(_as_known(unknown, self.values[unknown.kind]) for unknown in unknowns)
             self.build(errors, (known, parts))
-            found = self.climb(evidence_steps=0 if turn > 1 else 12, tolerance=0.03, steps=20)
+            found = self.optimize(evidence_steps=0 if turn > 1 else 12, tolerance=0.03, steps=20)
             if turn == 0:
-                self.trust()
+                self.update_sensor_errors()
             own = self.layout.where["delay"]
             std = np.sqrt(np.maximum(np.diag(found.covariance[:, own][own]), 1e-12))
             moved, delays = np.abs(found.x[own] - delays), found.x[own]
             settled = turn > 1 and bool(np.all(moved < STILL * std))
             if settled:
                 break
-        # What errors are made of is as unknown as all else: it has its part in the covariance.
+        # The parameters of errors are unknowns as well: the covariance contains them.
         self.build(errors, (unknowns, parts))
         if not few:
             self.errors = replace(mixture, used=self.used)
-            self.climb(evidence_steps=0, tolerance=0.03, steps=20)
+            self.optimize(evidence_steps=0, tolerance=0.03, steps=20)
         self.errors = replace(errors, used=self.used)
-        return self.found(replace(self.climb(evidence_steps=0, tolerance=np.inf), success=settled))
+        return self.found(replace(self.optimize(evidence_steps=0, tolerance=np.inf), success=settled))
 
     def fit_errors(self, errors: Mixture, unknowns: tuple[Unknown, ...], parts: tuple[Part, ...]) -> None:
-        """Fit what errors are made of to the residuals."""
+        """Fit the parameters of the error model to the residuals."""
         layout, rows = self.model.build(self.residuals(), errors, unknowns, parts, only=())
         x, priors = layout.start(), Priors(layout)
         for kind, where in layout.where.items():
             x[where] = self.values.get(kind, x[where])
         keys = [(block.kind, k) for block in layout.blocks for k in range(len(block.priors))]
         priors.weights = [self.weights.get(key, w) for key, w in zip(keys, priors.weights, strict=True)]
-        found = maximize([rows.sample(self.telling())], priors, x, tolerance=0.1)
+        found = maximize([rows.sample(self.informative_rows())], priors, x, tolerance=0.1)
         self.values |= {kind: found.x[where] for kind, where in layout.where.items()}
         self.weights |= dict(zip(keys, priors.weights, strict=True))
 
     def found(self, found: Optimum) -> Found:
-        """Return what was found."""
+        """Return the optimum."""
         path = next(k for k, key in enumerate(self._keys()) if key == ("path", 0))
         return Found(
             scene=self.motion.scene,
@@ -314,7 +315,7 @@ class _Search:
             optimum=found,
             geometry=self.geometry,
             used=self.used,
-            coarse=self.coarse(),
+            coarseness=self.coarseness(),
             jerk_m_s3=float(self.priors.weights[path] ** -0.5),
             steps=self.steps,
             success=found.success,
@@ -322,19 +323,20 @@ class _Search:
 
 
 def _as_known(unknown: Unknown, values: Floats) -> Unknown:
-    """Return a block of unknowns that keep their values, and the weights of their priors."""
+    """Return a block of unknowns with fixed values and prior weights."""
     priors = tuple(replace(prior, bounds=None) for prior in unknown.priors)
     return replace(unknown, start=values, known=np.ones(len(values), dtype=bool), priors=priors)
 
 
 PROBES = 48
-"""Random vectors by which shares are estimated (Hutchinson 1990; Bekas, Kokiopoulou, Saad 2007), to a tenth or so."""
+"""Random vectors for leverages (Hutchinson 1990; Bekas, Kokiopoulou and Saad 2007): exact to about 10 %."""
 
 
-def taken_shares(rows: RangeRows, found: Optimum) -> Floats:
-    """Return the share of each range (n,) that the unknowns use up: its leverage, at most `MOST_TAKEN`.
+def leverages(rows: RangeRows, found: Optimum) -> Floats:
+    """Return the leverage of each range (n,), at most `MAX_LEVERAGE`: the share of it that the unknowns use up.
 
-    These are the diagonal of W^1/2 A C A' W^1/2, of what residuals tell W, their derivatives A and the covariance C.
+    This is the diagonal of W^1/2 A C A' W^1/2, with the information W of residuals, their derivatives A and the
+    covariance C.
     """
     size, parts, values = found.layout.size, [], rows.values(found.x)
     for terms in rows.terms(found.x):
@@ -345,44 +347,45 @@ def taken_shares(rows: RangeRows, found: Optimum) -> Floats:
         parts.append((part.as_matrix(part.slopes if part.entries is None else part.entries, size), weight))
     weight = np.concatenate([known for _, known in parts])
     if "noise" in values:
-        # A residual tells no more than if all errors were normal (Stam 1959).
+        # The information of a residual is at most that of normal errors (Stam 1959).
         weight = np.minimum(weight, np.exp(-2 * values["noise"][rows.order]))
     reach = sparse.csr_matrix(sparse.diags_array(np.sqrt(weight)) @ sparse.vstack([matrix for matrix, _ in parts]))
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(rows), PROBES))
     shares = np.empty(len(rows))
     shares[rows.order] = np.mean(probes * (reach @ (found.covariance @ (reach.T @ probes))), axis=1)
-    return np.clip(shares, 0.0, MOST_TAKEN)
+    return np.clip(shares, 0.0, MAX_LEVERAGE)
 
 
 NEAR = (0.08, 0.16, 0.3)
-"""Ranges follow each other closely if they do within such parts of the time between control points."""
+"""Time differences of neighbouring ranges, as shares of the time between control points."""
 
 NEIGHBOURS, FEWEST = 8, 50
-"""Of a body's ranges, so many before each are looked at, and no fewer products of two are."""
+"""Previous ranges of the body that each range is compared with, and the minimum number of products."""
 
-SURELY, MATTERS_M = 4.0, 0.01
-"""Motion is left out where neighbours go together by so many standard errors, and by so much."""
+MIN_DEVIATION, MIN_MOTION_M = 4.0, 0.01
+"""The path misses motion if neighbours correlate by so many standard errors, and by a motion of so many metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Coarseness:
-    """How many standard errors neighbours go together by, and how large a motion along an axis in metres that says."""
+    """Correlation of neighbouring residuals in standard errors, and the size of the missed motion along an axis in
+    metres."""
 
     deviation: float = 0.0
     motion_m: float = 0.0
 
     @property
     def shows(self) -> bool:
-        """Whether bodies move as their control points cannot."""
-        return self.deviation > SURELY and self.motion_m > MATTERS_M
+        """Whether the paths miss motion."""
+        return self.deviation > MIN_DEVIATION and self.motion_m > MIN_MOTION_M
 
 
 def coarseness(motion: Motion, rows: RangeRows, geometry: Distances, x: Floats) -> Coarseness:
-    """Return how much of the bodies' motion is not in their paths.
+    """Return the motion of the bodies that their paths miss.
 
-    A motion that a path leaves out is in all ranges of its body, along each one's direction, so residuals of ranges
-    that follow each other closely go together as far as their directions do. Errors of a pair that last (a reflection)
-    are kept out: only ranges of other pairs are multiplied.
+    A missed motion enters all ranges of the body along their directions, so residuals of ranges that follow each other
+    correlate as their directions do. Only ranges of different pairs are multiplied, which excludes lasting errors of a
+    pair (reflections).
     """
     scene = motion.scene
     values = rows.values(x)

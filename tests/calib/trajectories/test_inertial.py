@@ -9,7 +9,7 @@ import uwbsim
 from calib.settings import FlightSettings
 from calib.trajectories.attitudes import Attitude
 from calib.trajectories.scene import scene_from
-from calib.trajectories.start import Followed, turned_right
+from calib.trajectories.start import Trajectories, resolve_headings
 
 BOXES = {"a": ([-2.6, -2.6, 0.4], [-0.4, -0.2, 2.6]), "b": ([0.4, -2.6, 0.4], [2.6, -0.2, 2.6])}
 IMU = {"grade": "consumer", "vibration_mps2": 1.0}
@@ -67,15 +67,15 @@ def test_headings_that_are_wrong_by_a_right_angle_are_found_over_the_flight(flow
         return np.array([[np.arctan2(*(a @ b.T)[[1, 0], 0]) for a, b in zip(*pair, strict=True)] for pair in pairs])
 
     # Integrated from an unknown heading; "b" is put a right angle off, where a first window may have left it.
-    scene = scene.headed({body: -off(scene)[k, 0] for k, body in enumerate(BOXES)})
-    scene = scene.headed({"b": np.pi / 2})
+    scene = scene.turned_by({body: -off(scene)[k, 0] for k, body in enumerate(BOXES)})
+    scene = scene.turned_by({"b": np.pi / 2})
     began = flown.exchanges.time_ns[0]
     where = np.arange(0.0, 8.0, 0.1)
     places = [flown.poses[flown.poses.body == body] for body in BOXES]
     place = np.stack(
         [[np.interp(where, (p.time_ns - began) * 1e-9, axis) for axis in p.position_m.T] for p in places]
     ).transpose(2, 0, 1)
-    found, _, unsure = turned_right(scene, Followed(where, place).state(scene, np.zeros((0, 3))))
+    found, _, unsure = resolve_headings(scene, Trajectories(where, place).state(scene, np.zeros((0, 3))))
     assert np.degrees(np.abs(off(scene))).max() > 80
     assert np.degrees(np.abs(off(found))).max() < 16
     assert unsure == ""
