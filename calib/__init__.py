@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from calib.report.campaign import run_campaign
     from calib.report.sections import register_report_section
     from calib.report.writing import write_report
-    from calib.settings import FitSettings
+    from calib.settings import FitSettings, FlightSettings
     from calib.surveys.knowledge import Knowledge, KnownPosition
     from calib.surveys.result import SurveyResult
     from calib.surveys.sample import sample_arrangements
@@ -50,6 +50,7 @@ __all__ = [
     "FitSettings",
     "FlightPlan",
     "FlightPlanSettings",
+    "FlightSettings",
     "Knowledge",
     "KnownPosition",
     "OnboardSettings",
@@ -90,6 +91,7 @@ _HOMES: Final = {
     "FitSettings": "calib.settings",
     "FlightPlan": "calib.planning.result",
     "FlightPlanSettings": "calib.planning.settings",
+    "FlightSettings": "calib.settings",
     "Knowledge": "calib.surveys.knowledge",
     "KnownPosition": "calib.surveys.knowledge",
     "OnboardSettings": "calib.evaluation.onboard",
