@@ -297,6 +297,11 @@ class FlightSettings:
     """What is known of a flight without true distances: settings of `fit_from_ranges`, which explains them.
 
     Raises `BadInputError` that names the setting.
+
+    >>> import calib
+    >>> flight = calib.FlightSettings(poses_until_s=5.0, heading_std_deg=1.0)
+    >>> calib.fit_from_ranges(calib.sample_flight(), flight).success
+    True
     """
 
     poses_until_s: float | None = setting(
