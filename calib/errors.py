@@ -1,4 +1,4 @@
-"""Everything `calib` raises, in the two kinds that differ in exit status."""
+"""The errors of `calib`, of two kinds with different exit status."""
 
 from uwblink.errors import OfParameter
 

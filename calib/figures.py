@@ -1,7 +1,7 @@
-"""The figures of a calibration: errors and their distribution, curves over power, delays, and what is left of errors.
+"""Figures of a calibration: errors and their distribution, curves over power, delays, and residuals.
 
-Functions that take Matplotlib axes draw into them, or into new ones where there are none, and return them. Functions
-that take a width in inches return a figure at that width (`uwblink.pages.figures`).
+Functions that take Matplotlib axes draw into them, or into new ones, and return them. Functions that take a width in
+inches return a figure of that width (`uwblink.pages.figures`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges
 from calib.estimator.grouped_errors import fit_grouped_errors
-from calib.evaluation.statistics import CORRECTION_STAGES, beside_planted, pair_rows, planted_curve
+from calib.evaluation.statistics import CORRECTION_STAGES, compare_with_planted, pair_rows, planted_curve
 from calib.spread import TWO_SIDED_95
 from uwblink.arrays import Floats, Ints
 from uwblink.pages.colours import BLUE, GREEN, INK, MUTED, PALE, VERMILION, WINE, look
@@ -32,27 +32,26 @@ STAGE_LINES: Final[dict[str, dict[str, Any]]] = {
     "delays": {"color": WINE, "ls": (0, (5, 1.5)), "label": "delays corrected"},
     "full": {"color": BLUE, "ls": "-", "label": "fully corrected"},
 }
-"""How each stage of correction is drawn."""
+"""Line style of each stage of correction."""
 
 PLANTED: Final[dict[str, Any]] = {"color": GREEN, "ls": (0, (5, 1.5))}
-"""How the curve of a simulation is drawn."""
+"""Line style of a planted curve."""
 
 MIN_RANGES_PER_BIN: Final = 60
-"""Of so many, a tenth of them reflected, the parts of errors are known to 15 %; of fewer the median is drawn."""
+"""With so many ranges, a tenth of them reflected, the error model is known to 15 %; with fewer the median is drawn."""
 
 MOST_RANGES_PER_BIN: Final = 2000
-"""Of so many the centre is known to a fortieth of the noise, less than a drawn point."""
+"""With so many ranges the standard error of the centre is a fortieth of the noise, less than a drawn point."""
 
 MOST_PAIRS: Final = 24
-"""Pairs whose errors are drawn over time, those with the largest spread; more would be too small to see."""
+"""Pairs whose errors are drawn over time, those with the largest spread."""
 
 
 @dataclass(frozen=True, slots=True)
 class Binned:
-    """Errors by lifted power: median power, centre, standard deviation and median in each bin (bins,), metres.
+    """Errors by lifted power: median power, centre, standard deviation and median of each bin (bins,), metres.
 
-    Centre and deviation are those of the errors' core, noise without reflections, where the curve was fitted to the
-    core; else those of all errors.
+    Centre and deviation are those of direct ranges if the curve was fitted to these, else those of all ranges.
     """
 
     lifted: Floats
@@ -75,9 +74,9 @@ def over_power(
 
 
 def binned(sets: Mapping[str, tuple[Floats, Floats, int]], loss: str) -> dict[str, Binned]:
-    """Return sets of (lifted powers (n,), errors (n,), number of bins) in bins of equal counts, as a fit sees them.
+    """Return sets of (lifted powers (n,), errors (n,), number of bins) in bins of equal counts, as a fit weighs them.
 
-    The curve of a fit follows the errors of direct ranges: reflections only lengthen, so medians and means lie above
+    The curve of a fit follows the errors of direct ranges; reflections only lengthen, so medians and means lie above
     it. Least squares ("l2") follow the mean.
     """
     groups = {
@@ -105,7 +104,7 @@ def histogram(ranges: Ranges, applied: CorrectedRanges, axes: Axes | None = None
     """Draw range errors in the three stages, in cm; the outermost bins hold everything beyond them."""
     axes = axes or new_axes()
     errors = _errors_cm(ranges, applied)
-    # From where to where: 98 % of the corrected errors, and of the raw ones where they are near.
+    # Limits: 98 % of the corrected errors, and of the raw ones if they are close.
     low, high = np.quantile(errors["full"], (0.01, 0.99))
     raw = np.quantile(errors["raw"], (0.02, 0.98))
     if raw[1] - raw[0] + abs(float(np.mean(raw)) - float(low + high) / 2) < 5 * (high - low):
@@ -144,9 +143,10 @@ def curve_over_power(
     axes: Axes | None = None,
     found: Mapping[str, Binned] | None = None,
 ) -> Axes:
-    """Draw the "bias" or "sigma" curve over lifted power with its band, what was planted, and errors of pairs and all.
+    """Draw the "bias" or "sigma" curve over lifted power with its band, the planted curve, and errors of pairs and of
+    all ranges.
 
-    Errors are those of `over_power`, or what it `found` already; of the bias their medians are drawn, too.
+    Errors are those of `over_power`, or `found` if given; for the bias their medians are drawn as well.
     """
     axes, found = axes or new_axes(), found or over_power(ranges, applied, calibration, which)
     bias, squares = which == "bias", calibration.loss == "l2"
@@ -167,7 +167,7 @@ def curve_over_power(
     _curve(axes, calibration, which, grid, 100 * curve(grid), color=BLUE, lw=1.6, label="fitted", zorder=3)
     planted = planted_curve(ranges, f"{which}_curve", grid)
     if planted is not None:
-        beside = beside_planted(ranges, applied, calibration) if bias else None
+        beside = compare_with_planted(ranges, applied, calibration) if bias else None
         planted += 0.0 if beside is None else beside.shift_ns * 1e-9 * SPEED_OF_LIGHT
         axes.plot(grid, 100 * planted, label="planted, same gauge" if bias else "planted", **PLANTED)
     if not bias:
@@ -188,7 +188,7 @@ def _curve(
 
 
 def _power_axes(axes: Axes, calibration: Calibration, y: str) -> None:
-    """Name the axes, and put first-path powers in dBm above: the same axis in the radio's unit."""
+    """Label the axes, with first-path powers in dBm on top."""
     alpha = calibration.alpha_dbm
     label(axes, f"lifted power ψ = 10^((p − α) / 10 dB), α = {alpha:g} dBm".replace("-", "−"), y)
     low, high = axes.get_xlim()
@@ -211,9 +211,9 @@ def delays(
     shift_ns: float = 0.0,
     axes: Axes | None = None,
 ) -> Axes:
-    """Draw delays in ns with 95 % intervals, and planted ones beside them, moved by the common shift.
+    """Draw delays in ns with 95 % intervals, and planted delays moved by the common shift.
 
-    A delay far from all the others is at the edge, with its value.
+    A delay far from all others is drawn at the edge, with its value.
     """
     axes = axes or new_axes()
     tags = sorted(calibration.delays_ns)
@@ -246,14 +246,14 @@ def delays(
 
 
 def within_fence(values: Floats) -> Any:
-    """Return which values (n,) may decide how far an axis runs: those within 12 median deviations of the median."""
+    """Return which values (n,) determine the limits of an axis: those within 12 median deviations of the median."""
     away = np.abs(values - np.median(values))
     usual = float(np.median(away))
     return away <= (12.0 * usual if usual > 0 else np.inf)
 
 
 def keep_strays_out(axes: Axes, values: Floats) -> None:
-    """Let the vertical axis run over values (n,) but strays."""
+    """Set the limits of the vertical axis by values (n,) without outliers."""
     inside = values[within_fence(values)]
     low, high = float(inside.min()), float(inside.max())
     margin = 0.12 * (high - low) + 1e-9
@@ -261,14 +261,14 @@ def keep_strays_out(axes: Axes, values: Floats) -> None:
 
 
 def new_axes() -> Axes:
-    """Return the axes of a new figure, which pyplot shows and closes."""
+    """Return the axes of a new pyplot figure."""
     from matplotlib import pyplot
 
     return pyplot.subplots(figsize=(WIDTHS["page"], 3.2), layout="constrained")[1]
 
 
 def alone(draw: Callable[[Axes], Axes], width_in: float) -> Figure:
-    """Return a figure of a width in inches with what is drawn into its only axes."""
+    """Return a figure of a width in inches, drawn into its only axes."""
     figure, (axes,) = sheet(width_in, height_in=3.1)
     draw(axes)
     return figure
@@ -279,7 +279,7 @@ def _errors_cm(ranges: Ranges, applied: CorrectedRanges) -> dict[str, Floats]:
 
 
 def _explained(axes: Axes) -> Axes:
-    """Explain the lines: above the axes where they have a figure of their own, else inside."""
+    """Add the legend: above axes that have their own figure, else inside."""
     figure = axes.figure
     if isinstance(figure, Figure) and len(figure.axes) == 1 and figure.get_layout_engine() is not None:
         legend(figure, axes)
@@ -377,14 +377,14 @@ def most_spread(ranges: Ranges, error: Floats) -> dict[str, Ints]:
 
 
 def _reach_cm(error: Floats) -> tuple[float, float]:
-    """Return from where to where errors in cm are drawn: all but the outermost hundredth."""
+    """Return the limits of errors in cm: all but the outermost hundredth."""
     low, high = np.quantile(error, (0.003, 0.985))
     margin = 0.1 * float(high - low) + 0.1
     return float(low) - margin, float(high) + margin
 
 
 def scale_sensitivity(width_in: float, scales_ns: list[float], fits: list[Calibration], chosen_ns: float) -> Figure:
-    """Draw how far each delay moves, about the mean of all, as the scale of the loss changes."""
+    """Draw the change of each delay, less their mean, with the scale of the loss."""
     figure, (axes,) = sheet(width_in, height_in=2.8)
     tags = sorted(fits[0].delays_ns)
     table = np.array([[fit.delays_ns[tag] for tag in tags] for fit in fits])
@@ -407,7 +407,7 @@ def scale_sensitivity(width_in: float, scales_ns: list[float], fits: list[Calibr
 
 
 def differences(width_in: float, found: Comparison) -> Figure:
-    """Draw how far each delay differs, second less first, with 95 % intervals, the common shift taken out."""
+    """Draw the difference of each delay, second less first, with 95 % intervals and without the common shift."""
     figure, (axes,) = sheet(width_in, height_in=2.6)
     tags = sorted(found.difference_ns)
     place, values = np.arange(len(tags)), 1e3 * np.array([found.difference_ns[tag] for tag in tags])

@@ -1,9 +1,9 @@
-"""What an information matrix determines, direction by direction, and in words what it leaves free.
+"""Which directions an information matrix determines, and a description in words of those it leaves free.
 
-An information matrix (the inverse of a covariance, J' W J of a fit) is singular along what the data do not say, and
-nearly so along what they hardly say. Whether a direction is known is judged in units in which an ignorant guess is good
-to about 1: an antenna delay is known to a nanosecond before anything is measured, so an estimate that is worse says
-nothing. `scale` of each unknown is that guess.
+An information matrix (the inverse of a covariance, J' W J of a fit) is singular along directions without information,
+and nearly singular along directions with little. A direction is judged in units of prior knowledge (`scale` of each
+unknown): an antenna delay is known to a nanosecond without any data, so an estimate with a larger standard error has no
+value.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from calib.errors import BadInputError
 from uwblink.arrays import Bools, Floats
 
 LOOSEST: Final = 0.5
-"""Largest standard deviation of a direction that counts as known, as a share of what is known without any data: data
-then weigh four times as much as the guess."""
+"""Largest standard deviation of a determined direction, as a share of its prior one: the data then weigh four times as
+much as the prior."""
 
 ROUNDING: Final = 1e-12
-"""Share of the largest eigenvalue below which an eigenvalue is rounding."""
+"""Eigenvalues below this share of the largest one are rounding errors."""
 
 TAKES_PART: Final = 0.02
-"""Share of the largest part in a free direction from which an unknown is named."""
+"""An unknown is named if its part of a free direction exceeds this share of the largest part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Unknown:
 
 @dataclass(frozen=True, slots=True)
 class FreeDirection:
-    """A combination of unknowns that the data leave free, in words: what moves together, or one against another."""
+    """A combination of unknowns that the data leave free, in words."""
 
     words: str
 

@@ -1,4 +1,4 @@
-"""How wide values spread: robustly measured, and as 95 % intervals."""
+"""Robust spread of values, and the factor of 95 % intervals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from uwblink.arrays import Floats
 __all__ = ["SIGMA_OF_MAD", "TWO_SIDED_95", "robust_spread"]
 
 TWO_SIDED_95: Final = 1.959963984540054
-"""How many standard deviations about its mean hold 95 % of a normal distribution."""
+"""Standard deviations about the mean that contain 95 % of a normal distribution."""
 
 SIGMA_OF_MAD: Final = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""

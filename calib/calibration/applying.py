@@ -1,7 +1,7 @@
-"""Corrects ranges by a calibration, as columns and one at a time: delays, then the curve, then what errors to expect.
+"""Correct ranges by a calibration, as columns and one at a time: delays, curve, expected errors.
 
-A single range takes a few microseconds of plain Python, for a robot's loop: curves are taken apart into
-polynomials, one between each two knots. Both ways give the same numbers.
+A single range takes a few microseconds of plain Python, for the loop of a robot: curves are split into polynomials
+between knots. Both ways give the same numbers.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def corrected_ranges(calibration: Calibration, ranges: Ranges) -> CorrectedRange
 
 
 def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
-    """Return ranges (n,) without the delays of both tags and without the constants of pairs, in metres."""
+    """Return ranges (n,) corrected for the delays of both tags and for constants of pairs, in metres."""
     missing = [t for t in ranges.tags() if t not in calibration.delays_ns]
     if missing:
         known = ", ".join(map(str, sorted(calibration.delays_ns)))
@@ -59,7 +59,7 @@ def _without_delays(calibration: Calibration, ranges: Ranges) -> Floats:
 
 
 def _errors(calibration: Calibration, ranges: Ranges, lifted: Floats, error_m: Floats) -> dict[str, Any]:
-    """Return what is known of the errors of ranges (n,), by the names of `CorrectedRanges`."""
+    """Return the expected errors of ranges (n,), by the names of `CorrectedRanges`."""
     model = calibration.errors
     if model is None:
         nothing = np.full(len(ranges), np.nan)
@@ -114,7 +114,7 @@ class PiecewiseCurve:
     """
 
     def __init__(self, curve: Curve) -> None:
-        """Take a curve apart."""
+        """Split a curve into polynomials."""
         self.low, self.high = curve.range
         first, count = curve.degree, len(curve.coefficients)
         whole = PPoly.from_spline((np.array(curve.knots), np.array(curve.coefficients), curve.degree))
@@ -134,7 +134,7 @@ class PiecewiseCurve:
 
 
 class RangeCorrector:
-    """Corrects single ranges by a calibration; make one, and call it as often as there are ranges."""
+    """Corrects single ranges by a calibration; make one object and call it for every range."""
 
     def __init__(self, calibration: Calibration) -> None:
         """Prepare the curves of every group of tags."""
@@ -197,7 +197,7 @@ class RangeCorrector:
         return (curve(one if one == one else two) + curve(two if two == two else one)) / 2
 
     def _lifted(self, first: float, second: float) -> float:
-        """Return the lifted power; of two powers of which one was not measured, the other serves."""
+        """Return the lifted power; if one of both powers is missing, the other replaces it."""
         if not FAINTEST_DBM < first < LOUDEST_DBM:
             first = second
             if not FAINTEST_DBM < first < LOUDEST_DBM:

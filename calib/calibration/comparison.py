@@ -1,4 +1,4 @@
-"""Compares two calibrations: whether their delays are the same within their standard errors."""
+"""Comparison of two calibrations: whether their delays agree within their standard errors."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _interval(std_ns: float) -> str:
 
 
 def _or_none(value: float) -> float | None:
-    """Return a number as JSON has it, which knows no NaN."""
+    """Return a number for JSON, None if it is not finite."""
     return value if np.isfinite(value) else None
 
 

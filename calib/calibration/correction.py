@@ -1,4 +1,4 @@
-"""Writes a recording again with corrected ranges, or as files that others read."""
+"""Write a copy of a recording with corrected ranges, or files in other formats."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from uwblink.twr import Exchanges
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """Number of corrected ranges, of those at powers beyond the fitted ones, and of those without power.
+    """Number of corrected ranges, of those at powers outside the fitted range, and of those without power.
 
-    A range without power is corrected by its delays alone where the calibration has curves, and has no sigma.
+    A range without power is corrected by its delays alone if the calibration has curves, and has no sigma.
     """
 
     count: int

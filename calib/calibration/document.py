@@ -162,7 +162,8 @@ def pair_name(pair: tuple[int, int]) -> str:
 
 
 MAX_DELAY_NS: Final = 1e4
-"""A register holds 1026 ns and a device has two; ten metres of cable are 50 ns. The rest is margin (3 km of range)."""
+"""Largest delay: a register holds 1026 ns and a device has two; ten metres of cable are 50 ns. The rest is margin (3 km
+of range)."""
 
 # Squares and products of numbers up to 1e100 are finite.
 Number = Annotated[float, number(-1e100, 1e100, "a finite number up to 1e+100")]

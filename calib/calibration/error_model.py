@@ -1,9 +1,9 @@
 """The error model of corrected ranges, by pair and power: direct ranges, reflections, outliers.
 
-An error is noise about `location_m`; with a tail share noise plus a detour, a least one and an exponential one, which
-is of one of two kinds; rarely an outlier. Noise and share are stated at some lifted powers, in logarithms and log odds
-straight between them, and each pair has factors on noise, odds and detour; a pair that was not there when the fit was
-made has what is common.
+An error is noise about `location_m`; with a probability of `tail_share` it also contains a detour, the sum of a least
+one and an exponential one of one of two kinds; rarely it is an outlier. Noise and share are stated at some lifted
+powers, and interpolated linearly as logarithm and log odds. Each pair has factors on noise, odds and detour; an unknown
+pair has the common values.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from uwblink.arrays import Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class PairErrors:
-    """Factors of a pair of tags on what is common: noise, odds of a reflection, mean of the exponential detour."""
+    """Factors of a pair of tags on the common noise, odds of a reflection, and mean exponential detour."""
 
     noise: Positive
     odds: Positive
@@ -38,7 +38,7 @@ class PairErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorShapes:
-    """Of each range (n,): noise of the core, share of reflections, mean of their exponential detour, metres."""
+    """Parameters of each range (n,): noise, share of reflections, mean of their exponential detour, in metres."""
 
     noise_m: Floats
     tail_share: Floats
@@ -75,7 +75,7 @@ class ErrorModel:
     lasting: LastingErrors | None = None
 
     def between(self, between_m: float) -> ErrorModel:
-        """Return the model of ranges of other recordings, whose pairs are off by so much more."""
+        """Return the model for other recordings, in which pairs differ by `between_m`."""
         noise_m = tuple(np.hypot(self.noise_m, between_m).tolist())
         return replace(self, noise_m=noise_m, between_m=between_m)
 
@@ -103,7 +103,7 @@ class ErrorModel:
         )
 
     def mean_m(self, shapes: ErrorShapes) -> Floats:
-        """Return the mean of the errors (n,): how much reflections add to a range on average."""
+        """Return the mean of the errors (n,)."""
         inside = 1 - self.outlier_share
         return np.asarray(self.location_m + inside * shapes.tail_share * (self.least_m + shapes.detour_m))
 
@@ -115,7 +115,7 @@ class ErrorModel:
         return np.asarray(self.scale * np.sqrt(square - (self.mean_m(shapes) - self.location_m) ** 2))
 
     def below(self, error_m: Floats, shapes: ErrorShapes) -> Floats:
-        """Return the model's share of errors below some (n,)."""
+        """Return the distribution function of errors (n,)."""
         error = error_m - self.location_m
         noise, share = shapes.noise_m, shapes.tail_share
         away = (error - self.least_m) / noise
@@ -130,9 +130,9 @@ class ErrorModel:
         return np.asarray((1 - self.outlier_share) * inside + self.outlier_share * wild)
 
     def quantiles(self, probabilities: Sequence[float], lifted: Floats, initiator: Ints, target: Ints) -> Floats:
-        """Return the errors (n, k) that shares (k,) of errors lie below, for ranges (n,); NaN without a power.
+        """Return the quantiles (n, k) of errors at shares (k,), for ranges (n,); NaN without a power.
 
-        They are taken at the model's powers for each pair, and are straight between them.
+        They are computed at the model's powers for each pair, and interpolated linearly.
         """
         given = np.asarray(probabilities, dtype=np.float64)
         if given.ndim != 1 or not len(given) or not np.all((given > 0) & (given < 1)):
@@ -158,13 +158,13 @@ class ErrorModel:
         wide = max(self.outlier_m, 1e-9)
         wild = self.outlier_share * np.exp(-0.5 * (error / wide) ** 2) / (wide * ROOT_2PI)
         total = core + tail + wild
-        # Nothing else reaches where all three are zero.
+        # Where all three vanish, only an outlier is possible.
         nothing = total <= 0
         total = np.where(nothing, 1.0, total)
         return np.asarray(tail / total), np.where(nothing, 1.0, wild / total)
 
     def _table(self, levels: Floats, lifted: Floats, pair: Ints) -> Floats:
-        """Return quantiles (m, k) of the model itself at lifted powers of numbered pairs (m,), by bisection."""
+        """Return quantiles (m, k) of the uncorrected model at lifted powers of numbered pairs (m,), by bisection."""
         flat = self._shapes(lifted, self._factors[pair])
         shapes = ErrorShapes(
             noise_m=flat.noise_m[:, None], tail_share=flat.tail_share[:, None], detour_m=flat.detour_m[:, None]
@@ -181,7 +181,7 @@ class ErrorModel:
         return np.asarray((low + high) / 2)
 
     def _own_levels(self, probabilities: Floats) -> Floats:
-        """Return the model's levels below which such shares of errors were found."""
+        """Return the levels of the uncorrected model for shares of errors."""
         if not self.levels:
             return probabilities
         found, own = np.array(self.levels).T
@@ -189,7 +189,7 @@ class ErrorModel:
 
     @cached_property
     def _factors(self) -> Floats:
-        """Logarithms of each pair's factors (pairs + 1, 3); the last row is that of a pair that is not known."""
+        """Logarithms of each pair's factors (pairs + 1, 3); the last row is that of an unknown pair."""
         rows = [[pair.noise, pair.odds, pair.detour] for pair in self.pairs.values()]
         return np.log([*rows, [1.0, 1.0, 1.0]])
 
@@ -223,13 +223,13 @@ CheckedErrors = Annotated[ErrorModel, joint(_mistake)]
 
 
 class ErrorsAtOnce:
-    """Total standard deviation and share of reflections of one range at a time, in plain Python, as `ErrorModel` has.
+    """Total standard deviation and share of reflections of single ranges, in plain Python; equal to `ErrorModel`.
 
-    Between powers the total is that of noise and odds there, so this equals the columns.
+    Between powers the total is computed from interpolated noise and odds.
     """
 
     def __init__(self, model: ErrorModel, bias_curve: Curve) -> None:
-        """Prepare tables of a model; where the bias curve is held constant the total grows."""
+        """Prepare the tables; outside the range of the bias curve the total increases."""
         self._model, self._low, self._high = model, *bias_curve.range
         slopes = bias_curve.beyond(np.array([self._low - 1, self._high + 1]))
         self._below, self._above = slopes.tolist()

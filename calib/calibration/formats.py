@@ -1,4 +1,4 @@
-"""Calibrations in other forms: register values, tables, MILUV's JSON, YAML for ROS."""
+"""Calibrations in other formats: register values, tables, MILUV's JSON, YAML for ROS."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TX_SHARE: Final = 0.44
 
 
 def programmed(path: str | os.PathLike[str]) -> AntennaDelays:
-    """Return what was programmed into devices, from a recording or from a file of antenna delays (.toml).
+    """Return the antenna delays that were programmed into devices, from a recording or a file (.toml).
 
     Raises what `Recording.open` and `load_antenna_delays` raise.
     """
@@ -172,7 +172,7 @@ def _ros_yaml(calibration: Calibration, base: AntennaDelays | None) -> str:
 
 
 def _error_tables(model: ErrorModel) -> dict[str, Any]:
-    """Return what errors to expect, by pair and lifted power, as tables to interpolate in."""
+    """Return the error model by pair and lifted power, as tables for interpolation."""
     lifted, pairs = np.array(model.lifted), {}
     for name in [*model.pairs, "other"]:
         ends = [0, 0] if name == "other" else [int(end) for end in name.split("-")]
@@ -199,7 +199,7 @@ FORMATS: Final[dict[str, Callable[[Calibration, AntennaDelays | None], str]]] = 
     "ros-yaml": lambda calibration, base: _ros_yaml(calibration, base),
     "c-header": lambda calibration, _: c_header(calibration),
 }
-"""What turns a calibration, and what was programmed into its devices, into text, by the name of the format."""
+"""Functions from a calibration and programmed delays to text, by format."""
 
 ONE_CURVE: Final = ("miluv", "ros-yaml", "c-header")
 """Formats that have one curve for all tags."""

@@ -1,7 +1,7 @@
-"""How long the errors of direct ranges last: a pair's ranges do not err independently of one another in time.
+"""Autocovariance of the errors of direct ranges: errors of a pair are not independent in time.
 
-Short reflections, fading and power readings change slowly, so ranges of a pair that follow each other share a part of
-their errors. A filter that takes them for independent is too sure of itself.
+Short reflections, fading and power readings change slowly, so successive ranges of a pair share a part of their errors.
+A filter that assumes independent errors is overconfident.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ GATE: Final = 10.83
 """99.9 % quantile of chi-square with one degree of freedom: filters take ranges whose squared errors are below it."""
 
 LONGEST_S: Final = 2.0
-"""Lags that are looked at. A filter forgets its position within a second or so; fitted to lags of a minute, the
-autocovariance says less of the first second, and positions in an office became 32 % worse instead of equal."""
+"""Longest lag. A filter forgets its position within about a second; with lags up to a minute the fit describes the
+first second less well, and positions in an office became 32 % worse instead of equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class LastingErrors:
-    """Errors of ranges within the gate of a filter, in units of sigma: mean, variance of the part that each range has
-    of its own, variance of the part that lasts, and the time in which that forgets."""
+    """Errors of ranges within the gate of a filter, in units of sigma: mean, variance of the independent part, variance
+    of the lasting part, and the time constant of the latter."""
 
     mean: Metres
     own_variance: Positive
@@ -35,9 +35,9 @@ class LastingErrors:
 
 
 def lasting_errors(ranges: Ranges, z: Floats) -> LastingErrors | None:
-    """Fit the autocovariance a exp(-lag / time) to errors over sigma (n,), pair by pair; None where none is seen.
+    """Fit the autocovariance a exp(-lag / time) to errors over sigma (n,) by pair; None without enough products.
 
-    The autocovariance is averaged in bins of the logarithm of the lag; those with few products say nothing.
+    The autocovariance is averaged in bins of the logarithm of the lag; bins with few products are left out.
     """
     inside = np.flatnonzero(z**2 < GATE)
     low, high = (np.sort([ranges.initiator[inside], ranges.target[inside]], axis=0)).astype(np.int64)

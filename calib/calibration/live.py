@@ -1,4 +1,4 @@
-"""Correct exchanges as they come: what a recorder's live page and a stream of ranges ask for."""
+"""Correction of exchanges as they arrive, for the live page of a recorder and for streams."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A calibration: antenna delays, curves and error model, as a frozen value that corrects ranges and prints itself."""
+"""The calibration: antenna delays, curves and error model. It corrects ranges and prints itself."""
 
 from __future__ import annotations
 
@@ -257,7 +257,7 @@ _ADAPTER: Final = TypeAdapter(Calibration)
 
 
 def _misfit(calibration: Calibration) -> str:
-    """Return what covariance matrices do not fit, "" where all are as large as what they are of."""
+    """Return the mistake in the sizes of covariance matrices, "" if there is none."""
     known = calibration.uncertainty
     if known is None:
         return ""
@@ -300,7 +300,7 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
 DELAY_HEAD: Final = ("tag", "delay (ns)", "95 % interval")
 PAIR_HEAD: Final = ("pair", "constant (cm)", "95 % interval")
 MAX_ROWS: Final = 40
-"""Tags or pairs that are listed; of more, the first are: a screen."""
+"""Maximum number of tags or pairs that are printed, about a screen."""
 
 
 def pair_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
@@ -351,7 +351,7 @@ def _headline(calibration: Calibration) -> str:
 
 
 def rests_on(provenance: Mapping[str, Any]) -> str:
-    """Return what stands in the place of known distances, as one phrase; "" where distances were known."""
+    """Return what replaces known distances; nothing where distances were known."""
     known = provenance.get("rests_on")
     if provenance.get("truth") != "ranges" or not isinstance(known, Mapping):
         return ""

@@ -13,7 +13,7 @@ def main() -> NoReturn:
 
 
 def _run() -> NoReturn:
-    # Here, so that Ctrl-C is answered while these are loaded.
+    # Imported here, so that Ctrl-C is handled while they load.
     import sys
 
     from calib.cli.commands import app

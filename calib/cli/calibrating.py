@@ -1,4 +1,4 @@
-"""Commands that make calibrations, and show them: fit, add-tag, survey, show, sample."""
+"""Commands that make and show calibrations: fit, add-tag, survey, show, sample."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _fit_from_ranges(
 
 
 def delay_lines(found: calib.Calibration) -> Iterator[str]:
-    """Yield a line a pair that has a constant and a line a tag: the constant or delay, and its 95 % interval."""
+    """Yield a line per pair with a constant and per tag: constant or delay, and its 95 % interval."""
     from calib.spread import TWO_SIDED_95
 
     for pair, offset in sorted(found.pair_offsets.items()):
@@ -303,7 +303,7 @@ def _survey_figures(result: calib.SurveyResult) -> dict[str, Any]:
 def show(
     calibration: Annotated[Path, typer.Argument(help="Calibration to show (.json).")], as_json: AsJson = False
 ) -> None:
-    """Print a calibration: delays, curves, what it was fitted to, and what its fit could not know."""
+    """Print a calibration: delays, curves, the data of its fit, and its limits."""
     import calib
     from calib.calibration import rests_on
 

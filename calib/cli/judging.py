@@ -1,4 +1,4 @@
-"""Commands that judge: evaluate, localize, doctor, compare, report."""
+"""Commands that evaluate: evaluate, localize, doctor, compare, report."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def evaluate(
         return
     from rich.console import Console
 
-    # Columns that the table never needs more than: in a file no figure must lose its last digits.
+    # The largest width of the table: in a file no number may be cut.
     print_table(evaluation, Console(width=None if sys.stdout.isatty() else 110))
     for path in filter(None, (report, figures)):
         typer.echo(f"report: {path}")
@@ -159,7 +159,7 @@ def _onboard(
     as_json: bool,
     force: bool,
 ) -> None:
-    """Localize by what is on board, and print it."""
+    """Localize by on-board sensors, and print the result."""
     from calib.evaluation import OnboardSettings, localize_onboard, onboard_json, onboard_text, write_onboard_tum
 
     settings = OnboardSettings(model=model)
@@ -242,7 +242,7 @@ def compare(
 
 
 def spread_tests(arguments: Sequence[str]) -> list[str]:
-    """Let `--tests` take several files: repeat it before every word up to the next option."""
+    """Repeat `--tests` before each of its files, so that it takes several."""
     many, found = "--tests", list[str]()
     inside = False
     for word in arguments:
@@ -336,7 +336,7 @@ def print_table(evaluation: Evaluation, console: Console) -> None:
 
 
 def _remarks(evaluation: Evaluation) -> Iterator[str]:
-    """Yield what the table has no room for: quantiles, coverage, errors from planted values."""
+    """Yield lines below the table: quantiles, coverage, errors against planted values."""
     group = evaluation.overall
     yield (
         f"95 % of the calibrated errors lie between {100 * group.full.low_m:+.1f} and {100 * group.full.high_m:+.1f} cm"

@@ -1,4 +1,4 @@
-"""Commands that say what to measure, and what will come of it: plan survey, plan flight."""
+"""Commands that plan measurements: plan survey, plan flight."""
 
 from __future__ import annotations
 

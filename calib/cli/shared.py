@@ -1,4 +1,4 @@
-"""What the commands of `calib` share: calibrations as they read them, and the options that errors and warnings name."""
+"""Functions and options that the commands of `calib` share."""
 
 from __future__ import annotations
 

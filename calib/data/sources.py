@@ -335,7 +335,7 @@ def _planted(source: Source, name: str) -> Mapping[str, Any] | None:
 
 
 def _why_no_power(exchanges: Exchanges) -> str:
-    """Return which powers cannot be received ones, if there are any: nothing is received at more than a milliwatt."""
+    """Return a text on impossible powers, if there are any: no receiver gets more than a milliwatt."""
     given = np.concatenate([exchanges.fpp1_dbm, exchanges.fpp2_dbm])
     given = given[np.isfinite(given) & (given != 0)]
     if not len(given):
@@ -417,7 +417,7 @@ class Flight:
 
 
 def require_times(ranges: Ranges) -> None:
-    """Raise `UnanswerableError` where all ranges have the same time, as those without recorded times."""
+    """Raise `UnanswerableError` if all ranges have the same time, as those without recorded times."""
     if len(ranges) > 1 and not np.ptp(ranges.time_ns):
         raise UnanswerableError(
             f"{ranges.source}: all of its {len(ranges)} ranges have the same time, so nothing can be tracked; import "

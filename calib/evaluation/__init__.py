@@ -1,4 +1,4 @@
-"""How good a calibration is: statistics of errors, and localization with and without it."""
+"""Evaluation of a calibration: statistics of errors, and localization with and without it."""
 
 from calib.evaluation.localization import PAPER_RMSE_M, summarize
 from calib.evaluation.onboard import OnboardSettings, localize_onboard

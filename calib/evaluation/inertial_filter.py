@@ -13,24 +13,25 @@ from typing import Final
 
 import numpy as np
 
-from calib.evaluation.range_updates import Fix, Heard, RangeErrors, weighed
+from calib.evaluation.range_updates import Fix, RangeErrors, RangeUpdate, mixture_update
 from uwblink.arrays import Floats
 
 GRAVITY: Final = 9.81
 """m/s^2."""
 
 SIZE: Final = 16
-"""Of the state; its parts are sliced by the names below: position, velocity, attitude, biases, height's offset."""
+"""Size of the state. The names below slice its parts: position, velocity, attitude, biases, offset of the height
+sensor."""
 
 P, V, A, G, F, H = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), 15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """What the filter takes for noise: of accelerometer and gyro (a root of Hz), of their biases, of motion without.
+    """Process noise of the filter: accelerometer and gyro (per root of Hz), their biases, and motion without an IMU.
 
-    Defaults are those of a consumer IMU on a small drone with its vibrations. `acceleration` (m/s^2 a root of Hz) is
-    how velocity wanders without an IMU.
+    The defaults are those of a consumer IMU on a small vibrating drone. `acceleration` (m/s^2 per root of Hz) is the
+    random walk of velocity without an IMU.
     """
 
     force: float = 0.05
@@ -43,10 +44,10 @@ class Noise:
 
 
 class InertialFilter:
-    """Predicts by inertial readings or by constant velocity, and corrects by ranges and heights."""
+    """Predicts by inertial readings or constant velocity, and updates by ranges and heights."""
 
     def __init__(self, fix: Fix, attitudes: Floats, noise: Noise, *, inertial: bool, speed_m_s: float = 1.0) -> None:
-        """Begin at a fix with attitudes (headings, 3, 3), body to world."""
+        """Start at a fix with attitudes (headings, 3, 3), body to world."""
         count = len(attitudes)
         self.noise, self.inertial = noise, inertial
         self.place, self.velocity = np.tile(fix.place_m, (count, 1)), np.zeros((count, 3))
@@ -57,14 +58,15 @@ class InertialFilter:
         spread = np.zeros(SIZE)
         spread[V] = speed_m_s
         if inertial:
-            # Heading is from a grid; tilt and bias of the accelerometer are told apart by `pulled`; consumer parts.
+            # Headings are those of a grid; other standard deviations are those of consumer sensors.
             spread[A], spread[G], spread[F] = (0.3, 0.3, np.pi / count), 0.02, 0.4
         spread[H] = 0.15
         self.covariance = np.tile(np.diag(spread**2), (count, 1, 1))
         self.covariance[:, P, P] = fix.covariance_m2
 
     def predict(self, dt: float, gyro: Floats, force: Floats) -> None:
-        """Move on by `dt` seconds with mean angular velocity (3,) and specific force (3,), which nothing may be of."""
+        """Predict over `dt` seconds with mean angular velocity (3,) and specific force (3,); without an IMU they are
+        ignored."""
         noise, step = self.noise, np.zeros((len(self.place), SIZE, SIZE))
         step[:, P, V] = np.eye(3) * dt
         added = np.zeros(SIZE)
@@ -88,8 +90,10 @@ class InertialFilter:
         self.covariance = whole @ self.covariance @ whole.transpose(0, 2, 1) + np.diag(added)
         self.covariance = (self.covariance + self.covariance.transpose(0, 2, 1)) / 2
 
-    def hear(self, range_m: float, noise_m: float, errors: RangeErrors, arm_m: Floats, anchor_m: Floats) -> Heard:
-        """Correct by a range to an anchor (3,); return what the filters made of it."""
+    def update_range(
+        self, range_m: float, noise_m: float, errors: RangeErrors, arm_m: Floats, anchor_m: Floats
+    ) -> RangeUpdate:
+        """Update by a range to an anchor (3,); return the update."""
         towards = self.place - anchor_m
         if self.inertial:
             towards = towards + self.attitude @ arm_m
@@ -102,49 +106,51 @@ class InertialFilter:
         row[:, P] = towards / distance[:, None]
         if self.inertial:
             row[:, A] = -np.einsum("hi,hij->hj", row[:, P], self.attitude @ _cross(np.tile(arm_m, (len(distance), 1))))
-        heard = self._weigh(row, range_m - distance, noise_m, errors)
-        self.likelihood = self.likelihood + heard.log_density
-        return heard
+        update = self._update_scalar(row, range_m - distance, noise_m, errors)
+        self.likelihood = self.likelihood + update.log_density
+        return update
 
-    def level(self, height_m: float) -> None:
-        """Correct by the height above the world's zero, less an offset that the sensor may have."""
+    def update_height(self, height_m: float) -> None:
+        """Update by a height above the world's zero; the sensor may have an offset."""
         row = np.zeros((len(self.place), SIZE))
         row[:, [2, H]] = 1.0
         errors = RangeErrors(share=1e-6, least_m=0.0, detour_m=1.0, outlier=0.05, outlier_m=1.0)
-        self._weigh(row, height_m - self.place[:, 2] - self.offset, self.noise.height_m, errors)
+        self._update_scalar(row, height_m - self.place[:, 2] - self.offset, self.noise.height_m, errors)
 
-    def _weigh(self, row: Floats, innovation: Floats, noise_m: float, errors: RangeErrors) -> Heard:
-        """Correct by an observation of one (headings, states) whose errors are not normal alone."""
+    def _update_scalar(self, row: Floats, innovation: Floats, noise_m: float, errors: RangeErrors) -> RangeUpdate:
+        """Update by a scalar measurement with derivatives `row` (headings, states) and a non-normal error."""
         reach = np.einsum("hij,hj->hi", self.covariance, row)
         variance = np.einsum("hi,hi->h", row, reach) + noise_m**2
-        heard = weighed(innovation, variance, errors)
+        update = mixture_update(innovation, variance, errors)
         gain = reach / variance[:, None]
-        self._move(gain * heard.noise_m[:, None])
-        change = (heard.variance_m2 - variance)[:, None, None]
+        self._move(gain * update.noise_m[:, None])
+        change = (update.variance_m2 - variance)[:, None, None]
         self.covariance = self.covariance + gain[:, :, None] * gain[:, None, :] * change
-        return heard
+        return update
 
-    def pulled(self, force: Floats, std: float) -> None:
-        """Take the mean specific force (3,) for gravity's, but for an acceleration of `std` m/s^2 an axis.
+    def update_gravity(self, force: Floats, std: float) -> None:
+        """Update by the direction of gravity: the mean specific force (3,) with an acceleration of `std` m/s^2 per
+        axis.
 
-        Tilt and bias are then known together: what one is off, the other makes up for.
+        The update determines the sum of tilt error and accelerometer bias.
         """
         pull = force - self.force_bias
         world = np.einsum("hij,hj->hi", self.attitude, pull) - (0.0, 0.0, GRAVITY)
-        self._observe([(A, -self.attitude @ _cross(pull)), (F, -self.attitude)], -world, std)
+        self._update_linear([(A, -self.attitude @ _cross(pull)), (F, -self.attitude)], -world, std)
 
-    def slow(self, speed_m_s: float) -> None:
-        """Take it that the body is no faster than it may be: what holds it in the room while no range comes."""
-        self._observe([(V, np.eye(3))], -self.velocity, speed_m_s)
+    def limit_speed(self, speed_m_s: float) -> None:
+        """Update by a velocity of zero with standard deviation `speed_m_s`: it bounds the state while there are no
+        ranges."""
+        self._update_linear([(V, np.eye(3))], -self.velocity, speed_m_s)
 
-    def rest(self, gyro: Floats, force: Floats) -> None:
-        """Take the body for still: no velocity (to 1 cm/s), no turning (3 mrad/s), no acceleration (3 cm/s^2)."""
-        self._observe([(V, np.eye(3))], -self.velocity, 0.01)
-        self._observe([(G, np.eye(3))], gyro - self.gyro_bias, 0.003)
-        self.pulled(force, 0.03)
+    def update_standstill(self, gyro: Floats, force: Floats) -> None:
+        """Update by standstill: no velocity (1 cm/s), no rotation (3 mrad/s), no acceleration (3 cm/s^2)."""
+        self._update_linear([(V, np.eye(3))], -self.velocity, 0.01)
+        self._update_linear([(G, np.eye(3))], gyro - self.gyro_bias, 0.003)
+        self.update_gravity(force, 0.03)
 
-    def _observe(self, parts: Sequence[tuple[slice, Floats]], innovation: Floats, std: float) -> None:
-        """Correct by a linear observation of three parts of the state (headings, 3, 3 each) with plain noise."""
+    def _update_linear(self, parts: Sequence[tuple[slice, Floats]], innovation: Floats, std: float) -> None:
+        """Update by a linear measurement of parts of the state (headings, 3, 3 each) with normal noise."""
         rows = np.zeros((len(self.place), 3, SIZE))
         for part, slopes in parts:
             rows[:, :, part] = slopes
@@ -156,7 +162,7 @@ class InertialFilter:
         self.covariance = left @ self.covariance @ left.transpose(0, 2, 1) + std**2 * gain @ gain.transpose(0, 2, 1)
 
     def restart(self, fix: Fix, speed_m_s: float) -> None:
-        """Begin anew at a fix, with the attitude and the biases that are there."""
+        """Restart at a fix, with the present attitude and biases."""
         self.place, self.velocity = np.tile(fix.place_m, (len(self.place), 1)), np.zeros_like(self.velocity)
         for part in (P, V):
             self.covariance[:, part, :] = self.covariance[:, :, part] = 0
@@ -172,7 +178,7 @@ class InertialFilter:
 
 
 def _cross(vectors: Floats) -> Floats:
-    """Return the matrices (n, 3, 3) that take cross products with vectors (n, 3)."""
+    """Return the cross-product matrices (n, 3, 3) of vectors (n, 3)."""
     found = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
     found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x

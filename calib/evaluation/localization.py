@@ -1,8 +1,8 @@
-"""What a calibration is worth to a robot: each body is tracked from its ranges to the others, with and without it.
+"""Localization with and without a calibration: each body is tracked from its ranges to the others.
 
-Four filters see the same ranges and the same noise of velocity: raw and calibrated with fixed variances, calibrated
-with the variance of the sigma curve, and calibrated with all that a calibration says of errors, reflections included
-(`calib.evaluation.tracking`). `calib.evaluation.onboard` does without motion capture.
+Four filters use the same ranges and the same velocity noise: raw and calibrated ranges with fixed variances, calibrated
+ranges with the variance of the sigma curve, and calibrated ranges with the whole error model, reflections included
+(`calib.evaluation.tracking`). `calib.evaluation.onboard` needs no motion capture.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from calib.evaluation.tracking import FILTERS, FilterRanges, Run, Settings, Trac
 from uwblink.arrays import Floats
 
 PAPER_RMSE_M: Final = {"raw": 0.804, "calibrated": 0.500, "variance": 0.431}
-"""Mean over six scenarios (ICRA 2023, its only table): flights of its own, another filter's noise."""
+"""Mean RMSE over six scenarios (ICRA 2023, its only table), with other flights and another process noise."""
 
 TUNED_OVER: Final = (0.04, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.6, 1.0)
-"""Fixed standard deviations that are tried on a training flight, in metres: two in each octave, about."""
+"""Candidates for fixed standard deviations on a training flight, in metres, about two per octave."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedStd:
-    """The fixed standard deviations of ranges, by filter, and where they come from, in words."""
+    """The fixed standard deviations of ranges by filter, and their source in words."""
 
     std_m: dict[str, float]
     source: str
@@ -39,7 +39,7 @@ class FixedStd:
 class Localization:
     """One body of one recording: a track for each of `FILTERS`, and the RMSE of each over seeds (seeds,) in metres.
 
-    `simulated` says whether the flight was; `fixed` are the fixed variances of the filters that have one.
+    `simulated` tells whether the flight was simulated; `fixed` are the fixed standard deviations.
     """
 
     source: str
@@ -50,7 +50,7 @@ class Localization:
     simulated: bool
 
     def __repr__(self) -> str:
-        """Return how far off each filter is, over seeds, on one line."""
+        """Return the RMSE of each filter, over seeds, on one line."""
         found = ", ".join(f"{name} {np.mean(rmse):.3f} m" for name, rmse in self.rmse_m.items())
         return f"{self.body} of {self.source}: rms error {found}"
 
@@ -101,8 +101,7 @@ def localize(
 
 
 def filter_runs(flight: Flight, calibration: Calibration, fixed: FixedStd) -> list[Run]:
-    """Return what each of `FILTERS` measures of each body; the robust one only where it is known what errors are made
-    of."""
+    """Return the inputs of each of `FILTERS` for each body; the robust filter needs an error model."""
     applied, runs = calibration.apply(flight.ranges), []
     for problem in problems(flight):
         rows = problem.rows
@@ -120,7 +119,7 @@ def filter_runs(flight: Flight, calibration: Calibration, fixed: FixedStd) -> li
                 ranges["variance"] = FilterRanges(
                     corrected - lasting.mean * sigma, own * sigma, lasting=lasting, sigma_m=sigma
                 )
-                # Reflections within the gate are in the mixture already, so the total stays that of the noise.
+                # The mixture contains reflections within the gate, so the total variance is that of the noise.
                 unit = noise / np.sqrt(lasting.own_variance + lasting.lasting_variance)
                 ranges["robust"] = replace(ranges["robust"], std_m=own * unit, lasting=lasting, sigma_m=unit)
         runs.append(Run(problem, ranges))
@@ -128,11 +127,10 @@ def filter_runs(flight: Flight, calibration: Calibration, fixed: FixedStd) -> li
 
 
 def fixed_std(calibration: Calibration, settings: Settings, training: Data | Flight | None = None) -> FixedStd:
-    """Return the fixed standard deviations of raw and calibrated ranges, by what is known before the flight.
+    """Return the fixed standard deviations of raw and calibrated ranges, from what is known before the flight.
 
-    The one that is given; else those with which filters err least on a training flight (the first 2500 ranges of each
-    body); else those of the errors that the calibration was fitted to, or its sigma at the middle of its powers, where
-    it is too old to remember them.
+    In this order: the given one; those with the smallest RMSE on a training flight (the first 2500 ranges of each
+    body); those of the errors that the calibration was fitted to; for old calibrations its sigma at the median power.
     """
     if settings.fixed_std_m is not None:
         return FixedStd(dict.fromkeys(("raw", "calibrated"), settings.fixed_std_m), "given")
@@ -183,9 +181,9 @@ class Summary:
 
 
 def summarize(found: list[Localization]) -> Summary:
-    """Average over bodies and recordings, each counting the same, as in the paper.
+    """Return means over bodies and recordings, with equal weights as in the paper.
 
-    Raises `UnanswerableError` where the filter took no range at all.
+    Raises `UnanswerableError` if the filter accepted no range.
     """
     filters = [name for name in FILTERS if all(name in one.tracks for one in found)]
     means = {name: np.mean([one.rmse_m[name] for one in found], axis=0) for name in filters}
@@ -211,7 +209,7 @@ def summarize(found: list[Localization]) -> Summary:
 
 
 def _mean_bounds(count: float, degrees: int) -> tuple[float, float]:
-    """Return bounds that hold the mean of `count` independent chi-squares with 95 %."""
+    """Return the 95 % bounds of the mean of `count` independent chi-squares."""
     some = max(count, 1.0)
     low, high = (float(chi2.ppf(share, some * degrees)) / some for share in (0.025, 0.975))
     return low, high
@@ -223,7 +221,7 @@ def _inside(values: Floats, degrees: int) -> float:
 
 
 def _independent(values: Floats) -> float:
-    """Return how many independent values a correlated series is worth: n over the sum of its autocorrelations.
+    """Return the effective number of independent values of a correlated series: n over the sum of its autocorrelations.
 
     The sum ends where the autocorrelation first falls below a twentieth.
     """

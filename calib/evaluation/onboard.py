@@ -1,8 +1,8 @@
-"""Localization without a motion-capture studio: ranges to fixed anchors, an IMU or none, a height sensor or none.
+"""Localization without motion capture: ranges to fixed anchors, optionally an IMU and a height sensor.
 
-The start comes from the first ranges (`multilaterate`), tilt from gravity, heading from several that are tried at
-once; the likeliest so far is told. Where half of the latest ranges cannot be explained, the filter begins anew from
-them. Poses of the body, where there are any, are truth to judge by and nothing else.
+The first ranges give the start (`multilaterate`), gravity gives the tilt, and several headings are tried in parallel;
+the likeliest is reported. If half of the latest ranges are inconsistent, the filter restarts from them. Poses of the
+body are only used as truth for evaluation.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from uwblink.recording.target_reports import single_reports
 MODELS: Final = ("imu", "constant-velocity")
 
 MIN_ANCHORS: Final = 3
-"""Fewer leave a position open; a start takes one more, for three leave its mirror image."""
+"""Anchors of a fix: fewer leave the position ambiguous; a start needs one more, because three leave its mirror image.
+"""
 
 MIN_RANGES_PER_FIX: Final = 6
 SPAN_S: Final = 0.5
-"""Span of time in which a body is found at rest, and in which gravity is averaged for the first tilt."""
+"""Seconds over which standstill is detected, and gravity averaged for the first tilt."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +62,7 @@ class OnboardSettings:
     noise: Noise = field(default_factory=Noise)
 
     def __post_init__(self) -> None:
-        """Refuse what no filter can run with; raises `BadInputError`."""
+        """Check the settings; raises `BadInputError`."""
         if self.model not in MODELS:
             raise BadInputError(
                 f"found {self.model!r:.40}, allowed: {', '.join(MODELS)}, or poses with motion capture",
@@ -102,13 +103,13 @@ class OnboardTrack:
 
     @property
     def rmse_m(self) -> float:
-        """Root of the mean squared distance from the truth, NaN where nothing is known of it."""
+        """RMSE of the position, NaN without truth."""
         known = np.isfinite(self.truth_m).all(axis=1)
         wrong = self.estimate_m[known] - self.truth_m[known]
         return float(np.sqrt(np.mean(np.sum(wrong**2, axis=1)))) if known.any() else float("nan")
 
     def __repr__(self) -> str:
-        """Return what it rests on and how far off it is, on one line."""
+        """Return the inputs and the RMSE, on one line."""
         off = f"rms error {self.rmse_m:.3f} m" if self.rmse_m == self.rmse_m else "no truth to judge by"
         return f"{self.body} of {self.source} by {self.used}: {off}"
 
@@ -159,7 +160,7 @@ class _Readings:
 
 
 def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
-    """Return the readings of every body that is no anchor and ranges with one."""
+    """Return the readings of every body that is not an anchor and ranges with one."""
     with opened(data) as (name, source):
         exchanges = single_reports(source.exchanges).exchanges
         poses, tags = source.poses, list(source.tags)
@@ -223,10 +224,10 @@ def _readings(data: Data, calibration: Calibration) -> list[_Readings]:
 
 
 def _corrected(ranges: Ranges, calibration: Calibration) -> tuple[Floats, Floats, RangeErrors]:
-    """Return corrected ranges (n,), the noise of direct ones (n,), and what their errors are made of besides."""
+    """Return corrected ranges (n,), the noise of direct ones (n,), and their error model."""
     applied = calibration.apply(ranges)
     if calibration.errors is None:
-        # What is reckoned with where a calibration does not say: a tenth reflected, by 30 cm on average.
+        # Default without an error model: a tenth of the ranges reflected, by 30 cm on average.
         unknown = RangeErrors(share=0.1, least_m=0.0, detour_m=0.3, outlier=0.01, outlier_m=3.0)
         return applied.corrected_m, applied.sigma_m, unknown.times(len(ranges))
     return (applied.corrected_m - calibration.errors.location_m, *range_errors(calibration, ranges))
@@ -245,7 +246,7 @@ def _table(
 
 
 def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilter]:
-    """Return the range at which the filter begins, and the filter there."""
+    """Return the index of the range at which the filter starts, and the filter."""
     inertial, first = settings.model == "imu", 0
     if inertial and not len(one.imu_s):
         raise UnanswerableError(f"{one.source}: no inertial readings of {one.body}; choose the model constant-velocity")
@@ -263,12 +264,12 @@ def _begin(one: _Readings, settings: OnboardSettings) -> tuple[int, InertialFilt
     turned = _attitudes(force, settings.headings) if inertial else np.eye(3)[None]
     found = InertialFilter(fix, turned, settings.noise, inertial=inertial, speed_m_s=settings.speed_m_s)
     if inertial:
-        found.pulled(force, 0.7)  # m/s^2: how a body may accelerate while it begins
+        found.update_gravity(force, 0.7)  # m/s^2: how a body may accelerate while it begins
     return first, found
 
 
 def _fix(one: _Readings, rows: Ints, settings: OnboardSettings) -> Fix:
-    """Return where a body is at the last of some ranges (n,), which it may have moved between."""
+    """Return the position of a body at the last of some ranges (n,), during which it may move."""
     span = float(one.time_s[rows[-1]] - one.time_s[rows[0]])
     arm = float(np.linalg.norm(one.arm_m[rows], axis=1).max())
     moves = 0.3 * settings.speed_m_s * span
@@ -279,7 +280,7 @@ def _fix(one: _Readings, rows: Ints, settings: OnboardSettings) -> Fix:
 
 
 def _attitudes(force: Floats, headings: int) -> Floats:
-    """Return attitudes (headings, 3, 3) with the tilt that gravity says, and headings all around."""
+    """Return attitudes (headings, 3, 3) with the tilt from gravity, and headings all around."""
     up = force / np.linalg.norm(force)
     # The world's vertical in the axes of the body, and two axes across it.
     east = np.cross((0.0, 1.0, 0.0), up)
@@ -291,7 +292,7 @@ def _attitudes(force: Floats, headings: int) -> Floats:
 
 
 def _events(one: _Readings, settings: OnboardSettings, begin_s: float) -> Iterator[tuple[float, str, int, Floats]]:
-    """Yield times at which something happens, what, its number, and mean inertial readings since the one before."""
+    """Yield events in order of time: time, kind, number, and the mean inertial readings since the previous event."""
     end_s = float(one.time_s[-1])
     grid = np.arange(begin_s + 1 / settings.rate_hz, end_s, 1 / settings.rate_hz)
     ranges = np.flatnonzero(one.time_s >= begin_s)
@@ -319,14 +320,14 @@ def _means(one: _Readings, edges: Floats) -> Floats:
     at = np.column_stack([np.interp(inside, one.imu_s, column) for column in gathered.T])
     span = np.diff(inside)[:, None]
     now = np.column_stack([np.interp(inside[1:], one.imu_s, column) for column in one.imu.T])
-    # A sum of straight pieces read straight between its own points is off by less than its last piece.
+    # Linear interpolation of the sum has an error below its last term.
     return np.asarray(np.where(span > 1e-9, np.diff(at, axis=0) / np.maximum(span, 1e-9), now))
 
 
 def _still_spans(one: _Readings) -> set[int]:
-    """Return the half seconds in which inertial readings say that nothing moves: no vibration, no turning.
+    """Return the half seconds in which inertial readings show standstill.
 
-    A body at rest scatters less than 4 mrad/s and 5 cm/s^2: rotors vibrate twenty times as much.
+    A body at rest varies by less than 4 mrad/s and 5 cm/s^2: rotors vibrate twenty times as much.
     """
     span = np.floor(one.imu_s / SPAN_S).astype(np.int64)
     edges = np.flatnonzero(np.diff(span, prepend=span[:1] - 1)) if len(span) else np.zeros(0, dtype=np.int64)
@@ -340,15 +341,15 @@ def _still_spans(one: _Readings) -> set[int]:
 
 
 def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
-    """Play ranges, steps and heights in order of time, and return where the likeliest heading was."""
+    """Process ranges, steps and heights in order of time, and return the states of the likeliest heading."""
     first, running = _begin(one, settings)
     now = float(one.time_s[first])
     calm = _still_spans(one) if running.inertial else set()
     states: list[tuple[float, Floats, Floats, Floats]] = []
-    heards: list[tuple[float, float, bool]] = []
+    updates: list[tuple[float, float, bool]] = []
     restarts: list[float] = []
     window: list[tuple[int, float]] = []
-    # How fast it may be counts once a second: velocities of a second ago say nothing of now.
+    # The speed limit counts once a second: velocities are independent after a second.
     slow_every = max(round(settings.rate_hz), 1)
     for time_s, kind, number, inertial in _events(one, settings, now):
         gyro, force = inertial[:3], inertial[3:]
@@ -357,30 +358,32 @@ def _track(one: _Readings, settings: OnboardSettings) -> OnboardTrack:
             now = time_s
         best = int(np.argmax(running.likelihood))
         if kind == "height":
-            running.level(float(one.height_m[number]))
+            running.update_height(float(one.height_m[number]))
         elif kind == "step" and int(now // SPAN_S) in calm and number % 5 == 0:
-            running.rest(gyro, force)
+            running.update_standstill(gyro, force)
         elif kind == "step" and number % slow_every == 0:
-            running.slow(settings.speed_m_s)
+            running.limit_speed(settings.speed_m_s)
         elif kind == "range":
             measured, noise_m = float(one.range_m[number]), float(one.noise_m[number])
-            heard = running.hear(measured, noise_m, one.errors.at(number), one.arm_m[number], one.anchor_m[number])
-            heards.append((now, float(heard.nis[best]), bool(heard.believed[best])))
-            window.append((number, float(np.sqrt(heard.nis[best]))))
-            if _lost(one, window, settings):
+            update = running.update_range(
+                measured, noise_m, one.errors.at(number), one.arm_m[number], one.anchor_m[number]
+            )
+            updates.append((now, float(update.nis[best]), bool(update.believed[best])))
+            window.append((number, float(np.sqrt(update.nis[best]))))
+            if _diverged(one, window, settings):
                 running.restart(_fix(one, np.array([row for row, _ in window]), settings), settings.speed_m_s)
                 restarts.append(now)
                 window = []
         best = int(np.argmax(running.likelihood))
         covariance = running.covariance[best][P, P]
         states.append((now, running.place[best].copy(), running.attitude[best].copy(), covariance.copy()))
-    return _told(one, settings, states, heards, restarts)
+    return _told(one, settings, states, updates, restarts)
 
 
-def _lost(one: _Readings, window: list[tuple[int, float]], settings: OnboardSettings) -> bool:
-    """Return whether half of the latest ranges are off by more than three standard deviations; forget those before.
+def _diverged(one: _Readings, window: list[tuple[int, float]], settings: OnboardSettings) -> bool:
+    """Return whether half of the latest ranges are off by more than three standard deviations; drop older ones.
 
-    The window reaches back for `reopen_s`, or for as many ranges as a fix takes.
+    The window has `reopen_s` seconds, or as many ranges as a fix needs.
     """
     now = float(one.time_s[window[-1][0]])
     while len(window) > MIN_RANGES_PER_FIX and now - one.time_s[window[1][0]] > settings.reopen_s:
@@ -396,7 +399,7 @@ def _told(
     one: _Readings,
     settings: OnboardSettings,
     states: list[tuple[float, Floats, Floats, Floats]],
-    heards: list[tuple[float, float, bool]],
+    updates: list[tuple[float, float, bool]],
     restarts: list[float],
 ) -> OnboardTrack:
     """Return a track of states (time, place, attitude, covariance) and ranges (time, nis, whether believed)."""
@@ -405,7 +408,7 @@ def _told(
         return one.began_ns + np.rint(np.array(seconds) * 1e9).astype(np.int64)
 
     times, places, attitudes, covariances = zip(*states, strict=True)
-    heard_s, nis, believed = zip(*heards, strict=True)
+    heard_s, nis, believed = zip(*updates, strict=True)
     time_ns, place, covariance = nanoseconds(times), np.array(places), np.array(covariances)
     truth, turned = np.full_like(place, np.nan), np.full((len(place), 4), np.nan)
     if one.truth is not None:

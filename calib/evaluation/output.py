@@ -1,4 +1,4 @@
-"""A localization as text, as JSON, and as trajectories in TUM files."""
+"""Localizations as text, as JSON, and as trajectories in TUM files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uwblink.output import write_files
 
 
 def localization_text(found: list[Localization], summary: Summary, settings: Settings) -> str:
-    """Return the table that `calib localize` prints, a row a body, and what it rests on."""
+    """Return the table that `calib localize` prints, a row per body, with the settings below."""
     filters, width = list(summary.rmse_m), 12
     first = max(30, *(len(one.source) + len(one.body) + 2 for one in found))
     lines = [f"{'RMSE of the position (m)':{first}s}" + "".join(f"{name:>{width}s}" for name in filters)]
@@ -79,7 +79,7 @@ def write_tum(found: list[Localization], folder: Path, *, force: bool = False) -
 
 
 def _names(texts: Iterable[str]) -> list[str]:
-    """Return names of files for texts: those of recordings of one name in two folders are numbered."""
+    """Return file names; equal names of recordings in different folders are numbered."""
     found: list[str] = []
     for text in texts:
         plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in text)
@@ -89,7 +89,7 @@ def _names(texts: Iterable[str]) -> list[str]:
 
 
 def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
-    """Return a line a body: what it was localized by, and how far off it was where that is known."""
+    """Return a line per body: its RMSE where truth is known."""
     lines = [f"{'by ranges to fixed anchors':33s}{'RMSE (m)':>10s}{'median':>9s}{'95 %':>9s}{'own std':>9s}  restarts"]
     for one in found:
         off = np.linalg.norm(one.estimate_m - one.truth_m, axis=1)
@@ -108,7 +108,7 @@ def onboard_text(found: list[OnboardTrack], settings: OnboardSettings) -> str:
 
 
 def onboard_json(found: list[OnboardTrack]) -> list[dict[str, Any]]:
-    """Return a table a body for JSON; what is not known is None."""
+    """Return a table per body for JSON; unknown values are None."""
     return [
         {
             "recording": one.source,

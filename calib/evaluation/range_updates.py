@@ -1,9 +1,8 @@
-"""What a range tells a filter, for many filters at once: by a gate, or by what its error may be made of.
+"""Updates of filters by a range, for many filters at once: by a gate, or by a mixture of errors.
 
-Filters differ in what they take for the noise of a range. All of them update along the line of sight; what differs is
-what is expected of the noise in an innovation, its mean and variance, from which mean and covariance of the state
-follow exactly (Gaussian noise and state, moments of the posterior). A filter that is lost begins anew where ranges
-alone say (`multilaterate`).
+Filters differ in the error of a range that they assume. All update along the line of sight: mean and covariance of the
+state follow from the mean and variance of the noise in an innovation (moments of the posterior for Gaussian noise and
+state). A diverged filter restarts from ranges alone (`multilaterate`).
 """
 
 from __future__ import annotations
@@ -24,10 +23,11 @@ from uwblink.arrays import Bools, Floats
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeErrors:
-    """What the errors of a range are made of: reflected with `share`, by a least detour and an exponential one.
+    """The error model of a range: reflected with probability `share`, by a least detour and an exponential one.
 
-    Metres and shares of 1. `outlier` are of any size, about `outlier_m`. Of several ranges, `share` and `detour_m` are
-    columns (n,). `detour_m` is the mean of both kinds of exponential detour, `long` says how they divide.
+    Metres and shares of 1. Outliers have the share `outlier` and a size of about `outlier_m`. Of several ranges,
+    `share` and `detour_m` are columns (n,). `detour_m` is the mean of both kinds of exponential detour, `long` their
+    proportions.
     """
 
     share: Floats | float
@@ -38,19 +38,19 @@ class RangeErrors:
     long: LongDetours = ONE_KIND
 
     def times(self, count: int) -> RangeErrors:
-        """Return those of so many ranges, all alike."""
+        """Return the model of so many equal ranges."""
         return replace(self, share=np.full(count, self.share), detour_m=np.full(count, self.detour_m))
 
     def at(self, rows: Any) -> RangeErrors:
-        """Return those of some of several ranges, or of one by its number."""
+        """Return the model of some of several ranges, or of one."""
         return replace(self, share=np.asarray(self.share)[rows], detour_m=np.asarray(self.detour_m)[rows])
 
 
 def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, RangeErrors]:
-    """Return the noise (n,) of corrected ranges, and what their errors are made of besides.
+    """Return the noise (n,) of corrected ranges, and their error model.
 
-    Outliers are at least a thousandth, of about 3 m: a filter reckons with what a calibration has not seen. Raises
-    `UnanswerableError` for a calibration that does not say.
+    Outliers have a share of a thousandth at least, of about 3 m, because a filter meets errors that the calibration did
+    not. Raises `UnanswerableError` for a calibration without an error model.
     """
     model = calibration.errors
     if model is None:
@@ -69,10 +69,10 @@ def range_errors(calibration: Calibration, ranges: Ranges) -> tuple[Floats, Rang
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
-    """What filters make of a range: mean and variance of the noise in an innovation, and whether they believe it.
+class RangeUpdate:
+    """An update by a range: mean and variance of the noise in the innovation, and whether the range is accepted.
 
-    `log_density` is how likely the innovation was, in 1/m, `nis` its square over its variance as plain noise.
+    `log_density` is that of the innovation, in 1/m; `nis` is its square over its variance with plain noise.
     """
 
     noise_m: Floats
@@ -82,10 +82,10 @@ class Heard:
     nis: Floats
 
 
-def gated(innovation_m: Floats, variance_m2: Floats, gate: float) -> Heard:
-    """Take an innovation for noise where its square over its variance is below the gate, else learn nothing."""
+def gated_update(innovation_m: Floats, variance_m2: Floats, gate: float) -> RangeUpdate:
+    """Accept an innovation if its square over its variance is below the gate; otherwise the state does not change."""
     believed = innovation_m**2 < gate * variance_m2
-    return Heard(
+    return RangeUpdate(
         noise_m=np.where(believed, innovation_m, 0.0),
         variance_m2=np.where(believed, 0.0, variance_m2),
         believed=believed,
@@ -94,11 +94,11 @@ def gated(innovation_m: Floats, variance_m2: Floats, gate: float) -> Heard:
     )
 
 
-def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> Heard:
-    """Weigh noise, reflection and outlier by how likely each made an innovation of such noise.
+def mixture_update(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> RangeUpdate:
+    """Weigh direct, reflected and outlying ranges by the likelihood of the innovation.
 
-    The noise in a reflected range is normal, cut off above (`calib.range_errors.densities`, docs/theory.md). An
-    outlier says nothing.
+    The noise in a reflected range is a normal distribution, truncated above (`calib.range_errors.densities`,
+    docs/theory.md). An outlier has no information.
     """
     found = densities(innovation_m, np.sqrt(variance_m2), errors.least_m, errors.detour_m, errors.long)
     inside = 1 - errors.outlier
@@ -111,7 +111,7 @@ def weighed(innovation_m: Floats, variance_m2: Floats, errors: RangeErrors) -> H
     of_tail, spread = found.noise_m(), variance_m2 * found.noise_var()
     mean = core * innovation_m + tail * of_tail
     square = core * innovation_m**2 + tail * (of_tail**2 + spread) + wild * variance_m2
-    return Heard(
+    return RangeUpdate(
         noise_m=mean,
         variance_m2=np.maximum(square - mean**2, 0.0),
         believed=wild < 0.5,
@@ -129,11 +129,11 @@ class Fix:
 
 
 def multilaterate(range_m: Floats, anchor_m: Floats, spread_m: float, height_m: float | None = None) -> Fix:
-    """Return the position that ranges (n,) to anchors (n, 3) agree on, by a Cauchy loss, from nine starts.
+    """Return the position from ranges (n,) to anchors (n, 3), by a Cauchy loss from nine starts.
 
-    Errors beyond 15 cm count for less: reflections are longer. `spread_m` is by how much each range may be off besides
-    its noise: by its lever arm, or because the body moves. A `height_m` above the world's zero counts as a measurement
-    with a standard deviation of 30 cm.
+    Errors beyond 15 cm count less: reflections are longer. `spread_m` is a further error of each range: its lever arm,
+    or motion of the body. A `height_m` above the world's zero counts as a measurement with a standard deviation of 30
+    cm.
     """
     scale = float(np.hypot(0.15, spread_m))
 

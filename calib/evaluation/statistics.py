@@ -1,4 +1,4 @@
-"""How well a calibration does on ranges with known truth: errors by stage of correction, of all ranges and by pair."""
+"""Errors of a calibration on ranges with known truth: by stage of correction, for all ranges and by pair."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from uwblink.arrays import Bools, Floats
 from uwblink.ticks import SPEED_OF_LIGHT
 
 CORRECTION_STAGES: Final = {"raw": "raw_m", "delays": "delay_corrected_m", "full": "corrected_m"}
-"""What each stage of correction is called in `CorrectedRanges`."""
+"""Names of the stages of correction in `CorrectedRanges`."""
 
 NOMINAL: Final = {"50": 0.6744897501960817, "68": 1.0, "90": 1.6448536269514722, "95": 1.959963984540054,
                   "99": 2.5758293035489004}  # fmt: skip
-"""Bounds of a standard normal distribution that hold so many per cent."""
+"""Two-sided bounds of a standard normal distribution, by per cent."""
 
 CHI_SQUARE_95: Final = 3.841458820694124
 """95 % quantile of the chi-square distribution with one degree of freedom."""
@@ -80,10 +80,10 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class PlantedComparison:
-    """A calibration beside what a simulation planted, after the common constant has been moved to one side.
+    """The difference between a calibration and what a simulation planted, less the common constant.
 
     `delay_error_ns` maps tags to fitted less planted delays, `curve_rms_m` is the rms of the bias curves' difference
-    over the ranges inside the fitted power, `correction_rms_m` that of the whole correction of each range; NaN where no
+    over the ranges inside the fitted power, `correction_rms_m` that of the whole correction of each range; NaN if no
     curve was planted.
     """
 
@@ -95,10 +95,10 @@ class PlantedComparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorSplit:
-    """Standard deviations of corrected errors in metres: within a pair and session, and of what is constant there.
+    """Standard deviations of corrected errors in metres: within a pair and session, and of the constants of these.
 
-    `between_pairs_m` is what pairs differ by, `between_sessions_m` by what a pair differs from session to session (NaN
-    of one session, as for pairs of one pair).
+    `between_pairs_m` is that between pairs, `between_sessions_m` that of a pair between sessions (NaN with one session
+    or one pair).
     """
 
     within_m: float
@@ -109,9 +109,9 @@ class ErrorSplit:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Evaluation:
-    """The outcome for all ranges and for each pair, named "smaller-larger".
+    """Errors of all ranges and of each pair, named "smaller-larger".
 
-    `seen` names the recordings among those judged that the calibration was fitted to: errors there are too small.
+    `seen` names the recordings that the calibration was fitted to: their errors are too small.
     """
 
     overall: ErrorStatistics
@@ -158,7 +158,7 @@ def _cells(group: ErrorStatistics) -> list[str]:
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no NaN: a figure of nothing is null."""
+    """Return a value for JSON, with None in place of NaN."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
     return None if isinstance(value, float) and value != value else value
@@ -185,7 +185,7 @@ def evaluate(data: Data | Iterable[Data], calibration: Calibration) -> Evaluatio
         _group(ranges, applied, everything, inside),
         {name: _group(ranges, applied, rows, inside) for name, rows in pair_rows(ranges).items()},
         split_error(ranges, applied.corrected_m - ranges.truth_m),
-        beside_planted(ranges, applied, calibration),
+        compare_with_planted(ranges, applied, calibration),
         _seen(ranges, calibration),
     )
 
@@ -196,7 +196,9 @@ def _seen(ranges: Ranges, calibration: Calibration) -> tuple[str, ...]:
     return tuple(name for name, found in ranges.recordings if isinstance(known, list) and found in known)
 
 
-def beside_planted(ranges: Ranges, applied: CorrectedRanges, calibration: Calibration) -> PlantedComparison | None:
+def compare_with_planted(
+    ranges: Ranges, applied: CorrectedRanges, calibration: Calibration
+) -> PlantedComparison | None:
     """Compare a calibration with what a simulation planted, where the ranges carry it."""
     planted = {int(tag): float(delay) for tag, delay in (ranges.planted or {}).get("delays_ns", {}).items()}
     difference = {tag: calibration.delays_ns[tag] - d for tag, d in planted.items() if tag in calibration.delays_ns}

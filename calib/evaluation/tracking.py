@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.calibration.lasting import LastingErrors
 from calib.data.sources import Flight
 from calib.errors import BadInputError
-from calib.evaluation.range_updates import Heard, RangeErrors, gated, multilaterate, weighed
+from calib.evaluation.range_updates import RangeErrors, RangeUpdate, gated_update, mixture_update, multilaterate
 from uwblink.arrays import Bools, Floats, Ints
 from uwblink.recording.distances import antennas_m, bodies_m
 from uwblink.recording.schema import Poses
@@ -60,7 +60,7 @@ class Settings:
     seeds: int = 3
 
     def __post_init__(self) -> None:
-        """Refuse what no filter can run with; raises `BadInputError`."""
+        """Check the settings; raises `BadInputError`."""
         for name in ("velocity_std_mps", "velocity_rate_hz", "initial_std_m", "gate", "reopen_s"):
             if not 0 < getattr(self, name) < np.inf:
                 raise BadInputError(f"found {getattr(self, name)!r:.40}, expected a number above 0", parameter=name)
@@ -110,19 +110,19 @@ class Problem:
     pair: Ints
 
     def first(self, count: int) -> Problem:
-        """Return its first ranges."""
+        """Return the first ranges."""
         columns = ("rows", "time_ns", "attitude", "place", "arm", "other", "pair")
         return replace(self, **{name: getattr(self, name)[:count] for name in columns})
 
     def velocity_spread(self, settings: Settings) -> Floats:
-        """Return by how much velocity's noise widens each axis between ranges (n,), in square metres."""
+        """Return the variance that velocity noise adds per axis between ranges (n,), in square metres."""
         dt = np.diff(self.time_ns, prepend=self.time_ns[:1]) * 1e-9
         return np.asarray(settings.velocity_std_mps**2 / settings.velocity_rate_hz * np.maximum(dt, 0))
 
     def noisy(self, settings: Settings, seed: int) -> tuple[Floats, Floats]:
         """Draw a start (3,) and displacements between ranges (n, 3), both with noise.
 
-        Each body and flight has noise of its own, the same for every filter.
+        The noise depends on body and flight, and is the same for every filter.
         """
         own = [zlib.crc32(part) for part in (self.time_ns.tobytes(), self.body.encode())]
         rng = np.random.default_rng([seed, *own])
@@ -207,24 +207,24 @@ def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[
         return []
     count, body = max(len(run.problem.rows) for run in runs), np.repeat(np.arange(len(runs)), settings.seeds)
 
-    def beside(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        """Return arrays (some, ...) side by side (count, parts, ...), each with its last row where it has none."""
+    def stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Return arrays (some, ...) stacked to (count, parts, ...); shorter ones repeat their last row."""
         return np.stack([part[np.minimum(np.arange(count), len(part) - 1)] for part in parts], axis=1)
 
-    measured = beside([np.array([one.measured_m for one in run.ranges.values()]).T for run in runs])
-    variance = beside([np.array([one.std_m for one in run.ranges.values()]).T for run in runs]) ** 2
+    measured = stacked([np.array([one.measured_m for one in run.ranges.values()]).T for run in runs])
+    variance = stacked([np.array([one.std_m for one in run.ranges.values()]).T for run in runs]) ** 2
     seeds = range(settings.seed, settings.seed + settings.seeds)
     noises = [run.problem.noisy(settings, seed) for run in runs for seed in seeds]
-    moves = beside([np.vstack([own, np.zeros(3)]) for _, own in noises])
-    spread = beside([np.append(run.problem.velocity_spread(settings), 0.0) for run in runs])
-    place, arm, other = (beside([getattr(run.problem, name) for run in runs]) for name in ("place", "arm", "other"))
-    errors = [_errors_beside([run.ranges[name].errors for run in runs], count) for name in runs[0].ranges]
+    moves = stacked([np.vstack([own, np.zeros(3)]) for _, own in noises])
+    spread = stacked([np.append(run.problem.velocity_spread(settings), 0.0) for run in runs])
+    place, arm, other = (stacked([getattr(run.problem, name) for run in runs]) for name in ("place", "arm", "other"))
+    errors = [_stacked_errors([run.ranges[name].errors for run in runs], count) for name in runs[0].ranges]
 
-    sigma = beside([np.array([_shared_sigma(one) for one in run.ranges.values()]).T for run in runs])
+    sigma = stacked([np.array([_shared_sigma(one) for one in run.ranges.values()]).T for run in runs])
     known = [one.lasting for one in runs[0].ranges.values()]
     shared = np.array([one.lasting_variance if one else 0.0 for one in known])
-    kept = np.exp(-beside([np.array([_steps(run, one) for one in known]).T for run in runs]))
-    pair = 3 + beside([run.problem.pair for run in runs])
+    kept = np.exp(-stacked([np.array([_steps(run, one) for one in known]).T for run in runs]))
+    pair = 3 + stacked([run.problem.pair for run in runs])
 
     shape, size = (len(errors), len(body)), int(pair.max()) + 1
     every, of_filter = np.arange(len(body)), np.arange(len(errors))[:, None]
@@ -252,13 +252,13 @@ def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[
         innovation = measured[k].T[:, body] - distance - h[own] * x[own]
         s = np.einsum("fsi,fsi->fs", h, ph) + variance[k].T[:, body]
         nis[k] = innovation**2 / s
-        heard = _heard(innovation, s, [one and one.at((k, body)) for one in errors], settings.gate)
+        update = _range_update(innovation, s, [one and one.at((k, body)) for one in errors], settings.gate)
         gain = ph / s[..., None]
-        x += gain * heard.noise_m[..., None]
-        p += gain[..., None] * (gain * (heard.variance_m2 - s)[..., None])[..., None, :]
-        for f, one, first in _lost(nis[: k + 1], runs, body, settings, began, settled) if k % 8 == 0 else ():
+        x += gain * update.noise_m[..., None]
+        p += gain[..., None] * (gain * (update.variance_m2 - s)[..., None])[..., None, :]
+        for f, one, first in _diverged(nis[: k + 1], runs, body, settings, began, settled) if k % 8 == 0 else ():
             problem, rows = runs[body[one]].problem, slice(first, k + 1)
-            # What the body moved since each range is known from its velocity, and counted to the anchors.
+            # The motion of the body since each range, from its velocity, is added to the anchors.
             since = np.vstack([moves[first + 1 : k + 1, one][::-1].cumsum(axis=0)[::-1], np.zeros(3)])
             anchors = problem.other[rows] - problem.arm[rows] + since
             fix = multilaterate(measured[rows, body[one], f], anchors, 0.0)
@@ -267,7 +267,7 @@ def run_filters(runs: Sequence[Run], settings: Settings) -> list[dict[str, list[
             p[f, one, :3, :3] = fix.covariance_m2
             began[f, one], settled[f, one] = k + 1, False
         wrong, of_place = x[..., :3] - place[k][body], p[..., :3, :3]
-        estimate[k], accepted[k] = x[..., :3], heard.believed
+        estimate[k], accepted[k] = x[..., :3], update.believed
         std[k] = np.sqrt(np.trace(of_place, axis1=-2, axis2=-1))
         nees[k] = np.einsum("fsi,fsi->fs", wrong, np.linalg.solve(of_place, wrong[..., None])[..., 0])
 
@@ -304,7 +304,7 @@ def _steps(run: Run, lasting: LastingErrors | None) -> Floats:
     return np.asarray(time_s / (lasting.time_s if lasting else np.inf))
 
 
-def _errors_beside(parts: Sequence[RangeErrors | None], count: int) -> RangeErrors | None:
+def _stacked_errors(parts: Sequence[RangeErrors | None], count: int) -> RangeErrors | None:
     """Return errors of several bodies side by side, `share` and `detour_m` (count, bodies)."""
     known = [part for part in parts if part is not None]
     if not known:
@@ -315,17 +315,19 @@ def _errors_beside(parts: Sequence[RangeErrors | None], count: int) -> RangeErro
     return replace(known[0], share=share, detour_m=detour)
 
 
-def _heard(innovation: Floats, variance: Floats, errors: Sequence[RangeErrors | None], gate: float) -> Heard:
+def _range_update(
+    innovation: Floats, variance: Floats, errors: Sequence[RangeErrors | None], gate: float
+) -> RangeUpdate:
     """Return what all filters make of a range: a gate for most, the whole of its error for those who reckon with it."""
-    heard = gated(innovation, variance, gate)
+    update = gated_update(innovation, variance, gate)
     for f, known in enumerate(errors):
         if known is not None:
-            own = weighed(innovation[f], variance[f], known)
-            heard.noise_m[f], heard.variance_m2[f], heard.believed[f] = own.noise_m, own.variance_m2, own.believed
-    return heard
+            own = mixture_update(innovation[f], variance[f], known)
+            update.noise_m[f], update.variance_m2[f], update.believed[f] = own.noise_m, own.variance_m2, own.believed
+    return update
 
 
-def _lost(
+def _diverged(
     nis: Floats, runs: Sequence[Run], body: Ints, settings: Settings, began: Ints, settled: Bools
 ) -> Iterator[tuple[int, int, int]]:
     """Yield filters (filter, column) that cannot explain half of the latest ranges, and the first of these ranges.

@@ -1,4 +1,4 @@
-"""A whole campaign: fit, examine, localize and judge, all that a report tells of."""
+"""A campaign: fit, examine, localize and judge, for a report."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ HELD_OUT_SHARE: Final = 0.3
 """Share of the recordings that judges a report without tests: three of the tenths of `FitSettings.fold`."""
 
 SCALES: Final = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
-"""Scales of the loss, over the chosen one, for which a campaign is fitted again: a factor of 16 in all."""
+"""Factors on the scale of the loss, for which a campaign is fitted again."""
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Campaign(Results):
-    """Everything that a report tells of: what was fitted from which recordings, and how it does on which tests."""
+    """The results of a campaign: the fit, its recordings, and its errors on tests."""
 
     fit: FitResult
 
     def __repr__(self) -> str:
-        """Return what it comes to: the fit, how many tests there are, and what the doctor found."""
+        """Return the fit, the recordings that judge it, and the findings."""
         found = [f"{name}: {finding.fault}" for name, finding in self.findings]
         return "\n".join([repr(self.fit), f"judged on {self.judged.source}", *found])
 
@@ -152,7 +152,7 @@ def run_campaign(
 
 
 def _fit_and_hold_out(ranges: Ranges, settings: FitSettings) -> FitResult:
-    """Fit, and fit a second time without a part to judge by, unless nobody asked for it and the ranges are too few."""
+    """Fit with a part held out to judge by; without it if ranges are too few and `hold_out` was not asked for."""
     if settings.hold_out:
         return fit(ranges, settings)
     try:
@@ -169,7 +169,7 @@ def _findings(data: Data) -> list[tuple[str, Finding]]:
 
 
 def _tracks(data: Data, calibration: Calibration) -> list[Localization]:
-    """Localize in a recording; a report does without those that have no body to localize."""
+    """Localize in a recording; nothing if no body can be localized."""
     try:
         return [] if isinstance(data, Ranges) else localize(data, calibration)
     except UnanswerableError:

@@ -1,4 +1,4 @@
-"""The sections of a report on errors: over power, before and after, what they are made of, in positions, over time."""
+"""Sections of a report on errors: over power, before and after correction, error model, localization, over time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from uwblink.pages.figures import Draw
 
 
 def curves(results: Results) -> list[Block]:
-    """Return the curves over power: with bands and data, or without any recording as a table."""
+    """Return the curves over power with bands and data; without a recording as a table."""
     calibration = results.calibration
     if not results.recordings:
         power, *curves = curve_rows(calibration)
@@ -51,13 +51,13 @@ def curves(results: Results) -> list[Block]:
 
 
 def _over_power(known: tuple[Any, Any, Any], which: Any) -> Draw:
-    """Return what draws a curve at a width, from errors that are binned once for all widths."""
+    """Return a function that draws a curve at a width; errors are binned once for all widths."""
     found = cache(lambda: figures.over_power(*known, which))
     return lambda width: figures.alone(lambda axes: figures.curve_over_power(*known, which, axes, found()), width)
 
 
 def before_after(results: Results) -> list[Block]:
-    """Return errors by pair and stage, how well sigma covers them, and their figures."""
+    """Return errors by pair and stage, their coverage by sigma, and figures."""
     if not results.recordings:
         return []
     evaluation, overall = results.evaluation, results.evaluation.overall
@@ -124,7 +124,7 @@ def _error_cells(group: ErrorStatistics) -> list[str]:
 
 
 def outliers(results: Results) -> list[Block]:
-    """Say what the calibrated errors are made of, by pair."""
+    """Return the error model of calibrated ranges by pair."""
     if not results.recordings:
         return []
     ranges, applied, rows = results.judged, results.corrected, []
@@ -163,7 +163,7 @@ def outliers(results: Results) -> list[Block]:
 
 
 def localization(results: Results) -> list[Block]:
-    """Return the RMSE by body and filter beside the paper's own, and figures."""
+    """Return the RMSE by body and filter with the paper's values, and figures."""
     found, drawn = results.tracks, 12
     if not found:
         return []
@@ -210,7 +210,7 @@ def localization(results: Results) -> list[Block]:
 
 
 def _filters(found: list[Localization]) -> str:
-    """Say how the filters were set up, and how far the paper's own figures may be compared."""
+    """Return the settings of the filters in words, and the limits of a comparison with the paper."""
     chosen, fixed = Settings(), found[0].fixed
     own = "these flights are simulated" if all(one.simulated for one in found) else "these are other flights"
     paper = ", ".join(f"{value:.3f}" for value in PAPER_RMSE_M.values())
@@ -226,12 +226,12 @@ def _filters(found: list[Localization]) -> str:
 
 
 def track_name(source: str, body: str) -> str:
-    """Return what the figure of a body in a recording is called."""
+    """Return the name of the figure of a body in a recording."""
     return "track-" + "".join(c if c.isalnum() else "-" for c in f"{source.removesuffix('.uwb')}-{body}")
 
 
 def over_time(results: Results) -> list[Block]:
-    """Return a figure a recording of the calibrated errors over time."""
+    """Return a figure of the calibrated errors over time for each recording."""
     blocks: list[Block] = [Heading("Over time")] if results.recordings else []
     for k, recording in enumerate(results.recordings):
         pairs, most = len(pair_rows(recording)), figures.MOST_PAIRS

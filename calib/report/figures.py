@@ -32,7 +32,7 @@ FILTER_LINES: Final[dict[str, tuple[str, Any, str]]] = {
 """Colour, dashes and hatches of each filter."""
 
 SAMPLES: Final = 700
-"""Instants of a track that are drawn: more than a page's width has points."""
+"""Points of a track that are drawn: more than the width of a page shows."""
 
 
 def rmse_bars(width_in: float, found: list[Localization]) -> Figure:
@@ -81,7 +81,7 @@ def track(width_in: float, one: Localization) -> Figure:
     panels["height"].plot(time, truth[:, 2], lw=0.9, color=INK)
     panels["error"].plot([], [], color=INK, lw=0.9, label="true")
     panels["error"].plot(time, 3 * last.std_m[every], color=MUTED, lw=0.8, ls="--", label="3 σ, by the filter itself")
-    # Errors are drawn up to beyond all but the few at the start or of a filter gone astray.
+    # The axis leaves out the few errors at the start and those of a diverged filter.
     usual = [np.quantile(np.linalg.norm(t.estimate_m - t.truth_m, axis=1), 0.995) for t in one.tracks.values()]
     middle, sigmas = float(np.median(usual)), float(np.quantile(3 * last.std_m, 0.9))
     panels["error"].set_ylim(0, 1.15 * max(1.5 * middle, *(float(u) for u in usual if u < 5 * middle), sigmas))
@@ -94,7 +94,7 @@ def track(width_in: float, one: Localization) -> Figure:
 
 
 def onboard(width_in: float, one: OnboardTrack) -> Figure:
-    """Draw the path from above and the height over time, beside the truth where poses say it."""
+    """Draw the path from above and the height over time, with the truth if poses give it."""
     figure, (path, height) = sheet(width_in, 2, height_in=2.8)
     every = slice(None, None, max(1, len(one.time_ns) // SAMPLES))
     time = (one.time_ns - one.time_ns[0])[every] * 1e-9
@@ -113,7 +113,7 @@ def onboard(width_in: float, one: OnboardTrack) -> Figure:
 
 
 def arrangement(width_in: float, plan: Plan, number: int) -> Figure:
-    """Draw where boards stand in an arrangement, with tapes, and intervals when it has been made.
+    """Draw the boards of an arrangement, with tapes and the intervals after it.
 
     Boards are seen from above, and in space from the side as well.
     """
@@ -161,7 +161,7 @@ def _intervals(
     before: Mapping[int, float],
     names: tuple[str, str] = ("after this arrangement", "before it"),
 ) -> None:
-    """Draw half intervals by tag as bars, others as outlines about them; what is not determined is open."""
+    """Draw half intervals by tag as bars, and others as outlines; undetermined ones are marked as open."""
     tags = list(after)
     rows = np.arange(len(tags))
     top = max((value for value in [*after.values(), *before.values()] if math.isfinite(value)), default=1.0)
@@ -183,7 +183,7 @@ def _intervals(
 
 
 def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
-    """Draw the mean interval as planned, and with each thing more."""
+    """Draw the mean interval of the plan, and with each further measurement."""
     letters = 26 if width_in < NARROW_IN else 60
     texts = ["as planned", *("+ " + textwrap.shorten(best.what, 3 * letters) for best in next_best)]
     texts = [textwrap.fill(text, letters) for text in texts]
@@ -203,7 +203,7 @@ def more(width_in: float, next_best: tuple[NextBest, ...]) -> Figure:
 
 
 def planned_delays(width_in: float, plan: FlightPlan) -> Figure:
-    """Draw the interval of each delay; of those that stay open, how far they would be known."""
+    """Draw the interval of each delay, and the prior interval of undetermined ones."""
     figure, (axes,) = sheet(width_in, height_in=2.2)
     left_open = {tag: math.nan if math.isfinite(half) else plan.open_ns[tag] for tag, half in plan.half_ns.items()}
     _intervals(axes, plan.half_ns, left_open, ("determined", "stays open"))
@@ -212,7 +212,7 @@ def planned_delays(width_in: float, plan: FlightPlan) -> Figure:
 
 
 def flight(width_in: float, plan: FlightPlan) -> Figure:
-    """Draw where bodies fly, from above and in height over time; thick while their positions are known."""
+    """Draw the paths of bodies from above and in height over time; thick while their positions are known."""
     figure, (above, height) = sheet(width_in, 2, height_in=2.9)
     time = np.linspace(0, plan.seconds, len(plan.path_m))
     early = time <= (plan.seconds if plan.settings.poses_until_s is None else plan.settings.poses_until_s)

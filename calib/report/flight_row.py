@@ -1,4 +1,4 @@
-"""A flight, fitted and judged at once: what a sweep of calibrations asks of every run."""
+"""A flight, fitted and evaluated: the row of a sweep over calibrations."""
 
 from __future__ import annotations
 

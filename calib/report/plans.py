@@ -1,4 +1,4 @@
-"""A plan as a page, as PDF and as figures: steps, a picture of each arrangement, intervals, and what brings more."""
+"""Plans as a page, as PDF and as figures: steps, arrangements, intervals, and the gain of further measurements."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _promise(plan: Plan | FlightPlan) -> Iterator[Block]:
 
 
 def _known(plan: Plan | FlightPlan) -> str:
-    """Return the beginning of a sentence: how well delays will be known on average."""
+    """Return the beginning of a sentence on the mean precision of delays."""
     known = [half for half in plan.half_ns.values() if math.isfinite(half)]
     if not known:
         return "No delay will be determined"

@@ -1,4 +1,4 @@
-"""What a report tells of, and where it comes from."""
+"""The content of a report, and its origin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from calib.calibration.model import Calibration
 from calib.calibration.parts import CorrectedRanges
 from calib.data.ranges import Ranges, concatenate
 from calib.data.sources import Data
-from calib.evaluation.statistics import Evaluation, PlantedComparison, beside_planted, evaluate
+from calib.evaluation.statistics import Evaluation, PlantedComparison, compare_with_planted, evaluate
 
 if TYPE_CHECKING:
     from calib.evaluation.localization import Localization
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """When (ISO 8601, UTC), how, with which version, and the SHA-256 of each file that was read, by its name."""
+    """Time (ISO 8601, UTC), command, version, and the SHA-256 of each input file by name."""
 
     made: str = ""
     command: str = ""
@@ -34,7 +34,7 @@ class Origin:
     files: dict[str, str] = field(default_factory=dict)
 
     def sentence(self) -> str:
-        """Return it in a line, for the head of a report."""
+        """Return the origin in a line, for the head of a report."""
         parts = [f"Made {self.made}" if self.made else "", f"by uwbcal {self.version}" if self.version else ""]
         how = f": {self.command}" if self.command else ""
         return " ".join(filter(None, parts)) + how
@@ -82,12 +82,12 @@ class Results:
 
     @property
     def warnings(self) -> list[str]:
-        """The warnings of the fit, which its calibration keeps."""
+        """The warnings of the fit, from its calibration."""
         return list(map(str, self.calibration.provenance.get("warnings", [])))
 
     @property
     def recordings(self) -> list[Ranges]:
-        """What the calibration is judged on: the tests, or the training where there are none."""
+        """The recordings that judge the calibration: the tests, or the training without tests."""
         return self.tests or self.training
 
     @property
@@ -102,7 +102,7 @@ class Results:
 
     @cached_property
     def trained(self) -> Ranges:
-        """The ranges that curves are drawn over: those of the training, or of the tests where it is not known."""
+        """The ranges that curves are drawn over: those of the training, or of the tests if it is unknown."""
         return concatenate(self.training or self.tests)
 
     @cached_property
@@ -117,14 +117,14 @@ class Results:
 
     @cached_property
     def evaluation(self) -> Evaluation:
-        """How the calibration does on the judged ranges."""
+        """The evaluation of the judged ranges."""
         found = self.evaluated or evaluate(self.judged, self.judged_calibration)
-        # What was held out is of a recording that both fits know by its name, but was not fitted.
+        # The held-out part has the name of a fitted recording, but was not fitted.
         return found if self.part is None else replace(found, seen=())
 
     @cached_property
     def planted(self) -> PlantedComparison | None:
-        """The calibration beside what a simulation planted."""
+        """The comparison of the calibration with what a simulation planted."""
         if self.part is None:
             return self.evaluation.planted
-        return beside_planted(self.trained, self.calibration.apply(self.trained), self.calibration)
+        return compare_with_planted(self.trained, self.calibration.apply(self.trained), self.calibration)

@@ -1,7 +1,6 @@
 """The sections of a report: a table of functions from results to blocks.
 
-A section returns its blocks, heading included, and nothing where there is nothing to tell. One more section is one
-function and one row of `SECTIONS`.
+A section returns its blocks, heading included, or nothing. A new section is one function and one row of `SECTIONS`.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from calib.surveys.result import SurveyedArrangement
 from uwblink.pages.blocks import Block, Document, Heading, Listing, Picture, Table, Text
 
 Section = Callable[[Results], list[Block]]
-"""Returns what stands in a section, its heading included; nothing where there is nothing to tell."""
+"""Returns the blocks of a section, heading included; nothing if it does not apply."""
 
 
 def _verdict(results: Results) -> list[Block]:
@@ -43,7 +42,7 @@ def _verdict(results: Results) -> list[Block]:
 
 
 def _summary(results: Results) -> str:
-    """Return what the whole comes to, in a few sentences."""
+    """Return the summary, in a few sentences."""
     group, where = results.evaluation.overall, ""
     if results.fit is not None:
         where = " of the tests" if results.tests else " of the recordings it was fitted from"
@@ -107,7 +106,7 @@ def _recordings(results: Results) -> list[Block]:
 
 
 def _foundations(results: Results) -> list[Block]:
-    """Return what stands in the place of known distances; nothing where distances were known."""
+    """Return what replaces known distances; nothing where distances were known."""
     made = results.calibration.provenance
     if made.get("recipe") == "survey":
         return [Heading("What it rests on"), *_of_survey(made)]
@@ -193,7 +192,7 @@ def _of_survey(made: Any) -> list[Block]:
 
 
 def _determined(results: Results) -> list[Block]:
-    """Say whether the pairs settle the delays, and what the fit assumed."""
+    """Return whether the pairs determine the delays, and the assumptions of the fit."""
     if results.fit is None:
         return []
     calibration, pairs = results.calibration, pair_rows(results.trained)
@@ -221,7 +220,7 @@ def _determined(results: Results) -> list[Block]:
 
 
 def _delays(results: Results) -> list[Block]:
-    """Return delays with intervals; beside them what was planted, and what listeners heard."""
+    """Return delays with intervals, with planted and overheard delays if there are any."""
     calibration, heard = results.calibration, results.heard
     if calibration.pair_offsets:
         rows = [list(row) for row in offset_rows(calibration)]
@@ -278,12 +277,12 @@ def _sensitivity(results: Results) -> list[Block]:
 
 
 def _provenance(results: Results) -> list[Block]:
-    """Return where a report and its calibration come from."""
+    """Return the origin of a report and its calibration."""
     origin, made = results.origin, results.calibration.provenance
     rows = [["report", origin.made], ["version", origin.version], ["command", origin.command]]
     rows = [row for row in [*rows, ["distances", rests_on(made)]] if row[1]]
     rows += [[path, f"SHA-256 {digest}"] for path, digest in origin.files.items()]
-    # What sections show as tables and figures is not repeated.
+    # Sections show the rest as tables and figures.
     rest = {key: value for key, value in made.items() if key not in ("surveyed", "reflected")}
     return [Heading("Provenance"), Table(["of", "what"], rows, words=True), Listing(json.dumps(rest, indent=1))]
 
@@ -302,7 +301,7 @@ SECTIONS: Final[dict[str, Section]] = {
     "over time": error_sections.over_time,
     "provenance": _provenance,
 }
-"""What stands in a report, in order; `register_report_section` adds to it."""
+"""The sections of a report, in order; `register_report_section` adds to it."""
 
 
 def register_report_section(name: str, section: Section, *, before: str = "provenance") -> None:
@@ -341,7 +340,7 @@ def register_report_section(name: str, section: Section, *, before: str = "prove
 
 
 def document(results: Results, title: str) -> Document:
-    """Return a report; raises `BadInputError` where the function of a section returns something else than blocks."""
+    """Return a report; raises `BadInputError` if the function of a section does not return blocks."""
     blocks: list[Block] = []
     for name, section in SECTIONS.items():
         found: object = section(results)

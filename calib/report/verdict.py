@@ -1,4 +1,4 @@
-"""Whether a calibration is fit for use: criteria with their thresholds, what was found, and a sentence of it all."""
+"""Whether a calibration is fit for use: criteria with thresholds and results, and a summary."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BAD: Final = "bad"
 
 
 class Criterion(NamedTuple):
-    """A question, what is asked for, what was found, how well that is (good, doubt, bad), and it in a few words."""
+    """A question, the requirement, the result, its grade (good, doubt, bad), and a short text."""
 
     question: str
     asked: str
@@ -32,7 +32,7 @@ class Criterion(NamedTuple):
 
 
 def verdict(results: Results) -> list[Block]:
-    """Return a sentence on all criteria, and the table behind it."""
+    """Return a sentence on all criteria, and their table."""
     found = criteria(results)
     bad, doubt = ("; ".join(one.told for one in found if one.grade == grade) for grade in (BAD, DOUBT))
     if bad:
@@ -49,7 +49,7 @@ def verdict(results: Results) -> list[Block]:
 
 
 def criteria(results: Results) -> list[Criterion]:
-    """Return what is asked of a calibration: on recordings where there are some, and by how it was made."""
+    """Return the criteria that apply to a calibration and its recordings."""
     made = results.calibration.provenance
     without_truth: Sequence[Ask] = [_distances_found] if rests_on(made) else []
     if made.get("recipe") == "survey":
@@ -61,7 +61,7 @@ def criteria(results: Results) -> list[Criterion]:
 
 
 Ask = Callable[[Results], Criterion | None]
-"""Returns how a criterion is met, None where it does not apply."""
+"""Returns a criterion, None if it does not apply."""
 
 
 def _graded(good: bool, tolerable: bool) -> str:
@@ -107,7 +107,7 @@ def _gain(results: Results) -> Criterion:
 def _bias(results: Results) -> Criterion:
     most = 0.5  # of the spread of one range: so large a bias adds an eighth to the error of a single range
     pairs = {name: group.full for name, group in results.evaluation.pairs.items()}
-    # What is sure of a bias: few ranges of a pair tell little of it.
+    # The bias beyond chance: few ranges of a pair determine little.
     ratios = {
         name: max(abs(full.median_m) - _median_bound_m(full, len(pairs)), 0.0) / max(full.robust_std_m, 1e-9)
         for name, full in pairs.items()
@@ -127,7 +127,7 @@ def _bias(results: Results) -> Criterion:
 
 
 def _median_bound_m(stats: Stats, pairs: int) -> float:
-    """Return what a median of errors may be off by at 1 % for all pairs together (Bonferroni), in metres.
+    """Return the bound of a median error by chance, at 1 % for all pairs together (Bonferroni), in metres.
 
     The standard error of a median is 1.2533 sigma / sqrt(n), and sigma is known to n - 1 degrees of freedom.
     """
@@ -181,7 +181,7 @@ def _settled(results: Results) -> Criterion | None:
 
 
 def left_open(results: Results) -> str:
-    """Say which delays the pairs do not determine."""
+    """Return in words the delays that the pairs do not determine."""
     made = results.calibration.provenance
     groups = "; ".join(", ".join(map(str, group)) for group in made.get("undetermined", []))
     trace = f"the delays of tags {groups} can shift against each other without a trace in any range"

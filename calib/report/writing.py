@@ -28,10 +28,10 @@ EVALUATION: Final = "Calibration report"
 
 
 def check_places(output: Path | None, pdf: Path | None, figures: Path | None, *, force: bool) -> None:
-    """Raise, before anything is computed, what would keep the files of a report from being written.
+    """Check the output files of a report before anything is computed.
 
     Raises what `check_output` raises, and `BadInputError` for a `pdf` that is the `output`, and for a folder of
-    `figures` that is a file, that holds some already, or whose parent does not exist.
+    `figures` that is a file, that holds figures already, or whose parent does not exist.
     """
     for path in filter(None, (output, pdf)):
         check_output(path, force=force)
@@ -116,7 +116,7 @@ def write_track_figures(found: Sequence[Localization], folder: Path, *, force: b
 
 
 def write_onboard_figures(found: Sequence[OnboardTrack], folder: Path, *, force: bool = False) -> None:
-    """Write each body's track by what is on board, likewise."""
+    """Write the track of each body by on-board sensors into a folder, as PDF and SVG at two widths."""
     tracks = [Picture(track_name(one.source, one.body), partial(onboard, one=one), one.body) for one in found]
     _write_figures(tracks, folder, force)
 
@@ -124,7 +124,7 @@ def write_onboard_figures(found: Sequence[OnboardTrack], folder: Path, *, force:
 def write_comparison_figures(
     found: Comparison, known: Sequence[Calibration], names: Sequence[str], folder: Path, *, force: bool = False
 ) -> None:
-    """Write the differences of delays and both calibrations' curves, likewise; `names` are what they are called."""
+    """Write the differences of delays and both calibrations' curves into a folder; `names` label the calibrations."""
     pictures = [
         Picture("differences", partial(drawings.differences, found=found), "Delays"),
         Picture("curves", partial(drawings.both_curves, known=known, names=names), "Curves"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.evaluation.range_updates import RangeErrors, gated, weighed
+from calib.evaluation.range_updates import RangeErrors, gated_update, mixture_update
 
 STD = 0.1
 ERRORS = RangeErrors(share=0.3, least_m=0.05, detour_m=0.3, outlier=0.02, outlier_m=2.0)
@@ -28,26 +28,26 @@ def draws():
 def test_mean_and_variance_of_the_noise_are_those_of_draws(draws, value):
     innovation, noise, wild = draws
     near = np.abs(innovation - value) < 0.01
-    heard = weighed(np.array([value]), np.array([STD**2]), ERRORS)
+    update = mixture_update(np.array([value]), np.array([STD**2]), ERRORS)
     count = np.count_nonzero(near)
     spread = noise[near].std()
     # Four standard errors, and what the width of the bin does.
-    assert heard.noise_m[0] == pytest.approx(noise[near].mean(), abs=4 * spread / np.sqrt(count) + 0.004)
-    assert heard.variance_m2[0] == pytest.approx(noise[near].var(), rel=6 / np.sqrt(count) + 0.05, abs=1e-4)
-    assert heard.believed[0] == (np.mean(wild[near]) < 0.5)
-    assert np.exp(heard.log_density[0]) == pytest.approx(count / COUNT / 0.02, rel=4 / np.sqrt(count) + 0.03)
+    assert update.noise_m[0] == pytest.approx(noise[near].mean(), abs=4 * spread / np.sqrt(count) + 0.004)
+    assert update.variance_m2[0] == pytest.approx(noise[near].var(), rel=6 / np.sqrt(count) + 0.05, abs=1e-4)
+    assert update.believed[0] == (np.mean(wild[near]) < 0.5)
+    assert np.exp(update.log_density[0]) == pytest.approx(count / COUNT / 0.02, rel=4 / np.sqrt(count) + 0.03)
 
 
 def test_innovations_out_of_reach_are_finite_and_not_believed():
-    heard = weighed(np.array([-50.0, 1e3, 1e5]), np.full(3, STD**2), ERRORS)
-    assert not heard.believed.any()
-    assert np.isfinite(heard.noise_m).all()
-    np.testing.assert_allclose(heard.noise_m, 0, atol=1e-6)
-    np.testing.assert_allclose(heard.variance_m2, STD**2, rtol=1e-6)
+    update = mixture_update(np.array([-50.0, 1e3, 1e5]), np.full(3, STD**2), ERRORS)
+    assert not update.believed.any()
+    assert np.isfinite(update.noise_m).all()
+    np.testing.assert_allclose(update.noise_m, 0, atol=1e-6)
+    np.testing.assert_allclose(update.variance_m2, STD**2, rtol=1e-6)
 
 
 def test_a_gate_takes_all_or_nothing():
-    heard = gated(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
-    assert heard.believed.tolist() == [True, False]
-    assert heard.noise_m.tolist() == [0.2, 0.0]
-    assert heard.variance_m2.tolist() == [0.0, 0.01]
+    update = gated_update(np.array([0.2, 0.4]), np.full(2, 0.01), 9.0)
+    assert update.believed.tolist() == [True, False]
+    assert update.noise_m.tolist() == [0.2, 0.0]
+    assert update.variance_m2.tolist() == [0.0, 0.01]
