@@ -87,7 +87,7 @@ def _recordings(results: Results) -> list[Block]:
     digests = {Path(path).name: digest[:12] for path, digest in results.origin.files.items()}
     tested = "test" if results.part is None else "held out"
     uses = [("fit", r) for r in results.training] + [(tested, r) for r in results.tests]
-    header = ["recording", "used to", "ranges", "seconds", "tags", "pairs", "protocol", "left out", "SHA-256"]
+    header = ["recording", "use", "ranges", "seconds", "tags", "pairs", "protocol", "left out", "SHA-256"]
     rows = [
         [
             r.source,
@@ -199,7 +199,7 @@ def _determined(results: Results) -> list[Block]:
     if calibration.provenance.get("undetermined"):
         answer = f"No: {left_open(results)}."
     else:
-        answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags settle every delay."
+        answer = f"Yes: the {len(pairs)} pairs of {len(results.trained.tags())} tags determine every delay."
     counts = [int(np.count_nonzero(rows)) for rows in pairs.values()]
     changed = calibration.provenance.get("settings", {})
     settings = f" Settings: {', '.join(f'{name} = {value}' for name, value in changed.items())}." if changed else ""
@@ -251,15 +251,16 @@ def _delays(results: Results) -> list[Block]:
     draw = partial(figures.alone, partial(figures.delays, calibration, known, shift))
     blocks: list[Block] = [Heading("Antenna delays"), Table(header, rows), Picture("delays", draw, caption)]
     if planted:
-        blocks.append(
-            Text(
-                "A constant in the bias curve and a shift common to all delays are the same thing: planted delays, and "
-                f"the planted curve below, are shown after moving the common {shift:+.4f} ns from the curve to the "
-                f"delays. The bias curve is {1e3 * planted.curve_rms_m:.1f} mm rms from the planted one over these "
-                f"ranges, the whole correction of a range {1e3 * planted.correction_rms_m:.1f} mm.",
-                "note",
-            )
+        text = (
+            "A constant of the bias curve and a common shift of all delays cannot be distinguished: planted delays, "
+            f"and the planted curve below, are shown after moving {shift:+.4f} ns from the curve to the delays."
         )
+        if isfinite(planted.curve_rms_m):
+            text += (
+                f" The bias curve differs from the planted one by {1e3 * planted.curve_rms_m:.1f} mm rms over these "
+                f"ranges, the whole correction of a range by {1e3 * planted.correction_rms_m:.1f} mm."
+            )
+        blocks.append(Text(text, "note"))
     return [*blocks, *_sensitivity(results)]
 
 
